@@ -39,10 +39,10 @@ IndexBase = Literal[0, 1]
 """The possible indices of the first vertex in a file."""
 
 CoordinateSystem = Literal["LPS", "RAS"]
-"""The names of the coordinate systems of medical images; the letters say where x, y and z increase.
+"""The names of coordinate systems of medical images; the letters say in which directions x, y, z increase.
 
-LPS means left, posterior (back), superior (up); RAS means right, anterior (front), superior. A change between
-them reverses the signs of x and y.
+LPS means left, posterior (back), superior (up); RAS means right, anterior (front), superior. A change from
+one system to the other reverses the signs of x and y.
 """
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -63,7 +63,7 @@ MethodName = Literal[
 ]
 """The names of the methods of a benchmark; see `jaxsmw.evaluation.opponents.registry.METHODS`."""
 PeerName = Literal["pyfm-zoomout", "geomfum-zoomout"]
-"""The names of methods of other libraries, which a benchmark can measure if these libraries are installed."""
+"""The names of other libraries' methods, which a benchmark can measure if the libraries are installed."""
 
 NUMBER_OF_EIGENVECTORS = 100
 """The number of eigenvectors per shape in the MWP paper."""

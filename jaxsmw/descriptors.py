@@ -101,7 +101,7 @@ class SampledPair:
 
 
 def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> SampledPair:
-    """Choose the vertices of X and of Y whose descriptors are compared with each other.
+    """Choose the vertices of X and of Y at which descriptors are compared.
 
     On a mesh with more than 15 000 vertices, descriptors are compared at about 10 000 evenly spread samples.
     On any other mesh, descriptors are compared at all vertices.
@@ -151,7 +151,7 @@ def describe(
       are used.
     - `sampled`: the result of `sample_pair` for this pair, if it was already computed.
 
-    **Returns:** The spectra of X and Y, with `descriptors` of shapes (m, d) and (n, d), without unit. The
+    **Returns:** The spectra of X and Y, with dimensionless `descriptors` of shapes (m, d) and (n, d). The
     function issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
 
     **Raises:** `InputError` if `number_of_descriptors` is not from 1 to 352, if a mesh is too coarse for SHOT
@@ -181,15 +181,15 @@ def _at_all_vertices(
 
 
 class DescriptorAxes(NamedTuple):
-    """The axes along which the SHOT descriptors of all shapes of a collection are described.
+    """The axes in which the SHOT descriptors of all shapes of a collection are expressed.
 
-    Descriptors along the same axes are comparable between any two shapes of the collection. For a pair of
-    shapes, `describe` computes axes for this pair alone.
+    Because all shapes share these axes, descriptors are comparable between any two shapes of the collection.
+    By contrast, the function `describe` computes axes for one pair of shapes alone.
 
     **Attributes:**
 
     - `radii`: the radii of SHOT, in units of the square root of the area.
-    - `principal`: the `PrincipalAxes` of SHOT at all radii, in which all shapes have equal weights.
+    - `principal`: the `PrincipalAxes` of SHOT at all radii. All shapes have equal weights.
     """
 
     radii: tuple[float, ...]
@@ -281,7 +281,7 @@ def principal_components(
     - `weight`: the weights of the rows (n,), which sum to 1.
     - `number`: the number d of components.
 
-    **Returns:** The components of the rows (n, d), those of largest variance first.
+    **Returns:** The components of the rows (n, d), in order of decreasing variance.
     """
     return PrincipalAxes.of([(values, weight)], number).components(values)
 
@@ -292,7 +292,7 @@ class PrincipalAxes(NamedTuple):
     **Attributes:**
 
     - `mean`: the weighted mean of the rows (c,).
-    - `axes`: the axes (c, d), those of largest variance first. Each axis is divided by the standard deviation
+    - `axes`: the axes (c, d), in order of decreasing variance. Each axis is divided by the standard deviation
       of the rows along the axis.
     """
 

@@ -35,7 +35,7 @@ def check_whole_number(name: str, value: Any, least: int | None = None, most: in
     - `least`, `most`: the smallest and the largest valid number; None for no limit.
 
     **Raises:** `InputError` if the value is not a whole number within the limits. Floats such as 3.0 and
-    truth values are no whole numbers.
+    Booleans do not count as whole numbers.
     """
     limits = "" if least is None else f" of at least {least}" if most is None else f" from {least} to {most}"
     number = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None

@@ -74,23 +74,24 @@ class Correspondence:
       chose an alternative initial map, `initial_map` is the alternative.
     - `preset`: the `Preset` with the stages of refinement and the settings of the repair. For small meshes,
       the stages of a preset differ from the stages in `PRESETS`; see `match`.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y with the k_X and k_Y eigenvectors of the last stage.
-      Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by the same factor,
-      which gives the larger shape area 1.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y. They contain the k_X and k_Y eigenvectors that the
+      last stage uses. Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by
+      one common factor, so that the larger shape has area 1.
     - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
     - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
       and larger for worse maps.
-    - `suspicious`: True if, after repair, limbs still look swapped or the body looks upside down. If the
-      preset has no repair, True if the distortion is at least 1.25. Also True if `match` is uncertain whether
-      X or its mirror image corresponds to Y, for example if `mirror_evidence` is between 0 and 0.1.
+    - `suspicious`: whether the map looks wrong. If the preset has repair, the value is True if limbs still
+      look swapped or the body still looks upside down after repair. If the preset has no repair, the value is
+      True if the distortion is at least 1.25. In both cases, the value is also True if `match` is uncertain
+      whether X or its mirror image corresponds to Y, for example if `mirror_evidence` is between 0 and 0.1.
     - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
-      hands, such as a left and a right tooth. In both cases, entry i of `pointwise_map` is the match of
-      vertex i of X.
+      hands, such as a left and a right tooth. Whether X is mirrored or not, entry i of `pointwise_map` is the
+      match of vertex i of X.
     - `mirror_evidence`: a logarithm that is positive if the mirror image of X seems to match Y better than X
-      itself; None if `match` did not compare the two. The distance error of a coarse map of X itself is at
-      least `exp(mirror_evidence)` times the distance error of a coarse map of the mirror image
+      itself does; None if `match` did not compare the two. The distance error of a coarse map of X itself is
+      at least `exp(mirror_evidence)` times the distance error of a coarse map of the mirror image
       (`jaxsmw.repair.chirality.Hands`). If X and Y differ enough from their own mirror images, a value of at
       least 0.05 leads to `mirrored=True`. Most correct decisions with `mirrored=True` have values above 0.3.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. The first refinement of
@@ -140,14 +141,15 @@ class Correspondence:
     def surface_points(self) -> SurfacePoints:
         """Compute the match of every vertex of X as a point on a triangle of Y.
 
-        The last stage embeds X and Y in a common space. In this space, `pointwise_map` contains the nearest
-        vertex of Y, and this method finds the nearest point on the triangles around this vertex. For 98 % of
-        the vertices, this point is the nearest point of all triangles of Y.
+        The last stage embeds X and Y in a common space. In this space, `pointwise_map` gives the vertex of Y
+        that is nearest to a vertex of X. This method searches the triangles around that vertex of Y for the
+        nearest point. For 98 % of the vertices of X, no other triangle of Y has a nearer point.
         `jaxsmw.functional_maps.decode_to_triangles` searches all triangles, which takes 20 times as long. An
         unreferenced vertex of X receives the point of the nearest referenced vertex.
 
-        **Returns:** m `SurfacePoints` on Y, one for each vertex of X. Their attribute `faces` (m,) contains
-        0-based rows of `mesh_y.faces`, and their attribute `weights` (m, 3) contains barycentric weights.
+        **Returns:** A `SurfacePoints` with m points on Y, one for each vertex of X. Its attribute `faces`
+        (m,) contains 0-based rows of `mesh_y.faces`, and its attribute `weights` (m, 3) contains barycentric
+        weights.
         """
         points = self._surface_points
         return SurfacePoints(points.faces.copy(), points.weights.copy())
@@ -161,8 +163,8 @@ class Correspondence:
 
         The map Y -> X comes from the same embeddings as `surface_points`, and needs no second match.
 
-        **Returns:** n `SurfacePoints` on X, one for each vertex of Y. An unreferenced vertex of Y receives
-        the point of the nearest referenced vertex.
+        **Returns:** A `SurfacePoints` with n points on X, one for each vertex of Y. An unreferenced vertex of
+        Y receives the point of the nearest referenced vertex.
         """
         embedded_x, embedded_y = self._embeddings()
         queries = extend_to_unreferenced(self.mesh_y, embedded_y)
@@ -185,7 +187,7 @@ class Correspondence:
         queries: Float[np.ndarray, "m d"],
         database: Float[np.ndarray, "n d"],
     ) -> SurfacePoints:
-        """Return the nearest point to each embedded source vertex, on the target triangles at its match."""
+        """Return, for each embedded source vertex, the nearest point on the triangles around its match."""
         mesh_x, mesh_y = pair.meshes
         with self._precision():
             rows, candidates = mesh_y.faces_around(matches)
@@ -235,8 +237,8 @@ class Correspondence:
 
         **Returns:** The map X -> Y (m,), as 0-based vertices of Y.
 
-        **Raises:** `InputError` if X has more referenced vertices than Y, or if the product of X's and Y's
-        numbers of referenced vertices is above 20 000².
+        **Raises:** `InputError` if X has more referenced vertices than Y, or if X's number of referenced
+        vertices times Y's number of referenced vertices is above 20 000².
         """
         queries, database = self._embeddings()
         used = self.mesh_x.referenced_vertices
@@ -248,10 +250,9 @@ class Correspondence:
 
         `SoftMap.pull_back` transfers functions smoothly from Y to X. `SoftMap.pointwise_map` covers more of Y
         than `Correspondence.pointwise_map`. On four remeshed FAUST pairs, `SoftMap.pointwise_map` covers 76
-        to 82 % of Y's vertices, and `Correspondence.pointwise_map` covers 69 to 75 %. The errors of
-        `SoftMap.pointwise_map` are between 4 % smaller and 2 % larger than those of
-        `Correspondence.pointwise_map`. One iteration takes 0.2 seconds for 5000 vertices, and 20 iterations
-        are needed.
+        to 82 % of Y's vertices, and `Correspondence.pointwise_map` covers 69 to 75 %. Compared with
+        `Correspondence.pointwise_map`, the errors of `SoftMap.pointwise_map` range from 4 % smaller to 2 %
+        larger. One iteration takes 0.2 seconds for 5000 vertices, and 20 iterations are needed.
 
         An unreferenced vertex of X is mapped like the nearest referenced vertex. The method issues a
         `UserWarning` if the share of misplaced area is larger than `tolerance` after the last iteration.
@@ -262,7 +263,7 @@ class Correspondence:
           area-weighted mean squared distance from the embedded vertices of X to their nearest embedded
           vertices of Y. A temperature of 0.1 gives a sharper map than 0.3 and needs more iterations. A
           temperature of 1 gives a softer map than 0.3.
-        - `iterations`: the largest number of iterations, an integer of at least 1.
+        - `iterations`: the maximum number of iterations, an integer of at least 1.
         - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. Misplaced area is
           the area that vertices of Y receive in excess of their own areas. Between two different bodies, a
           tolerance below a few hundredths costs further iterations but does not improve the map.
@@ -320,8 +321,8 @@ class Correspondence:
     def _embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
         """Return the embeddings of X and Y in the last stage.
 
-        The match of a vertex of X is its nearest neighbour among the embedded vertices of Y. An unreferenced
-        vertex of X has the same embedding as the nearest referenced vertex.
+        The match of a vertex of X is the nearest vertex of Y in these embeddings. An unreferenced vertex of X
+        has the same embedding as the nearest referenced vertex.
         """
         with self._precision():
             padded_x, padded_y = map(np.asarray, compiled(_embeddings)(*self._last_stage()))
@@ -374,9 +375,9 @@ def match(
       argument is a `Mesh`, a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
       `make_mesh`.
     - `preset`: the method of refinement, which is one of the following. The number of eigenvectors of a
-      preset (a name or a `Preset`) is limited to half the number of vertices of the smaller mesh. A preset
-      uses all vertices instead of samples if a mesh does not have more vertices than samples. If you give
-      stages instead of a preset, `match` uses the stages unchanged.
+      preset (a name or a `Preset`) is limited to half the number of vertices of the smaller mesh. If a mesh
+      does not have more vertices than the preset has samples, the preset uses all vertices instead of
+      samples. If you give stages instead of a preset, `match` uses the stages unchanged.
 
         - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
@@ -387,20 +388,21 @@ def match(
 
     - `init`: the initial map, which is one of the following.
 
-        - `"auto"` (the default): `"shot"`. If both shapes differ from their own mirror images, as teeth do,
-          `partial` is False and the preset has repair, then `"aligned"` is refined as well, and the map with
-          the smaller expected error is returned.
+        - `"auto"` (the default): `"shot"`. The initial map `"aligned"` is refined as well if `partial` is
+          False, the preset has repair, and both shapes differ from their own mirror images, as teeth do. The
+          map with the smaller expected error is then returned.
         - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
           with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, repair also tries alternative maps.
         - `"functional"`: the initial map is computed from the functional map that preserves SHOT and commutes
           with the Laplacian (section 3.2 of the MWP paper). This initial map is smoother than the initial map
-          `"shot"` and has smaller errors. However, the refined map often has larger errors than with `"shot"`
-          (docs/results.md).
+          `"shot"` and has smaller errors. After refinement, however, the map often has larger errors than
+          with `"shot"` (docs/results.md).
         - `"aligned"`: X is scaled to the area of Y and aligned rigidly. The initial map sends each vertex of
           X to the vertex of Y with the most similar SHOT descriptor and position. Use this map for shapes
           that differ little in pose, such as teeth and bones.
-        - an integer array (m,) of 0-based vertices of Y, or m `SurfacePoints` on Y: a given pointwise map.
+        - an integer array (m,) of 0-based vertices of Y, or a `SurfacePoints` with m points on Y: a given
+          pointwise map.
         - an integer array (l, 2) of landmarks, where each row contains a vertex of X and its match on Y, both
           0-based. The initial map then sends each vertex of X to the vertex of Y with the most similar
           features. The features are SHOT and the geodesic distances to the landmarks. Give a few landmarks on
@@ -415,8 +417,8 @@ def match(
     - `partial`: True if one mesh is a partial shape and the other mesh the full shape, in the same unit of
       length; see `paired_spectra`. The default is False, for two full shapes.
     - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. If they are, the
-      mirror image of X is matched instead of X. In both cases, entry i of the map is the match of vertex i of
-      X.
+      mirror image of X is matched instead of X. Whether X is mirrored or not, entry i of the map is the match
+      of vertex i of X.
 
         - `"auto"` (the default): decide by a comparison of coarse maps (`jaxsmw.repair.chirality.Hands`). If
           a coarse map of the mirror image of X preserves distances better than a coarse map of X itself, the
@@ -521,14 +523,15 @@ def match_prepared(
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `starts`: the same prepared pair with one initial map, or with `"shot"` and `"aligned"` in this order.
-      If `decision.mirrored` is True, X is replaced by its mirror image.
+    - `starts`: the prepared pair, once for each initial map. The sequence contains one initial map, or
+      `"shot"` and `"aligned"` in this order. If `decision.mirrored` is True, the prepared pair contains the
+      mirror image of X instead of X.
     - `preset`: the stages and the repair.
     - `decision`: the decision between X and its mirror image.
     - `history`: whether to record a `History` of the last stage.
-    - `seconds`: a dictionary to which the times of the steps are added. With None, the steps are neither
-      measured nor reported as progress.
-    - `compiling`: compilations in the background, which refinement waits for.
+    - `seconds`: a dictionary to which the times of the steps are added. With None, the steps are not timed,
+      and no progress is reported.
+    - `compiling`: background compilations that refinement waits for.
     - `alternatives`: whether repair tries alternative maps.
     - `refined`: for each start, the outcome of all stages if the stages already ran; see
       `jaxsmw.repair.batches`.
@@ -582,7 +585,7 @@ def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[obj
     """Compile the programs of all stages in the background.
 
     Nothing is compiled for partial pairs, because their numbers of eigenvectors are not known yet. Nothing is
-    compiled if the preset uses at least as many eigenvectors as a mesh has vertices, because `prepare` then
+    compiled either if a mesh has no more vertices than the preset has eigenvectors, because `prepare` then
     raises an error.
     """
     if pair.partial or preset.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):

@@ -13,8 +13,8 @@ from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpai
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.runtime.threads import side_by_side
 
-# With fewer vertices, presets would use fewer than two eigenvectors, because they use at most half as many
-# eigenvectors as vertices.
+# A preset uses at most one eigenvector per two vertices. With fewer vertices, a preset would use fewer than
+# two eigenvectors.
 _FEWEST_VERTICES = 4
 # The smallest allowed ratio of the smaller area to the larger area of a partial pair. A part with less than a
 # thousandth of a body's area shows too little of the body's shape.
@@ -72,7 +72,7 @@ class Pair:
 
     @property
     def units_of_length(self) -> tuple[float, float]:
-        """The unit of length for X and the unit of length for Y, each in the coordinates of its mesh.
+        """The units of length for X and for Y, each as a length in the coordinates of its own mesh.
 
         For two full shapes, the units are the square roots of the areas of X and of Y, which compensates for
         a difference in size. For a partial pair, both units are the square root of the larger area.
@@ -96,7 +96,7 @@ class Pair:
         return min(used)
 
     def mirrored(self) -> Pair:
-        """Return the pair of the mirror image of X and of Y; see `jaxsmw.Mesh.mirrored`."""
+        """Return the pair with the mirror image of X in place of X; see `jaxsmw.Mesh.mirrored`."""
         return Pair(self.mesh_x.mirrored(), self.mesh_y, self.partial)
 
     def reversed(self) -> Pair:
@@ -114,9 +114,9 @@ def paired_spectra(
     """Compute the spectra of the two meshes of a pair in comparable units.
 
     Two full shapes are each scaled to area 1, which compensates for a difference in size. The shapes of a
-    partial pair are scaled by the same factor, so that the larger shape has area 1. For a partial pair,
-    eigenpairs with eigenvalues above the smaller of the two shapes' largest eigenvalues are then removed.
-    Therefore k_X and k_Y usually differ for a partial pair.
+    partial pair are scaled by one common factor, so that the larger shape has area 1. For a partial pair, the
+    spectra are then cut at a common limit: the smaller of the two shapes' largest eigenvalues. Eigenpairs
+    with eigenvalues above this limit are removed, so k_X and k_Y usually differ for a partial pair.
 
     **Arguments:**
 
@@ -153,7 +153,8 @@ def paired_spectra(
             f"{pair.mesh_x.name} has area {areas[0]:.3g} and {pair.mesh_y.name} has area {areas[1]:.3g}, so "
             "their units of length probably differ: scale one of the meshes."
         )
-    # If one mesh has only zero eigenvalues, its range leaves only zero eigenvalues on the other mesh as well.
+    # If all eigenvalues of one mesh are zero, the common range contains only zero eigenvalues of the other
+    # mesh, too.
     for mesh, spectrum in zip(pair.meshes, (spectrum_x, spectrum_y), strict=True):
         check_eigenvalues(mesh, spectrum)
     scales = (area / max(areas) for area in areas)
@@ -176,16 +177,17 @@ def check_eigenvalues(mesh: Mesh, spectrum: Spectrum) -> None:
 
 
 def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
-    """Remove eigenpairs above the smaller of the two shapes' largest eigenvalues.
+    """Cut two spectra at a common limit, the smaller of the two shapes' largest eigenvalues.
 
-    The MWP paper truncates the spectra of partial shapes in the same way.
+    Eigenpairs with eigenvalues above this limit are removed. The MWP paper truncates the spectra of partial
+    shapes in the same way.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the same unit of length.
 
-    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors. The spectrum whose largest eigenvalue
-    is smaller is unchanged.
+    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors. The spectrum that ends at the limit is
+    unchanged.
     """
     spectra = spectrum_x, spectrum_y
     last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)

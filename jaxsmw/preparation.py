@@ -27,7 +27,7 @@ from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import side_by_side
 from jaxsmw.stage import Stage
 
-# The largest number of vertices of a mesh that is padded. For larger meshes, padding needs too much memory.
+# Meshes with more vertices than this number are not padded, because padding would need too much memory.
 _PADDED_UP_TO = 50_000
 
 
@@ -54,7 +54,8 @@ class PreparedPair:
     - `initial_map`: T: X -> Y (m,), as 0-based vertices of Y.
     - `samples`: a pair of arrays, the samples of X (s,) and of Y (s,) as 0-based vertices in farthest-point
       order; None if no samples were requested.
-    - `sampled`: the `SampledPair` whose descriptors were compared; None if no descriptors were compared.
+    - `sampled`: the `SampledPair` at whose vertices descriptors were compared; None if no descriptors were
+      compared.
     - `seconds`: a dictionary from the name of each step of the preparation to its wall time in seconds.
     """
 
@@ -124,8 +125,8 @@ def prepare(
     - `number_of_samples`: the largest number of samples of each shape that a stage uses. With 0, no samples
       are computed.
     - `init`: the initial map; see `match`. The argument is `"shot"`, `"wks"`, `"hks"`, `"wavelet"`,
-      `"functional"`, a pointwise map (m,) of 0-based vertices of Y, m `SurfacePoints` on Y, or an array (l,
-      2) of landmarks. Each row contains a vertex of X and its match on Y.
+      `"functional"`, a pointwise map (m,) of 0-based vertices of Y, a `SurfacePoints` with m points on Y, or
+      an array (l, 2) of landmarks. Each row of landmarks contains a vertex of X and its match on Y.
     - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. If False, the

@@ -27,9 +27,9 @@ class Preset:
     - `repair`: the `RepairSettings` that determine when and how a map is repaired; None (the default) for no
       repair.
 
-    **Raises:** `InputError` if there is no stage, if an attribute has another type, or if no stage has the
-    position `repair.stage`. `InputError` is also raised if the refiner of the stage that repair repeats has
-    no levels, or if this stage has fewer samples than the largest of `repair.fallback_levels`.
+    **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage has the
+    position `repair.stage`. `InputError` is also raised for the stage that repair repeats: if its refiner has
+    no levels, or if the stage has fewer samples than the largest of `repair.fallback_levels`.
     """
 
     stages: tuple[Stage, ...]
@@ -93,9 +93,9 @@ PRESETS: dict[PresetName, Preset] = {
 
 `"paper"` has the settings of the MWP paper: one stage of `WaveletPreservation` with 100 eigenvectors and 3
 iterations. `"fast"` has the same stage with iterations on 500 samples of each shape, as in the fast variant
-of the MWP authors. `"accurate"` has three stages and repair: the stage of `"paper"`, `FeatureRegression` with
-up to 35 eigenvectors, and `Registration` with up to 200 eigenvectors. `docs/accuracy.md` reports the errors
-of `"accurate"`.
+of the MWP authors' program. `"accurate"` has three stages and repair: the stage of `"paper"`,
+`FeatureRegression` with up to 35 eigenvectors, and `Registration` with up to 200 eigenvectors.
+`docs/accuracy.md` reports the errors of `"accurate"`.
 """
 
 

@@ -40,9 +40,9 @@ class Stage:
       argument out, because each level is one iteration.
     - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
       352; 0 by default.
-    - `number_of_samples`: the number of samples of each shape on which the refiner iterates, at least the
-      number of eigenvectors. The final nearest-neighbour search then matches all vertices. None, the default,
-      means that all iterations use all vertices.
+    - `number_of_samples`: the number of samples of each shape on which the refiner iterates. This number must
+      be at least the number of eigenvectors. The final nearest-neighbour search then matches all vertices.
+      None, the default, means that all iterations use all vertices.
     - `stop_when_unchanged`: whether refinement stops when an iteration changes no match; False by default.
 
     **Raises:** `InputError` if `refiner` is not a `Refiner`, or if there are fewer samples than eigenvectors.
@@ -162,8 +162,9 @@ class Stage:
     ) -> tuple[Spectrum, Spectrum]:
         """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
 
-        For a partial pair, eigenpairs with eigenvalues above the smaller of the two spectra's largest
-        eigenvalues are then removed (`jaxsmw.pair.common_range`).
+        For a partial pair, the spectra are then cut at a common limit, the smaller of the two spectra's
+        largest eigenvalues: eigenpairs with eigenvalues above this limit are removed
+        (`jaxsmw.pair.common_range`).
 
         **Arguments:**
 
@@ -195,8 +196,8 @@ class Stage:
 
         - `spectrum_x`, `spectrum_y`: the spectra that `view` returns, of X (m vertices) and Y (n vertices).
         - `pointwise_map`: the map from which the stage starts (m,), as 0-based vertices of Y.
-        - `samples`: a pair of integer arrays, the samples of X and of Y in farthest-point order. Each array
-          contains at least `number_of_samples` vertices. None if the stage uses no samples.
+        - `samples`: the samples of X and of Y in farthest-point order, as a pair of integer arrays; None if
+          the stage uses no samples. Each array contains at least `number_of_samples` vertices.
         - `partial`: whether one of the shapes is a partial shape.
         - `history`: whether to record a `History`; see `jaxsmw.refine`.
 

@@ -20,12 +20,12 @@ Returned = TypeVar("Returned")
 
 
 def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
-    """Returns a continuous parameter as an array of the default float type, which JAX can trace."""
+    """Return a continuous parameter as an array of the default float type, which JAX can trace."""
     return jnp.asarray(value, dtype=float)
 
 
 def all_finite(tree: PyTree) -> Bool[Array, ""]:
-    """Returns whether all numbers in the floating-point arrays of a pytree are finite.
+    """Return whether all numbers in the floating-point arrays of a pytree are finite.
 
     The pytree must contain at least one floating-point array.
     """
@@ -34,13 +34,13 @@ def all_finite(tree: PyTree) -> Bool[Array, ""]:
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """Raises `ValueError` if the value of an option is not one of the choices."""
+    """Raise `ValueError` if the value of an option is not one of the choices."""
     if value not in choices:
         raise ValueError(f"{name}={value!r} is unknown: choose one of {', '.join(choices)}")
 
 
 def check_kind(name: str, value: object, *kinds: type) -> None:
-    """Raises `TypeError` if the value is not an instance of one of the types `kinds`.
+    """Raise `TypeError` if the value is not an instance of one of the types `kinds`.
 
     If `kinds` contains several types, the error message names only the first type.
     """
@@ -55,20 +55,19 @@ def check_kind(name: str, value: object, *kinds: type) -> None:
 def check_between(
     owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
 ) -> None:
-    """Checks that a numerical parameter of a module is within its limits.
+    """Check that a numerical parameter of a module is within its limits.
 
     If the parameter is traced, only its number of dimensions is checked.
 
-    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if its numbers are not all
-    finite and strictly between `low` and `high`.
+    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if one of its numbers is not
+    finite or does not lie strictly between `low` and `high`.
     """
     if value.ndim != ndim:
         wanted = "one number" if ndim == 0 else "a list of numbers"
         raise ValueError(f"the {name} of {type(owner).__name__} must be {wanted}, not of shape {value.shape}")
     if isinstance(value, jax.core.Tracer):
         return
-    # Under `jax.jit`, JAX would trace the comparison even if both numbers are constants, so NumPy compares
-    # them.
+    # NumPy makes this comparison, because under `jax.jit`, JAX traces even comparisons between constants.
     host = np.asarray(value)
     if not ((low < host) & (host < high)).all():
         limits = f"between {low:g} and {high:g}" if math.isfinite(high) else f"finite and above {low:g}"
@@ -76,7 +75,7 @@ def check_between(
 
 
 def counts_iterations(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
-    """Decorates a compiled function so that its argument `iterations` may be an integer of any type.
+    """Decorate a compiled function so that its argument `iterations` may be an integer of any type.
 
     Apply this decorator outside `equinox.filter_jit`, which would otherwise trace a NumPy integer.
 
@@ -94,7 +93,7 @@ def counts_iterations(function: Callable[Parameters, Returned]) -> Callable[Para
 
 
 def _whole_number(caller: str, iterations: object) -> int:
-    """Returns the number of iterations as a Python integer."""
+    """Return the number of iterations as a Python integer."""
     try:
         number = operator.index(iterations)  # type: ignore[arg-type]
     except TypeError:

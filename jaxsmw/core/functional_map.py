@@ -1,18 +1,19 @@
 r"""The functional map of a pointwise map, and the wavelet-preservation energy.
 
-T: X -> Y is a pointwise map, and P (m, n) is its matrix, with a one at (x, T(x)) in each row x. Phi_X and
-Phi_Y contain the eigenvectors as columns. C_0 is the functional map of T before any filtering. There are two
-conventions for the direction of a functional map C:
+The pointwise map T: X -> Y has a matrix P (m, n), whose row x has a one in column T(x) and zeros elsewhere.
+Phi_X and Phi_Y contain the eigenvectors as columns. C_0 is the functional map of T before any filtering.
+There are two conventions for the direction of a functional map C:
 
 - **pullback** (default): `C` (k_X, k_Y) maps functions on Y to functions on X, and `C_0 = Phi_X^+ P Phi_Y`.
   The MWP authors' program uses this convention.
 - **pushforward**: `C` (k_Y, k_X) maps functions on X to functions on Y, and `C_0 = Phi_Y^+ P^T Phi_X`. The
   equations of the MWP paper use this convention.
 
-This module calls the shape that C maps from "in" and the shape that C maps to "out". In both conventions,
-every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x. Ideally, C maps a_x to
-b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which equation (5) of the
-MWP paper uses, all vertices have the same weight. The following table defines the weights and the vectors:
+In this module, "in" denotes the shape that C maps from, and "out" denotes the shape that C maps to. In both
+conventions, every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x. Ideally, C
+maps a_x to b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which equation
+(5) of the MWP paper uses, all vertices have the same weight. The following table defines the weights and the
+vectors:
 
 | convention  | norm      | weight w_x | input a_x          | output b_x                           |
 |-------------|-----------|------------|--------------------|--------------------------------------|
@@ -38,10 +39,10 @@ m x n:
 
 The minimiser solves the linear system `C gram = cross` with the (k_in, k_in) matrix `gram`. The inputs are
 called orthonormal if `sum_x w a a^T` is the identity. Then `gram` is a diagonal matrix that contains the
-frame function, and the minimiser is `cross` with each column divided by the frame function. For a Parseval
-frame, this minimiser is the filtered map of equation (8) of the MWP paper. In the pushforward convention with
-the area norm, the inputs are always orthonormal. In the pullback convention with the area norm, the inputs
-are orthonormal if T preserves area. `docs/frames.md` derives these results.
+values of the frame function. The minimiser is `cross` with each column divided by the corresponding value.
+For a Parseval frame, this minimiser is the filtered map of equation (8) of the MWP paper. In the pushforward
+convention with the area norm, the inputs are always orthonormal. In the pullback convention with the area
+norm, the inputs are orthonormal if T preserves area. `docs/frames.md` derives these results.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ Side = TypeVar("Side")
 
 
 def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-    """Returns the two arguments in the order (out, in).
+    """Return the two arguments in the order (out, in).
 
     "Out" is the shape that C maps to, and "in" is the shape that C maps from. So the order is (X, Y) in the
     pullback convention and (Y, X) in the pushforward convention. If its arguments are in the order (out, in),
@@ -81,7 +82,7 @@ def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Si
 
 
 def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Float[Array, "n k"]:
-    """Returns the transpose (n, k) of the pseudo-inverse `Phi^+` (k, n) of the eigenvectors.
+    """Return the transposed pseudo-inverse of the eigenvectors: `Phi^+` (k, n) as an array (n, k).
 
     **Arguments:**
 
@@ -110,10 +111,10 @@ def encode(
     convention: Convention = "pullback",
     pseudo_inverse: PseudoInverse = "area",
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the functional map C_0 of a pointwise map T: X -> Y, without any filtering.
+    """Return the functional map C_0 of a pointwise map T: X -> Y, without any filtering.
 
     Phi_X and Phi_Y contain the eigenvectors as columns, and `Phi^+` is a pseudo-inverse of Phi. P (m, n) is
-    the matrix of T, with a one at (x, T(x)) in each row x.
+    the matrix of T: row x has a one in column T(x) and zeros elsewhere.
 
     **Arguments:**
 
@@ -142,7 +143,7 @@ def _encode(
     eigenvectors_in: Float[Array, "n_in k_in"],
     convention: Convention,
 ) -> Float[Array, "k_out k_in"]:
-    """Computes the result of `encode` from dual eigenvectors that the caller provides.
+    """Compute the result of `encode` from dual eigenvectors that the caller provides.
 
     Padded vertices of X do not contribute, because their eigenvectors and dual eigenvectors are zero.
     """
@@ -154,12 +155,12 @@ def _encode(
 def multiscale_kernel(
     responses_out: Float[Array, "filters k_out"], responses_in: Float[Array, "filters k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the multiscale kernel K (k_out, k_in), which turns filtering into an elementwise product.
+    """Return the multiscale kernel K (k_out, k_in), which turns filtering into an elementwise product.
 
     For a bank with filters g_l and any functional map C (k_out, k_in), the filtered map
-    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The diagonal matrices
-    Lambda_out and Lambda_in contain the eigenvalues of the shape that C maps to and of the shape that C maps
-    from.
+    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The diagonal matrix
+    Lambda_out contains the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains
+    the eigenvalues of the shape that C maps from.
 
     **Arguments:**
 
@@ -193,11 +194,11 @@ class QuadraticEnergy(eqx.Module):
 
     @classmethod
     def zero(cls, k_out: int, k_in: int, dtype: DTypeLike) -> QuadraticEnergy:
-        """Returns the energy that is zero for every C."""
+        """Return the energy that is zero for every C."""
         return cls(jnp.zeros((k_in, k_in), dtype), jnp.zeros((k_out, k_in), dtype), jnp.zeros((), dtype))
 
     def __call__(self, functional_map: Float[Array, "k_out k_in"]) -> Float[Array, ""]:
-        """Returns the energy of a functional map.
+        """Return the energy of a functional map.
 
         The energy is a difference of large sums, so rounding errors can make it slightly negative.
         """
@@ -212,25 +213,25 @@ class QuadraticEnergy(eqx.Module):
         return QuadraticEnergy(weight * self.gram, weight * self.cross, weight * self.constant)
 
     def minimizer(self) -> Float[Array, "k_out k_in"]:
-        """Returns the functional map of least energy, (k_out, k_in), by one Cholesky factorisation.
+        """Return the functional map of least energy, (k_out, k_in), by one Cholesky factorisation.
 
         If the gram matrix is singular, the returned map is NaN or meaningless; `is_regular` detects this.
         """
         return jsp.linalg.cho_solve((self.cholesky(), True), self.cross.T).T
 
     def cholesky(self) -> Float[Array, "k_in k_in"]:
-        """Returns the lower Cholesky factor of the gram matrix, (k_in, k_in)."""
+        """Return the lower Cholesky factor of the gram matrix, (k_in, k_in)."""
         return jnp.linalg.cholesky(self.gram, symmetrize_input=False)
 
     def is_regular(self) -> Bool[Array, ""]:
-        """Returns whether the gram matrix is non-singular to working precision."""
+        """Return whether the gram matrix is non-singular to working precision."""
         # If the gram matrix is singular, one of its Cholesky pivots is negative or as small as the rounding
         # error. If a pivot is negative, the factor contains NaN, and the comparison below is False.
         pivots = jnp.diagonal(self.cholesky()) ** 2
         return jnp.min(pivots) > self.rounding()
 
     def rounding(self) -> Float[Array, ""]:
-        """Returns an estimate of the rounding error of the gram matrix.
+        """Return an estimate of the rounding error of the gram matrix.
 
         The estimate is k_in times the largest diagonal entry times the machine epsilon.
         """
@@ -238,7 +239,7 @@ class QuadraticEnergy(eqx.Module):
         return jnp.max(jnp.diagonal(self.gram)) * jnp.asarray(relative, self.gram.dtype)
 
     def condition_number(self) -> Float[Array, ""]:
-        """Returns the ratio of the largest to the smallest eigenvalue of the gram matrix.
+        """Return the ratio of the largest to the smallest eigenvalue of the gram matrix.
 
         The ratio is infinite if the matrix is singular.
         """
@@ -247,7 +248,7 @@ class QuadraticEnergy(eqx.Module):
 
 
 class WaveletProblem(eqx.Module):
-    """The data from which a `Solution` computes the functional map C of a pointwise map from X to Y.
+    """The data that a `Solution` needs to compute the functional map C of a pointwise map from X to Y.
 
     The properties `spectra` and `responses` are pairs in the order (out, in): first the shape that C maps to,
     then the shape that C maps from. A solution can therefore use the same code for both conventions.
@@ -271,7 +272,7 @@ class WaveletProblem(eqx.Module):
     sampled: bool = eqx.field(static=True, default=False)
 
     def out_and_in(self, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-        """Returns the two arguments in the order (out, in)."""
+        """Return the two arguments in the order (out, in)."""
         return out_and_in(self.convention, of_x, of_y)
 
     @property
@@ -287,7 +288,7 @@ class WaveletProblem(eqx.Module):
     def encode(
         self, pointwise_map: PointwiseMap, dual_out: Float[Array, "n_out k_out"]
     ) -> Float[Array, "k_out k_in"]:
-        """Returns the functional map C_0 (k_out, k_in) of a pointwise map, without any filtering.
+        """Return the functional map C_0 (k_out, k_in) of a pointwise map, without any filtering.
 
         **Arguments:**
 
@@ -298,7 +299,7 @@ class WaveletProblem(eqx.Module):
         return _encode(pointwise_map, dual_out, spectrum_in.eigenvectors, self.convention)
 
     def energy(self, pointwise_map: PointwiseMap, *, norm: Norm = "area") -> QuadraticEnergy:
-        """Returns the wavelet-preservation energy (equation (5) of the MWP paper) as a function of C.
+        """Return the wavelet-preservation energy (equation (5) of the MWP paper) as a function of C.
 
         For each functional map C, the energy is a weighted sum of squared distances over all filters and all
         vertices x of X. In the pullback convention, C maps the wavelet at the match of x to a function on X.
@@ -306,9 +307,9 @@ class WaveletProblem(eqx.Module):
         module `jaxsmw.core.functional_map` states the formula, which holds for every filter bank.
 
         `problem.energy(T)(C)` is the energy of C. `problem.energy(T).minimizer()` is the C of least energy,
-        also for frames that are not tight. `problem.energy(T).constant` is the energy of C = 0. In the
-        pullback convention with the area norm, this constant is `sum_i G_X(lambda_i)`, where G_X is the frame
-        function at the eigenvalues lambda_i of X. For a Parseval frame this sum is k_X.
+        even if the frame is not tight. `problem.energy(T).constant` is the energy of C = 0. In the pullback
+        convention with the area norm, this constant is `sum_i G_X(lambda_i)`, where G_X is the frame function
+        at the eigenvalues lambda_i of X. For a Parseval frame this sum is k_X.
 
         **Arguments:**
 
@@ -330,7 +331,7 @@ class WaveletProblem(eqx.Module):
     def _weights_inputs_outputs(
         self, pointwise_map: PointwiseMap, norm: Norm
     ) -> tuple[Float[Array, "m 1"], Float[Array, "m k_in"], Float[Array, "m k_out"]]:
-        """Returns the weights w_x, inputs a_x and outputs b_x that the module docstring defines."""
+        """Return the weights w_x, inputs a_x and outputs b_x that the module docstring defines."""
         mask, eigenvectors_x = self.spectrum_x.mask[:, None], self.spectrum_x.eigenvectors
         areas_x = jnp.where(mask, self.spectrum_x.vertex_areas[:, None], 0)
         if self.convention == "pullback":

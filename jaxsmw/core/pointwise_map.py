@@ -20,7 +20,7 @@ def spectral_embeddings(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Returns spectral embeddings of X and Y: point sets in which matched vertices are close to each other.
+    """Return spectral embeddings of X and Y: point sets in which matched vertices are close to each other.
 
     The matrices Phi_X and Phi_Y contain the eigenvectors as columns. In the pullback convention, the points
     of X are the rows of `Phi_X`, and the points of Y are the rows of `Phi_Y C^T`. In the pushforward
@@ -57,7 +57,7 @@ def decode(
     convention: Convention = "pullback",
     patches: tuple[Patches, Patches] | None = None,
 ) -> Int32[Array, " m"]:
-    """Recovers the pointwise map T: X -> Y from a functional map C by nearest-neighbour search.
+    """Recover the pointwise map T: X -> Y from a functional map C by nearest-neighbour search.
 
     This computation is step 3 of Algorithm 1 of the MWP paper. T maps each vertex of X to the unmasked vertex
     of Y that is nearest in spectral space. Phi_X and Phi_Y contain the eigenvectors as columns. In the
@@ -91,7 +91,7 @@ def decode_to_triangles(
     *,
     convention: Convention = "pullback",
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Converts a functional map C to a map from the vertices of X to points on the triangles of Y.
+    """Convert a functional map C to a map from the vertices of X to points on the triangles of Y.
 
     The method is that of Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The
     vertices of both shapes become points in spectral space. The matrices Phi_X and Phi_Y contain the
@@ -102,8 +102,8 @@ def decode_to_triangles(
     If X is finer than Y, `decode` maps several neighbouring vertices of X to the same vertex of Y.
     `decode_to_triangles` can map neighbouring vertices to different points. Textures and other functions on Y
     therefore stay smooth when they are transferred to X. For shapes of 5000 vertices, `decode_to_triangles`
-    takes about one second, ten times as long as `decode` without patches. The time grows with the product of
-    the numbers of vertices of X and Y.
+    takes about one second, ten times as long as `decode` without patches. The time grows with the number of
+    vertices of X times the number of vertices of Y.
 
     **Arguments:**
 
@@ -125,14 +125,14 @@ def decode_to_triangles(
 
 
 def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches]:
-    """Returns patches of both shapes, for the argument `patches` of `decode`.
+    """Return patches of both shapes, for the argument `patches` of `decode`.
 
     A patch is a group of neighbouring vertices, which a nearest-neighbour search can skip as a whole. Patches
     make `decode` faster on large shapes. The same patches can be used for all functional maps between X and
     Y.
 
-    The number of vertices per patch of Y grows with the square root of Y's number of vertices. With patches
-    of this size, the time of a search grows with the number of vertices to the power 1.5.
+    A patch of Y contains more vertices if Y is finer: the patch size grows with the square root of Y's number
+    of vertices. With patches of this size, the search time grows as the number of vertices to the power 1.5.
 
     **Arguments:**
 
@@ -151,7 +151,7 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
 def chosen_patches(
     search: Search, spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> tuple[Patches, Patches] | None:
-    """Returns the result of `search_patches` if the setting `search` needs patches, and None otherwise.
+    """Return the result of `search_patches` if the setting `search` needs patches, and None otherwise.
 
     `"patches"` always uses patches, and `"exhaustive"` never uses patches. `"auto"` uses patches if the
     default backend is a CPU and the geometric mean of the two numbers of vertices is at least 15 000.

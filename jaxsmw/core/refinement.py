@@ -29,15 +29,15 @@ class History(eqx.Module):
 
     **Attributes:**
 
-    - `changed`: (iterations,), the share, from 0 to 1, of the vertices of X whose match changed in each
-      iteration. If the refinement uses samples, `changed` is computed from the samples of X only, and its
-      first and last entries are NaN.
+    - `changed`: (iterations,), the share of X's vertices whose match changed in each iteration, from 0 to 1.
+      If the refinement uses samples, `changed` is computed from the samples of X only, and its first and last
+      entries are NaN.
     - `energy`: (iterations,), the result of `Refiner.energy` in each iteration, computed from the state and
       from the pointwise map that produced this state. For `WaveletPreservation`, this is the energy of
       equation (5) of the MWP paper.
     - `objective`: (iterations,), the result of `Refiner.objective` in each iteration, computed from the state
-      and from the pointwise map that was recovered from this state. This is the mean squared distance between
-      matched points of the embeddings, in which lower is better.
+      and from the pointwise map that was recovered from this state. The objective is the mean squared
+      distance between matched points of the embeddings; lower is better.
     - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. The entries of
       skipped iterations repeat the final map. After a failure, all entries of `pointwise_maps` are -1.
       `pointwise_maps` is None if the refinement uses samples, because the iterations then map only the
@@ -81,7 +81,7 @@ class Refinement(eqx.Module):
         return self.state.functional_map
 
     def unpadded(self, number_of_vertices: int) -> Refinement:
-        """Returns the same refinement without the vertices that `Spectrum.pad` added to X.
+        """Return the same refinement without the vertices that `Spectrum.pad` added to X.
 
         **Arguments:**
 
@@ -123,7 +123,7 @@ def refine(
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
-    - `pointwise_map`: the initial map T, an integer array (m,). The array contains, for each vertex of X, the
+    - `pointwise_map`: the initial map T, an integer array (m,). Entry i is the match of vertex i of X, as the
       index of a vertex of Y, from 0 to n - 1.
     - `refiner`: the method, a `Refiner`. The default is `WaveletPreservation()`, the method of the MWP paper.
     - `iterations`: the number of iterations, an integer of at least 1. Each iteration computes a functional
@@ -200,10 +200,10 @@ class _Record(NamedTuple):
     pointwise_map: Int32[Array, "*iterations m"] | None
 
     def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
-        """Appends the final search of all vertices to the record of a refinement on samples.
+        """Append the final search of all vertices to the record of a refinement on samples.
 
-        The first and the last map cannot be compared with an earlier map of the same vertices. Their entries
-        in `changed` become NaN.
+        The first and the last map cannot be compared with an earlier map of the same vertices, so their
+        entries in `changed` become NaN.
         """
         undefined = jnp.asarray(jnp.nan, self.changed.dtype)
         return _Record(
@@ -214,7 +214,7 @@ class _Record(NamedTuple):
         )
 
     def history(self, successful: Bool[Array, ""]) -> History:
-        """Returns the `History`. If the refinement failed, all entries of its pointwise maps are -1."""
+        """Return the `History`. If the refinement failed, all entries of its pointwise maps are -1."""
         maps = self.pointwise_map
         if maps is not None:
             maps = jnp.where(successful, maps, -1)
@@ -239,7 +239,7 @@ class _Loop:
     def init(
         self, in_full: Prepared, pointwise_map: Int32[Array, " m"], first_map: Int32[Array, " s"]
     ) -> _Progress:
-        """Computes the first state from the initial map of all vertices.
+        """Compute the first state from the initial map of all vertices.
 
         The first iteration compares its map with `first_map` to count the changed matches. `first_map` is the
         initial map or, if the loop runs on samples, an array of -1.
@@ -256,7 +256,7 @@ class _Loop:
         )
 
     def step(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, _Record]:
-        """Runs one iteration, or does nothing if the loop has terminated."""
+        """Run one iteration, or do nothing if the loop has terminated."""
         if not self.stop_when_unchanged:
             return self._iterate(progress, is_last)
         return lax.cond(
@@ -264,15 +264,15 @@ class _Loop:
         )
 
     def terminate(self, progress: _Progress) -> Bool[Array, ""]:
-        """Returns whether the loop has finished its last iteration."""
+        """Return whether the loop has finished its last iteration."""
         return progress.finished
 
     def search(
         self, prepared: Prepared, state: State, before: Int32[Array, " s"]
     ) -> tuple[Int32[Array, " s"], Float[Array, ""], Float[Array, ""]]:
-        """Recovers the pointwise map from a state.
+        """Recover the pointwise map from a state.
 
-        Returns the map, the share of matches that differ from the map `before`, and the objective.
+        Return the map, the share of matches that differ from the map `before`, and the objective.
         """
         after = self.refiner.recover(prepared, state)
         mask = prepared.spectrum_x.mask
@@ -339,7 +339,7 @@ def _check_arguments(
 
 
 def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """Checks that both arguments are spectra and have the same float type.
+    """Check that both arguments are spectra and have the same float type.
 
     **Raises:** `TypeError` if an argument is not a `Spectrum`; `ValueError` if the spectra have different
     float types.
@@ -355,10 +355,10 @@ def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
 
 
 def checked(state: State, result: RESULTS) -> RESULTS:
-    """Checks the state that an update computed, and returns the status code of the update.
+    """Check the state that an update computed, and return the status code of the update.
 
-    If `result` is a failure, this failure is returned unchanged. A state that contains NaN or infinity is a
-    failure, and so is a functional map whose entries are all zero.
+    If `result` is a failure, this failure is returned unchanged. A state also counts as a failure if it
+    contains NaN or infinity, or if all entries of its functional map are zero.
     """
     went_well = result == RESULTS.successful
     finite, zero = all_finite(state), jnp.all(state.functional_map == 0)
@@ -369,7 +369,7 @@ def checked(state: State, result: RESULTS) -> RESULTS:
 def diagnose(
     spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m ..."] | None, result: RESULTS
 ) -> RESULTS:
-    """Checks the inputs of a refinement, and returns the status code of the refinement.
+    """Check the inputs of a refinement, and return the status code of the refinement.
 
     If a spectrum contains NaN or infinity, or the initial map is invalid, the status code names this fault.
     If the inputs are valid, `result` is returned unchanged.

@@ -24,7 +24,7 @@ class Problem(eqx.Module):
     **Attributes:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of source X (m vertices) and target Y (n vertices).
-    - `samples`: a pair of integer arrays, the sampled vertices of X (s_x,) and of Y (s_y,); None if the
+    - `samples`: the sampled vertices of X (s_x,) and of Y (s_y,), as a pair of integer arrays; None if the
       refiner iterates on all vertices.
     - `partial`: whether one shape is a part of the other. If True, both shapes must have the same unit of
       length.
@@ -36,7 +36,7 @@ class Problem(eqx.Module):
     partial: bool = eqx.field(static=True, default=False)
 
     def query_spectra(self) -> tuple[Spectrum, Spectrum]:
-        """Returns the spectra of X and of Y at the vertices on which the refiner iterates.
+        """Return the spectra of X and of Y at the vertices on which the refiner iterates.
 
         The refiner iterates on the samples or, if the problem has no samples, on all vertices.
         """
@@ -116,7 +116,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
     @abc.abstractmethod
     def prepare(self, problem: Problem) -> PreparedT:
-        """Returns the values that stay the same in all iterations, as a `Prepared`.
+        """Return the values that stay the same in all iterations, as a `Prepared`.
 
         **Arguments:**
 
@@ -127,7 +127,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def update(
         self, prepared: PreparedT, pointwise_map: Int[Array, " m"], previous: StateT | None
     ) -> tuple[StateT, RESULTS]:
-        """Computes a state from a pointwise map. Returns the state and a status code (a member of `RESULTS`).
+        """Compute a state from a pointwise map. Return the state and a status code (a member of `RESULTS`).
 
         **Arguments:**
 
@@ -138,7 +138,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
     @abc.abstractmethod
     def recover(self, prepared: PreparedT, state: StateT) -> Int32[Array, " m"]:
-        """Recovers the pointwise map X -> Y (m,) from a state.
+        """Recover the pointwise map X -> Y (m,) from a state.
 
         The map contains one vertex of Y per vertex of `prepared.spectrum_x`. For the same `prepared`,
         `update` must accept this map as its argument `pointwise_map`.
@@ -146,15 +146,15 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
     @abc.abstractmethod
     def recover_reverse(self, prepared: PreparedT, state: StateT) -> Int32[Array, " n"]:
-        """Recovers the reverse map Y -> X (n,) from a state.
+        """Recover the reverse map Y -> X (n,) from a state.
 
-        The map assigns to each vertex of Y the vertex of X that is nearest in the `embeddings`. `prepared`
-        must be the result of `prepare` for a problem without samples.
+        The map sends each vertex of Y to the nearest vertex of X in the `embeddings`. `prepared` must be the
+        result of `prepare` for a problem without samples.
         """
 
     @abc.abstractmethod
     def energy(self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]) -> Float[Array, ""]:
-        """Returns the quantity that the method minimises, as a scalar array.
+        """Return the quantity that the method minimises, as a scalar array.
 
         `jaxsmw.refine` stores this quantity in `History.energy`.
 
@@ -168,20 +168,21 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def embeddings(
         self, prepared: PreparedT, state: StateT
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Returns two point sets in which each vertex of X is close to its match on Y.
+        """Return two point sets in which each vertex of X is close to its match on Y.
 
-        In these embeddings, `jaxsmw.Correspondence.surface_points` finds the nearest point to each vertex of
-        X on the triangles around its match.
+        For each vertex of X, `jaxsmw.Correspondence.surface_points` searches the triangles around its match.
+        The result is the point of these triangles that is nearest in the embeddings.
 
-        **Returns:** One point per vertex of X to be matched (m, d), and one point per vertex of Y (n, d).
-        Each refiner chooses the dimension d and the unit, which is the same for both point sets.
+        **Returns:** Two arrays: one point for each vertex of X to be matched (m, d), and one point for each
+        vertex of Y (n, d). Each refiner chooses the dimension d and the unit, which is the same for both
+        point sets.
         """
         return spectral_embeddings(state.functional_map, prepared.spectrum_x, prepared.spectrum_y)
 
     def objective(
         self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the area-weighted mean squared distance between matched points of the `embeddings`.
+        """Return the area-weighted mean squared distance between matched points of the `embeddings`.
 
         The result is a scalar array, which `jaxsmw.refine` stores in `History.objective`.
 
@@ -196,7 +197,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         return jnp.sum(areas * jnp.sum((queries - database[pointwise_map]) ** 2, axis=1)) / jnp.sum(areas)
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
-        """Returns whether all iterations after a state use the same settings, such as the same eigenvectors.
+        """Return whether all iterations after a state use the same settings, such as the same eigenvectors.
 
         If the settings stay the same, a map that one iteration leaves unchanged also stays unchanged in all
         later iterations. `jaxsmw.refine` therefore stops early only if this method returns True. The default
@@ -220,7 +221,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
 
 def reverse_map(refiner: Refiner, problem: Problem, state: State) -> Int32[Array, " n"]:
-    """Recovers the reverse map Y -> X (n,) of a refiner's state for all vertices.
+    """Recover the reverse map Y -> X (n,) of all vertices from a refiner's state.
 
     **Arguments:**
 

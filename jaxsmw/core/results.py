@@ -56,7 +56,7 @@ class RESULTS(eqx.Enumeration):
 
 
 def where(condition: Bool[Array, ""] | bool, if_true: RESULTS | str, if_false: RESULTS | str) -> RESULTS:
-    """Returns the status code `if_true` if the condition is True, and `if_false` otherwise.
+    """Return the status code `if_true` if the condition is True, and `if_false` otherwise.
 
     The annotations include `str` because type checkers treat the members of an Enumeration as strings.
     """
@@ -64,5 +64,5 @@ def where(condition: Bool[Array, ""] | bool, if_true: RESULTS | str, if_false: R
 
 
 def sentence(result: RESULTS) -> str:
-    """Returns the text that explains a status code to the user."""
+    """Return the text that explains a status code to the user."""
     return RESULTS[result]  # type: ignore[misc]

@@ -41,7 +41,7 @@ def nearest_neighbor(
     *,
     database_mask: Bool[Array, " n"] | None = None,
 ) -> Int32[Array, " m"]:
-    """Returns, for each query, the index of the database row that is nearest in Euclidean distance.
+    """Return, for each query, the index of the database row that is nearest in Euclidean distance.
 
     The search compares every query with every row, and it is exact up to rounding errors. If several database
     rows are identical, the search returns the lowest of their indices. The queries are processed in blocks,
@@ -92,7 +92,7 @@ def in_blocks(
     queries: Float[Array, "m d"],
     size: int,
 ) -> Shaped[Array, "m ..."]:
-    """Returns the results of `search` for all queries, one row per query (m, ...).
+    """Return the results of `search` for all queries, one row per query (m, ...).
 
     The function `search` is called once for each block (size, d) of queries. The last block is padded with
     rows of zeros.
@@ -105,11 +105,11 @@ def in_blocks(
 
 
 def _maximum(values: Array, axis: int, parts: int) -> Array:
-    """Returns the maximum along an axis.
+    """Return the maximum along an axis.
 
-    The axis is first divided into parts of equal width, which may overlap. The elementwise maximum of all
-    parts has this width, and the function returns its maximum along the axis. On CPUs, this order of
-    operations reduces the time of a search by about 10 %.
+    The function divides the axis into parts of equal width, which may overlap, and computes the elementwise
+    maximum of all parts. The result is the maximum of this narrower array along the axis. On CPUs, this order
+    of operations reduces the time of a search by about 10 %.
     """
     size = values.shape[axis]
     width = -(-size // parts)
@@ -119,7 +119,7 @@ def _maximum(values: Array, axis: int, parts: int) -> Array:
 
 
 def _two_best(scores: Float[Array, "s block"]) -> Int[Array, "2 block"]:
-    """Returns the indices of the largest and the second largest score of each query."""
+    """Return the indices of the largest and the second largest score of each query."""
     first = jnp.argmax(scores, axis=0)
     is_first = jnp.arange(scores.shape[0])[:, None] == first[None, :]
     return jnp.stack([first, jnp.argmax(jnp.where(is_first, -jnp.inf, scores), axis=0)])
@@ -132,7 +132,7 @@ def _nearest(
     masked: Bool[Array, "c block"],
     n: int,
 ) -> Int[Array, " block"]:
-    """Returns the database row of the candidate that is nearest to each query.
+    """Return, for each query, the database row of the nearest candidate.
 
     If several candidates are equally near, the result is the lowest row. If all distances are NaN, the result
     is n.
@@ -152,11 +152,11 @@ class Patches(eqx.Module):
 
     **Attributes:**
 
-    - `rows`: (p, s), the indices of the s points of each of the p patches, in ascending order, with padding
-      at the end.
+    - `rows`: (p, s), one row per patch: the indices of the patch's points in ascending order, with padding at
+      the end.
     - `mask`: (p, s), False for padding and for masked points, True for all other points.
-    - `variations`: (p, r, s), the coefficients of r linear combinations of the s points of each patch. These
-      combinations give the r directions along which the points of the patch differ most.
+    - `variations`: (p, r, s), for each patch, the coefficients of r linear combinations of its s points.
+      These combinations are the r directions along which the points of the patch differ most.
     """
 
     rows: Int32[Array, "p s"]
@@ -165,7 +165,7 @@ class Patches(eqx.Module):
 
 
 def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: int, rank: int) -> Patches:
-    """Divides points into patches of equal size by repeated halving.
+    """Divide points into patches of equal size by repeated halving.
 
     Each group of points is halved along one of the first 6 coordinates: the coordinate with the largest
     variance.
@@ -201,9 +201,9 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
 def _halved(
     coordinates: Float[Array, "total c"], mask: Bool[Array, " total"], levels: int
 ) -> Int32[Array, " total"]:
-    """Returns the indices of all points, ordered by patch.
+    """Return the indices of all points, ordered by patch.
 
-    Each of the 2^levels equal parts of this array contains the points of one patch.
+    This array has 2^levels parts of equal length, and each part contains the points of one patch.
     """
     total, dtype = coordinates.shape[0], coordinates.dtype
 
@@ -226,7 +226,7 @@ def _halved(
 
 
 def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: int) -> Float[Array, "p r s"]:
-    """Computes the `variations` (p, r, s) of patches by power iteration."""
+    """Compute the `variations` (p, r, s) of patches by power iteration."""
     _, deviations = _centered(points, mask)
     products = product(deviations, jnp.swapaxes(deviations, 1, 2))
 
@@ -244,7 +244,7 @@ def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: i
 def _centered(
     points: Float[Array, "p s d"], mask: Bool[Array, "p s"]
 ) -> tuple[Float[Array, "p d"], Float[Array, "p s d"]]:
-    """Returns the mean of the points of each group, and the deviations of the points from this mean.
+    """Return the mean of the points of each group, and the deviations of the points from this mean.
 
     The deviations of masked points are zero.
     """
@@ -254,7 +254,7 @@ def _centered(
 
 
 def _orthonormal(vectors: Float[Array, "p r d"]) -> Float[Array, "p r d"]:
-    """Returns r orthonormal vectors for each group, whose span contains the r given vectors of the group."""
+    """Return, for each group, r orthonormal vectors whose span contains the r given vectors of the group."""
     return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(vectors, 1, 2))[0], 1, 2)
 
 
@@ -264,16 +264,16 @@ def nearest_neighbor_in_patches(
     query_patches: Patches,
     database_patches: Patches,
 ) -> Int32[Array, " m"]:
-    """Returns the same indices as `nearest_neighbor`, but skips patches that are too far away.
+    """Return the same indices as `nearest_neighbor`, but skip patches that are too far away.
 
     Each patch of the database has a bounding box with r axes through the centre of the patch. The box also
     has a radius: the largest distance from a point of the patch to the space that the axes span. The box
-    gives a lower bound on the distances from a query to the points of the patch. The computation of this
-    bound needs only r + 1 scalar products. For each query, the patch with the nearest box gives a first
-    candidate. The queries are also divided into patches. The search skips a database patch for a whole patch
-    of queries if the database patch cannot contain a nearer point for any of these queries. The bounds allow
-    for rounding errors, so no nearest point is skipped. If the points are spread evenly in all dimensions,
-    the search skips no patch, and `nearest_neighbor` is faster.
+    gives a lower bound on the distances from a query to the points of the patch. Computing this bound takes
+    only r + 1 scalar products. For each query, the patch with the nearest box gives a first candidate. The
+    queries are divided into patches, too. If a database patch cannot contain a nearer point for any query of
+    a patch, the search skips the database patch for this whole patch of queries. The bounds allow for
+    rounding errors, so no nearest point is skipped. If the points are spread evenly in all dimensions, the
+    search skips no patch, and `nearest_neighbor` is faster.
 
     **Arguments:**
 
@@ -294,7 +294,7 @@ def search_in_patches(
     query_patches: Patches,
     database_patches: Patches,
 ) -> tuple[Int32[Array, " m"], Int32[Array, " p"]]:
-    """Returns the result of `nearest_neighbor_in_patches` (m,), and the numbers of searched patches (p,).
+    """Return the result of `nearest_neighbor_in_patches` (m,), and the numbers of searched patches (p,).
 
     For each of the p patches of queries, the second array contains the number of database patches that were
     searched.
@@ -328,7 +328,7 @@ def nearest_vertices(
     database_mask: Bool[Array, " n"],
     patches: tuple[Patches, Patches] | None,
 ) -> Int32[Array, " m"]:
-    """Returns the index of the database row that is nearest to each query, (m,).
+    """Return, for each query, the index of the nearest database row, (m,).
 
     `patches` contains the patches of the queries and the patches of the database, as returned by
     `make_patches`. If `patches` is None, the search is exhaustive. The exhaustive search never chooses rows
@@ -360,7 +360,7 @@ class _Boxes(NamedTuple):
 
 
 def _boxes(database: Float[Array, "n d"], patches: Patches) -> _Boxes:
-    """Returns the boxes of all patches of a database."""
+    """Return the boxes of all patches of a database."""
     points = database[patches.rows]
     half_norms = jnp.where(patches.mask, 0.5 * jnp.sum(points**2, axis=2), jnp.inf)
     center, deviations = _centered(points, patches.mask)
@@ -389,7 +389,7 @@ class _BoundTables(NamedTuple):
 
 
 def _bound_tables(boxes: _Boxes) -> _BoundTables:
-    """Returns the tables that `_bounds` needs."""
+    """Return the tables that `_bounds` needs."""
     patches, rank, d = boxes.axes.shape
     axes = jnp.concatenate([jnp.swapaxes(boxes.axes, 0, 1).reshape(rank * patches, d), boxes.center])
     offsets = jnp.sum(boxes.axes * boxes.center[:, None, :], axis=2).T
@@ -404,12 +404,12 @@ def _bound_tables(boxes: _Boxes) -> _BoundTables:
 def _bounds(
     tables: _BoundTables, block: Float[Array, "block d"], counts: Bool[Array, " p"]
 ) -> tuple[Float[Array, "p block"], Float[Array, "p block"], list[Float[Array, "p block"]]]:
-    """Computes lower bounds on the distances from queries to the points of patches.
+    """Compute lower bounds on the distances from queries to the points of patches.
 
     **Returns:** Two arrays (p, block) and a list. The first array contains the squared distances from the
     queries to the boxes around the patches. The second array contains lower bounds on the distances from the
-    queries to the points of the patches. Entry i of the list is an array (p, block). It contains
-    coordinate i of each query, relative to the centre of the patch.
+    queries to the points of the patches. Entry i of the list is an array (p, block), which contains
+    coordinate i of each query relative to the centre of each patch.
     """
     rank, patches = tables.offsets.shape
     products = product(tables.axes, block.T)
@@ -431,10 +431,10 @@ def _distance_to_promising_patch(
     squared: Float[Array, "p block"],
     along: list[Float[Array, "p block"]],
 ) -> Float[Array, " block"]:
-    """Returns the distance from each query to one point of the patch with the nearest box.
+    """Return the distance from each query to one point of the patch with the nearest box.
 
-    Among the points of this patch, the function chooses the nearest point after projection onto the axes of
-    the box.
+    Of all points of this patch, the function chooses the one that is nearest to the query after projection
+    onto the axes of the box.
     """
     patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
     # A minimum, followed by a search for its position, takes a third of the time of argmin.
@@ -463,7 +463,7 @@ class _Found(NamedTuple):
 def _two_best_rows(
     boxes: _Boxes, block: Float[Array, "block d"], needed: Bool[Array, " p"]
 ) -> tuple[Int32[Array, "2 block"], Bool[Array, "2 block"]]:
-    """Finds the two best candidates of each query, in two different patches, among the needed patches.
+    """Find, for each query, the two best candidates from two different patches among the needed patches.
 
     Each step of the search compares the queries with _GROUP patches.
 

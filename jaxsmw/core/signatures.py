@@ -18,7 +18,7 @@ from jaxsmw.core.spectrum import Spectrum
 
 
 def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
-    """Returns the heat kernel signature at log-spaced diffusion times (Sun, Ovsjanikov, Guibas 2009).
+    """Return the heat kernel signature at log-spaced diffusion times (Sun, Ovsjanikov, Guibas 2009).
 
     The times run from `4 ln 10 / lambda_max` to `4 ln 10 / lambda_min`. Here lambda_max is the largest
     eigenvalue of the spectrum, and lambda_min is the smallest positive eigenvalue.
@@ -37,7 +37,7 @@ def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
 
 
 def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
-    """Returns the wave kernel signature at evenly spaced logarithmic energies.
+    """Return the wave kernel signature at evenly spaced logarithmic energies.
 
     Aubry, Schlickewei, Cremers 2011 define this signature. The weights are Gaussians in the logarithm of the
     eigenvalue. The centres of the Gaussians run in even steps from `log lambda_min + 2 width` to
@@ -65,7 +65,7 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
 
 
 def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
-    """Returns the wavelet signature: the scaled squared norm of the Meyer wavelet at each vertex and scale.
+    """Return the wavelet signature: the scaled squared norm of the Meyer wavelet at each vertex and scale.
 
     This signature is a spectral wavelet signature in the sense of Li and Ben Hamza 2013, but with the
     band-pass filter of the Meyer frame from the MWP paper. The filter of each scale is largest at an
@@ -93,7 +93,7 @@ def _signature(spectrum: Spectrum, weights: Float[Array, "dimensions k"]) -> Flo
 
 
 def _positive_range(spectrum: Spectrum) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Returns the smallest positive and the largest eigenvalue.
+    """Return the smallest positive and the largest eigenvalue.
 
     Each connected component has an eigenvalue zero, which rounding can make slightly positive. Eigenvalues up
     to 1e-6 times the largest eigenvalue are therefore treated as zero.

@@ -1,8 +1,8 @@
 """Soft maps, which match each query point to several database points with differentiable shares.
 
 A `Recovery` computes a soft map from two point sets. `Softmax` computes the shares of a query from its
-distances to all points. `NearestFew` uses only the points that are nearest to the query. `Sinkhorn` also
-makes the total area that each database point receives equal to the point's own area.
+distances to all points. `NearestFew` uses only the points that are nearest to the query. `Sinkhorn` adjusts
+the shares so that the total area that each database point receives equals its own area.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class SoftMap(eqx.Module):
       area-weighted mean of the database is the origin.
     - `query_areas`, `database_areas`: the areas a (m,) and b (n,), each with sum 1. Ignored points have area
       zero. The shares of a query of area zero are still computed from its position.
-    - `potentials`: g (n,), without unit. A database row with a higher potential receives larger shares
-      from all queries. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
+    - `potentials`: g (n,), dimensionless. A database row with a higher potential receives larger shares from
+      all queries. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
       computed.
     - `temperature`: the temperature, a scalar array in squared units of the points.
-    - `residual`: the part of the total area, from 0 to 1, that database rows receive in excess of their own
-      areas. It is NaN if `Softmax` computed the map, because `Softmax` computes no residual.
+    - `residual`: the share of the total area that database rows receive in excess of their own areas, from 0
+      to 1. The residual is NaN if `Softmax` computed the map, because `Softmax` computes no residual.
     - `converged`: whether the residual is at most the argument `tolerance` of `sinkhorn`; False if the
       residual is NaN.
     - `iterations`: the number of iterations that `sinkhorn` ran; 0 if `Softmax` computed the map.
@@ -67,7 +67,7 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Transfers functions on Y, such as colours, to the queries.
+        """Transfer functions on Y, such as colours, to the queries.
 
         Each query receives the mean of the values at the database rows, weighted with its shares.
 
@@ -95,7 +95,7 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """Returns, for each query, the index of the database row with the largest share per area, (m,).
+        """Return, for each query, the index of the database row with the largest share per area, (m,).
 
         The shares are divided by the areas of the rows, because shares alone would favour rows of large area.
         """
@@ -123,7 +123,7 @@ class SparseSoftMap(eqx.Module):
     shares: Float[Array, "m t"]
 
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Transfers functions on Y, such as colours, to the queries.
+        """Transfer functions on Y, such as colours, to the queries.
 
         Each query receives the mean of the values at the database rows, weighted with its shares.
 
@@ -146,7 +146,7 @@ class SparseSoftMap(eqx.Module):
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
 
     def pointwise_map(self) -> Int32[Array, " m"]:
-        """Returns the index of the nearest database row of each query, (m,)."""
+        """Return, for each query, the index of the nearest database row, (m,)."""
         return self.rows[:, 0]
 
 
@@ -155,7 +155,7 @@ PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
 
 
 def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """Transfers functions on Y to X along a pointwise map or a soft map from X to Y.
+    """Transfer functions on Y to X along a pointwise map or a soft map from X to Y.
 
     With a pointwise map, each vertex of X receives the value at its match. With a soft map, each vertex of X
     receives the mean of the values on Y, weighted with the shares of the vertex. No array of size m x n is
@@ -184,9 +184,9 @@ class Recovery(eqx.Module):
     """A method that computes a soft map from the distances between two point sets.
 
     This class is the abstract base class of recoveries. Pass a recovery to the argument `recovery` of
-    `refine_softly` or `WaveletPreservationLayer`. `refine_softly` passes the m vertices of X in the spectral
-    embedding as queries, and the n vertices of Y as database rows. Ready subclasses are `Softmax`,
-    `NearestFew` and `Sinkhorn`.
+    `refine_softly` or `WaveletPreservationLayer`. In `refine_softly`, the points belong to the spectral
+    embedding: the m vertices of X are the queries, and the n vertices of Y are the database rows. Ready
+    subclasses are `Softmax`, `NearestFew` and `Sinkhorn`.
 
     A subclass is an equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
     The arguments are query points (m, d), database points (n, d), query areas (m,) and database areas (n,).
@@ -202,7 +202,7 @@ class Recovery(eqx.Module):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap | SparseSoftMap:
-        """Returns the soft map from the queries to the database. Database rows of zero area have share zero.
+        """Return the soft map from the queries to the database. Database rows of zero area have share zero.
 
         **Arguments:**
 
@@ -216,8 +216,8 @@ class Softmax(Recovery):
     """A recovery that gives shares to all database rows, and larger shares to nearer rows.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    `refine_softly` passes the m vertices of X in the spectral embedding as queries, and the n vertices of Y
-    as database rows.
+    In `refine_softly`, the points belong to the spectral embedding: the m vertices of X are the queries, and
+    the n vertices of Y are the database rows.
 
     The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
     `distance` is the distance between the query and the row. The result is a `SoftMap`, whose `pull_back`
@@ -245,7 +245,7 @@ class Softmax(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap:
-        """Returns the soft map from the queries to the database; see `Recovery`."""
+        """Return the soft map from the queries to the database; see `Recovery`."""
         transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
         b = transport.database_areas
         unknown, no_iterations = jnp.asarray(jnp.nan, b.dtype), jnp.asarray(0, jnp.int32)
@@ -256,8 +256,8 @@ class NearestFew(Recovery):
     """A recovery that gives shares only to the nearest database rows of each query.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    `refine_softly` passes the m vertices of X in the spectral embedding as queries, and the n vertices of Y
-    as database rows.
+    In `refine_softly`, the points belong to the spectral embedding: the m vertices of X are the queries, and
+    the n vertices of Y are the database rows.
 
     The share of each of the nearest rows is proportional to its area times `exp(-distance² / temperature)`,
     where `distance` is the distance between the query and the row. The shares are differentiable, but
@@ -294,7 +294,7 @@ class NearestFew(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SparseSoftMap:
-        """Returns the soft map from the queries to the database; see `Recovery`."""
+        """Return the soft map from the queries to the database; see `Recovery`."""
         transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
         queries, database, _, b, temperature = transport
         settled_queries, settled = lax.stop_gradient((queries, database))
@@ -315,8 +315,8 @@ class Sinkhorn(Recovery):
     """A recovery by entropy-regularised optimal transport, which preserves the areas of database rows.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    `refine_softly` passes the m vertices of X in the spectral embedding as queries, and the n vertices of Y
-    as database rows.
+    In `refine_softly`, the points belong to the spectral embedding: the m vertices of X are the queries, and
+    the n vertices of Y are the database rows.
 
     The function `sinkhorn` computes the shares. The area that all queries together send to a database row
     equals the area of the row, up to the tolerance. The result is a `SoftMap`, whose `pull_back` transfers
@@ -329,7 +329,7 @@ class Sinkhorn(Recovery):
       0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
       nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
       maps and need more iterations.
-    - `iterations`: the largest number of iterations of `sinkhorn`, an integer of at least 1.
+    - `iterations`: the maximum number of iterations of `sinkhorn`, an integer of at least 1.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
       is at most the tolerance.
 
@@ -357,7 +357,7 @@ class Sinkhorn(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap:
-        """Returns the soft map from the queries to the database; see `Recovery`."""
+        """Return the soft map from the queries to the database; see `Recovery`."""
         return sinkhorn(
             queries,
             database,
@@ -379,7 +379,7 @@ def sinkhorn(
     iterations: int = 200,
     tolerance: float | Float[Array, ""] = 0.01,
 ) -> SoftMap:
-    """Returns the entropy-regularised optimal transport plan between two point sets, as a `SoftMap`.
+    """Return the entropy-regularised optimal transport plan between two point sets, as a `SoftMap`.
 
     The method is that of Cuturi 2013, "Sinkhorn distances: lightspeed computation of optimal transport". A
     transport plan distributes the areas of the queries over the areas of the database rows. The returned plan
@@ -404,7 +404,7 @@ def sinkhorn(
       times the variance. If the temperature is below this error, the error is used as the temperature. In
       this case, derivatives with respect to the temperature are zero. If the temperature is not positive, the
       result is NaN.
-    - `iterations`: the largest number of iterations, an integer of at least 1. Iterations after convergence
+    - `iterations`: the maximum number of iterations, an integer of at least 1. Iterations after convergence
       are skipped. Under `jax.vmap`, iterations after convergence run but change nothing.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
       is at most the tolerance.
@@ -438,7 +438,7 @@ class _SinkhornState(NamedTuple):
 def _sinkhorn_potentials(
     transport: _Transport, iterations: int, tolerance: float | Float[Array, ""]
 ) -> tuple[Float[Array, " n"], Float[Array, ""], Int32[Array, ""]]:
-    """Returns the potentials of `sinkhorn`, their residual, and the number of iterations."""
+    """Return the potentials of `sinkhorn`, their residual, and the number of iterations."""
     queries, database, a, b, temperature = transport
     dtype, (m, d) = queries.dtype, queries.shape
     log_b, rest = _log(b), -m % _BLOCK
@@ -448,7 +448,7 @@ def _sinkhorn_potentials(
     )
 
     def update(potentials: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """Returns the next potentials, and the residual of the given potentials."""
+        """Return the next potentials, and the residual of the given potentials."""
 
         def add(arrived: Float[Array, " n"], block: tuple[Array, Array]) -> tuple[Float[Array, " n"], None]:
             log_shares = _log_kernel(database, block[0], temperature) + (log_b + potentials)[:, None]
@@ -475,7 +475,7 @@ def _sinkhorn_potentials(
 
 
 def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Returns the logarithms of areas.
+    """Return the logarithms of areas.
 
     The logarithm of a zero area is -inf, and its derivative is zero instead of infinity.
     """
@@ -485,7 +485,7 @@ def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
 def _log_kernel(
     database: Float[Array, "n d"], block: Float[Array, "block d"], temperature: Float[Array, ""]
 ) -> Float[Array, "n block"]:
-    """Returns `-distance² / temperature` up to an additive constant for each query.
+    """Return `-distance² / temperature`, up to a constant that depends only on the query.
 
     The queries are on the last axis, so XLA computes sums over the database for several neighbouring queries
     at once. This layout halves the run time.
@@ -513,7 +513,7 @@ class _Transport(NamedTuple):
         converged: Bool[Array, ""],
         iterations: Int32[Array, ""],
     ) -> SoftMap:
-        """Returns the soft map with the given potentials."""
+        """Return the soft map with the given potentials."""
         points, areas = (self.queries, self.database), (self.query_areas, self.database_areas)
         return SoftMap(*points, *areas, potentials, self.temperature, residual, converged, iterations)
 
@@ -525,7 +525,7 @@ def _normalized(
     database_areas: Float[Array, " n"],
     temperature: Float[Array, ""],
 ) -> _Transport:
-    """Scales the inputs of a recovery. The temperature is given in the unit that `sinkhorn` describes.
+    """Scale the inputs of a recovery. The temperature is given in the unit that `sinkhorn` describes.
 
     The centre of the database becomes the origin, because distances between points far from the origin have
     large rounding errors. A temperature that is not positive is replaced by NaN, so all results are NaN. A

@@ -22,7 +22,7 @@ from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
 Step = Callable[[Float[Array, "k_out k_in"]], tuple[Float[Array, "k_out k_in"], RESULTS]]
-"""A function that takes a functional map to the functional map of the next iteration and a status code."""
+"""A function that takes a functional map, and returns the next functional map and a status code."""
 
 
 class SoftRefinement(eqx.Module):
@@ -33,9 +33,9 @@ class SoftRefinement(eqx.Module):
     - `functional_map`: the final functional map C (k_out, k_in). By default, C is a pullback (k_X, k_Y),
       which takes functions on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y,
       k_X) takes functions on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
-    - `soft_map`: the `SoftMap` or `SparseSoftMap` from X to Y that the recovery computes from C. Its
-      `pull_back` transfers functions (n, p) on Y to X (m, p), and its `pointwise_map()` returns an integer
-      array (m,).
+    - `soft_map`: the soft map from X to Y that the recovery computes from C, a `SoftMap` or a
+      `SparseSoftMap`. Its `pull_back` transfers functions (n, p) on Y to X (m, p), and its `pointwise_map()`
+      returns an integer array (m,).
     - `result`: the status code, a member of `RESULTS`. Compare `result` with `RESULTS.successful`.
       `RESULTS[result]` is a sentence that explains the status.
     - `iterations`: the number of functional maps that were computed after the first functional map.
@@ -63,7 +63,7 @@ def refine_softly(
     differentiation: Differentiation = "checkpointed",
     tolerance: float = 1e-4,
 ) -> SoftRefinement:
-    """Refines a map by Algorithm 1 of the MWP paper with soft maps instead of nearest neighbours.
+    """Refine a map by Algorithm 1 of the MWP paper with soft maps instead of nearest neighbours.
 
     The outcome is differentiable with respect to the spectra, the parameters of the filter bank, the weights
     and descriptors of the solution, and the temperature of the recovery. If the initial map is a soft map,
@@ -140,7 +140,7 @@ def refine_softly(
 
 
 def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."] | None:
-    """Returns the vertices of Y that an initial map contains, or None for a dense soft map.
+    """Return the vertices of Y that an initial map contains, or None for a dense soft map.
 
     **Raises:** `ValueError` if the map has the wrong size; `TypeError` if the argument is neither an array
     nor a soft map.
@@ -216,7 +216,7 @@ class WaveletPreservationLayer(eqx.Module):
         spectrum_x: Spectrum,
         spectrum_y: Spectrum,
     ) -> SoftRefinement:
-        """Matches two shapes by the features of their vertices.
+        """Match two shapes by the features of their vertices.
 
         **Arguments:**
 
@@ -265,7 +265,7 @@ class _Loop(NamedTuple):
 def _through_iterations(
     step: Step, first: Float[Array, "k_out k_in"], first_result: RESULTS, iterations: int
 ) -> _Loop:
-    """Runs a fixed number of iterations. Derivatives are computed through all iterations."""
+    """Run a fixed number of iterations. Derivatives are computed through all iterations."""
 
     def follow(state: _State, _: None) -> tuple[_State, None]:
         following, how = step(state.functional_map)
@@ -288,10 +288,10 @@ class _State(NamedTuple):
 def _to_the_fixed_point(
     step: Step, first: Float[Array, "k_out k_in"], iterations: int, tolerance: float
 ) -> _Loop:
-    """Iterates up to the fixed point. Derivatives are computed by the implicit function theorem."""
+    """Iterate up to the fixed point. Derivatives are computed by the implicit function theorem."""
     last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
-    # One more iteration gives the status code of an update and the last change of the functional map, which
-    # the fixed-point solver does not return.
+    # The fixed-point solver returns neither the status code of an update nor the last change of the
+    # functional map. One more iteration computes both.
     after, result = step(lax.stop_gradient(last))
     unsettled = (result == RESULTS.successful) & ~converged
     return _Loop(last, after - last, where(unsettled, RESULTS.fixed_point_not_reached, result), done)
@@ -303,7 +303,7 @@ def _fixed_point(
     iterations: int,
     tolerance: float,
 ) -> tuple[Float[Array, "k_out k_in"], Int32[Array, ""], Bool[Array, ""]]:
-    """Returns the fixed point of a step, the number of iterations, and whether the iterations converged."""
+    """Return the fixed point of a step, the number of iterations, and whether the iterations converged."""
     # These imports are local because they take as long as the computation of an eigenbasis.
     import lineax as lx
     import optimistix as optx
@@ -333,7 +333,7 @@ def _fixed_point(
 def _differentiable_if(
     converged: Bool[Array, ""], functional_map: Float[Array, "k_out k_in"]
 ) -> Float[Array, "k_out k_in"]:
-    """Returns the functional map, with NaN derivatives if the iterations have not converged.
+    """Return the functional map, with NaN derivatives if the iterations have not converged.
 
     The implicit function theorem holds only at fixed points.
     """

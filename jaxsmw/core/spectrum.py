@@ -45,7 +45,7 @@ class Spectrum(eqx.Module):
     normals: Float[Array, "n 3"] | None = None
 
     def truncate(self, number_of_eigenvectors: int) -> Spectrum:
-        """Returns the spectrum with only the first `number_of_eigenvectors` eigenpairs."""
+        """Return the spectrum with only the first `number_of_eigenvectors` eigenpairs."""
         return dataclasses.replace(
             self,
             eigenvalues=self.eigenvalues[:number_of_eigenvectors],
@@ -53,7 +53,7 @@ class Spectrum(eqx.Module):
         )
 
     def scale(self, factor: float) -> Spectrum:
-        """Returns the spectrum of the scaled shape.
+        """Return the spectrum of the scaled shape.
 
         Areas are multiplied by `factor`, and lengths are multiplied by the square root of `factor`.
 
@@ -70,8 +70,10 @@ class Spectrum(eqx.Module):
         )
 
     def reflect(self) -> Spectrum:
-        """Returns the spectrum of the mirror image: the first coordinates of all positions and normals change
-        their signs. The attribute `descriptors` is not changed.
+        """Return the spectrum of the mirror image.
+
+        The first coordinate of each position and of each normal changes its sign. The attribute `descriptors`
+        is not changed.
         """
         flip = jnp.array([[-1, 1, 1]])
         return dataclasses.replace(
@@ -81,7 +83,7 @@ class Spectrum(eqx.Module):
         )
 
     def with_descriptors(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
-        """Returns the spectrum with the given descriptors (n, d), or without descriptors if they are None.
+        """Return the spectrum with the given descriptors (n, d), or without descriptors if they are None.
 
         **Raises:** `ValueError` if the descriptors do not have one row per vertex.
         """
@@ -89,7 +91,7 @@ class Spectrum(eqx.Module):
         return dataclasses.replace(self, descriptors=descriptors)
 
     def with_positions(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
-        """Returns the spectrum with the given vertex positions (n, 3) and unit normals (n, 3).
+        """Return the spectrum with the given vertex positions (n, 3) and unit normals (n, 3).
 
         The positions must have the same unit of length as the vertex areas.
 
@@ -100,9 +102,9 @@ class Spectrum(eqx.Module):
         return dataclasses.replace(self, positions=positions, normals=normals)
 
     def pad(self, number_of_vertices: int) -> Spectrum:
-        """Returns the spectrum with masked vertices appended, up to `number_of_vertices` vertices in total.
+        """Return the spectrum with masked vertices appended, so that it has `number_of_vertices` vertices.
 
-        **Raises:** `ValueError` if the shape already has more vertices.
+        **Raises:** `ValueError` if the shape already has more than `number_of_vertices` vertices.
         """
         rows = number_of_vertices - self.mask.shape[0]
         if rows < 0:
@@ -117,7 +119,7 @@ class Spectrum(eqx.Module):
         )
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
-        """Returns the spectrum at the given vertices only (the samples). All samples receive the same area.
+        """Return the spectrum at the given vertices only (the samples). All samples receive the same area.
 
         The areas of the samples sum to the area of the shape. The eigenvectors are not orthonormal on
         samples, so the pseudo-inverse of the eigenvectors must be computed by least squares.
@@ -141,7 +143,7 @@ class Spectrum(eqx.Module):
             )
 
     def _map_vertex_arrays(self, change: Callable[[Array], Array]) -> Spectrum:
-        """Returns the spectrum with a function applied to all arrays that have one row per vertex."""
+        """Return the spectrum with a function applied to all arrays that have one row per vertex."""
         names = [field.name for field in dataclasses.fields(self) if field.name != "eigenvalues"]
         present = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return dataclasses.replace(self, **{name: change(field) for name, field in present.items()})

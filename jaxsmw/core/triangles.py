@@ -24,7 +24,7 @@ def nearest_point_on_triangles(
     *,
     face_mask: Bool[Array, " f"] | None = None,
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Finds, for each query, the nearest point on a set of triangles in a space of any dimension.
+    """Find, for each query, the nearest point on a set of triangles in a space of any dimension.
 
     The search is exact up to rounding errors, in Euclidean distance. Every query is compared with all
     triangles, but no array of size m x f is stored. If the nearest point belongs to several triangles, for
@@ -76,7 +76,7 @@ def nearest_point_on_candidates(
     rows: Int[Array, " p"],
     candidates: Int[Array, " p"],
 ) -> tuple[Int32[Array, " m"], Float[Array, "m 3"]]:
-    """Finds, for each query, the nearest point on the query's own candidate triangles, in any dimension.
+    """Find, for each query, the nearest point on the query's own candidate triangles, in any dimension.
 
     The time grows with the number of candidates, not with the number of all triangles.
 
@@ -84,10 +84,10 @@ def nearest_point_on_candidates(
 
     - `queries`, `points`, `faces`: (m, d), (n, d) and (f, 3), as in `nearest_point_on_triangles`.
     - `rows`: (p,), for each candidate the index of its query. Every query needs at least one candidate.
-    - `candidates`: (p,), the triangles to compare the query with, as indices of `faces`.
+    - `candidates`: (p,), for each candidate the index of its triangle in `faces`.
 
-    **Returns:** For the nearest point of each query, the triangle (m,), int32, and the barycentric weights
-    (m, 3).
+    **Returns:** Two arrays with one row per query. The first array (m,), int32, contains the index of the
+    triangle with the nearest point. The second array (m, 3) contains the barycentric weights of this point.
     """
 
     def compare(pair: tuple[Int[Array, ""], Int[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, " 2"]]:
@@ -114,8 +114,7 @@ def _closest(
     uv: Float[Array, "*#n"],
     vv: Float[Array, "*#n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Returns the squared distances from points q to triangles, and the coordinates s, t of the nearest
-    points.
+    """Return squared distances from points q to triangles, and the coordinates s, t of the nearest points.
 
     The nearest point of a triangle is `a + s u + t v`, where u and v are the edges from the corner a.
 

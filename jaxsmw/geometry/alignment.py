@@ -14,7 +14,8 @@ _FIRST, _FURTHER = 10, 30
 _BEST = 5
 # The number of iterations with distances to tangent planes.
 _TO_PLANES = 10
-# The result of these iterations is used if it reduces the mean distance by this factor. (Entry R24)
+# The result of these iterations is used only if it reduces the mean distance to less than this fraction of
+# the earlier mean distance. (Entry R24)
 _MUCH_SMALLER = 0.5
 # The first iterations move at most this number of points of x.
 _MOVED_FIRST = 500
@@ -46,13 +47,13 @@ def align_rigidly(
 
     Iterative closest points (Besl, McKay, "A method for registration of 3-D shapes", PAMI 1992) run from the
     identity, from the 24 rotations between the principal axes of both sets, and from the 60 rotations of an
-    icosahedron. Each resulting motion is rated by the mean distance from x to the nearest points of y, plus
-    the mean distance from y to the nearest points of x. The motion with the smallest sum is chosen.
+    icosahedron. Each resulting motion is rated by the sum of two mean distances: from x to the nearest points
+    of y, and from y to the nearest points of x. The motion with the smallest sum is chosen.
 
-    Closest points keep a nearly round surface from sliding into its place, because samples attract each
-    other. If normals are given, further iterations therefore minimise the distances to tangent planes (Chen,
-    Medioni, "Object modelling by registration of multiple range images", 1992). Their result is used only if
-    the shapes fit each other.
+    Iterative closest points prevent a nearly round surface from sliding into place, because samples attract
+    each other. If normals are given, further iterations therefore minimise the distances to tangent planes
+    (Chen, Medioni, "Object modelling by registration of multiple range images", 1992). Their result is used
+    only if the shapes fit each other.
 
     **Arguments:**
 
@@ -98,7 +99,7 @@ def _slide(
     """Minimise the distances of x to the tangent planes at the nearest points of y.
 
     Shapes that only resemble each other slide too far. The new motion is therefore returned only if the mean
-    distance becomes much smaller, as for shapes that fit each other.
+    distance becomes much smaller, as it does for shapes that fit each other.
     """
 
     def to_planes(
@@ -120,13 +121,13 @@ def _slide(
 
 
 def _principal_axes(points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Return a right-handed frame of principal axes, in columns."""
+    """Return a right-handed frame whose columns are the principal axes."""
     axes = np.linalg.svd(points, full_matrices=False)[2].T
     return axes * np.linalg.det(axes)
 
 
 def _rigid_fit(x: Float64[np.ndarray, "p 3"], targets: Float64[np.ndarray, "p 3"]) -> Alignment:
-    """Return the motion that brings each point of x nearest to its target, in the least-squares sense."""
+    """Return the rigid motion that brings the points of x closest to their targets in least squares."""
     middle, middle_of_targets = x.mean(axis=0), targets.mean(axis=0)
     left, _, right = np.linalg.svd((targets - middle_of_targets).T @ (x - middle))
     rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right

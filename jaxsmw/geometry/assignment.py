@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.errors import InputError
 
-# The largest allowed product m n. A computation of this size takes 3 GiB of memory and 15 minutes.
+# The largest allowed product of the numbers of vertices, m n. A computation of this size takes 3 GiB of
+# memory and 15 minutes.
 _LARGEST = 20_000**2
 
 
@@ -26,8 +27,8 @@ def one_to_one_map(
     seconds and 0.7 GiB of memory. The computation time grows with the third power of the number of vertices.
 
     One-to-one maps suit shapes whose vertices correspond one by one, such as shapes with the same
-    triangulation. On other shapes, several vertices of X often have the same best match. A one-to-one map can
-    assign this match to only one of them. On pairs of the remeshed FAUST data set, the restriction to
+    triangulation. On other shapes, several vertices of X often have the same best match, which a one-to-one
+    map can assign to only one of these vertices. On pairs of the remeshed FAUST data set, the restriction to
     one-to-one maps increases the mean geodesic error from 0.022 to 0.062.
 
     **Arguments:**
@@ -40,8 +41,8 @@ def one_to_one_map(
     **Returns:** An integer array (m,): the 0-based vertex of Y for each vertex of X, and -1 for each masked
     vertex of X.
 
-    **Raises:** `InputError` if Y has fewer unmasked vertices than X, or if the two numbers of unmasked
-    vertices have a product above 20 000². Also `InputError` if a point of an unmasked vertex is not finite,
+    **Raises:** `InputError` if Y has fewer unmasked vertices than X, or if the product of these two numbers
+    of vertices is above 20 000². `InputError` is also raised if a point of an unmasked vertex is not finite,
     or if array shapes do not match.
     """
     for points, mask, side in ((embedding_x, mask_x, "x"), (embedding_y, mask_y, "y")):

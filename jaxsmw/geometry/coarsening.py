@@ -25,8 +25,8 @@ class Coarsening(NamedTuple):
       sums to one.
     - `stiffness`, `mass`: the projected matrices P^T W P and P^T A P, each (c, c). W and A are the matrices
       of the original eigenproblem.
-    - `smooth`: a function that applies a low-pass filter to values at vertices (n, j). The filter passes low
-      frequencies, up to slightly above those that the subspace can represent.
+    - `smooth`: a function that applies a low-pass filter to values at vertices (n, j). The filter passes
+      frequencies up to slightly above the highest frequency that the subspace can represent.
 
     Prolongation and smoothing use single precision, whose rounding errors are far smaller than the projection
     errors.
@@ -59,14 +59,15 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
 
     **Returns:** The projected eigenproblem as a `Coarsening`.
 
-    **Raises:** `RuntimeError` if the diagonal of W is not positive. Also `RuntimeError` if a vertex has 100
-    or more neighbours, because the smoothed indicator functions would then overlap everywhere. Also
-    `RuntimeError` if cells larger than four times the mean cell area cover more than 10 % of the surface.
+    **Raises:** `RuntimeError` if the diagonal of W is not positive. `RuntimeError` is also raised if a vertex
+    has 100 or more neighbours, because the smoothed indicator functions would then overlap everywhere.
+    `RuntimeError` is also raised if cells larger than four times the mean cell area cover more than 10 % of
+    the surface.
     """
     n = stiffness.shape[0]
     if (most := int(np.diff(stiffness.indptr).max())) > _MOST_NEIGHBORS:
         raise RuntimeError(f"a vertex has {most - 1} neighbours")
-    # If seeds are more than r edges apart, a cell has about 1.25 (r + 1)² vertices on average.
+    # If seeds are more than r edges apart, a cell contains about 1.25 (r + 1)² vertices on average.
     radius = max(1, round((n / (1.25 * dimensions)) ** 0.5) - 1)
     stiffness = stiffness.tocsr()
     edges = sp.csr_matrix(

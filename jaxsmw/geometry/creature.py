@@ -41,7 +41,7 @@ class CreaturePair:
 
     - `source`: the source, a `Mesh` with m vertices.
     - `target`: the target, a `Mesh` with n vertices.
-    - `truth`: the ground truth as m `SurfacePoints` on the target, one for each source vertex.
+    - `truth`: the ground truth as a `SurfacePoints` with m points on the target, one for each source vertex.
     - `true_map`: the ground truth as a pointwise map (m,), int64, 0-based target vertices.
     """
 
@@ -166,7 +166,7 @@ class _Body:
         self._tubes.append(_Tube(chain[:, :3], chain[:, 3], blend, carved, unit, thickness))
 
     def limb(self, joints: str, parent: str, balls: str, *, blend: float) -> None:
-        """Add a tube with a joint in each ball except the last."""
+        """Add a tube that has a joint in each ball except the last ball."""
         for prefix, side in self._sides(self._individual(balls)):
             above = self.joints.get(prefix + parent, self.joints.get(parent, -1))
             for name, hull in zip(joints.split(), _hulls(side), strict=True):
@@ -621,8 +621,8 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     The two shapes are nearly isometric and are triangulated independently. The source is in the pose
     `"stand"`. The target is the same individual in another, randomly chosen pose, with 1 to 5 % fewer
     vertices. To compute the ground truth, the source vertices are projected onto the target's triangles in
-    the common rest pose. The only errors of the ground truth come from the projection between the two
-    triangulations.
+    the common rest pose. The projection between the two triangulations is the only source of errors in the
+    ground truth.
 
     **Arguments:**
 
@@ -631,9 +631,9 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     - `seed`: a random seed, an integer of at least 0. The seed determines the individual, the poses and the
       triangulations.
 
-    **Returns:** A `CreaturePair` with the attributes `source` and `target` (each a `Mesh`), `truth` (m
-    `SurfacePoints` on the target) and `true_map` (m target vertices). Both bodies are about 1.5 units high.
-    The x axis points to the creature's left, the y axis up and the z axis forward.
+    **Returns:** A `CreaturePair` with the attributes `source` and `target` (each a `Mesh`), `truth` (a
+    `SurfacePoints` with m points on the target) and `true_map` (m target vertices). Both bodies are about 1.5
+    units high. The x axis points to the creature's left, the y axis up and the z axis forward.
 
     **Raises:** `InputError` for an unknown kind, fewer than 500 vertices, a negative seed, or (rarely) a seed
     whose body intersects itself.

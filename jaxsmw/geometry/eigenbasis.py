@@ -49,8 +49,8 @@ def compute_spectrum(
     so that its entry of largest absolute value is positive. The eigenpairs of each connected component are
     computed separately and then merged.
 
-    The exact solver is a shift-invert Lanczos method. The exact solver checks the number of eigenvalues, the
-    residuals and the orthonormality. If the Lanczos method fails, ARPACK computes the eigenpairs.
+    The exact solver is a shift-invert Lanczos method, which checks the number of eigenvalues, the residuals
+    and the orthonormality. If the Lanczos method fails, ARPACK computes the eigenpairs.
 
     The approximate solver is the Rayleigh–Ritz method in a smooth subspace of far fewer dimensions
     (`jaxsmw.geometry.coarsening`). The approximate eigenvectors are also orthonormal, up to rounding errors.
@@ -80,8 +80,8 @@ def compute_spectrum(
     float type is JAX's default (float32 unless `jax_enable_x64` is set). Unreferenced vertices are masked.
 
     **Raises:** `InputError` if k is not an integer, is less than 1, or is not less than the number of
-    referenced vertices. Also `InputError` if the Laplacian or the eigensolver is unknown, if faces without
-    area make the cotangent Laplacian undefined, or if the eigenproblem cannot be solved accurately.
+    referenced vertices. `InputError` is also raised if the Laplacian or the eigensolver is unknown, if faces
+    without area make the cotangent Laplacian undefined, or if the eigenproblem cannot be solved accurately.
     `TypeError` if `mesh` is not a `Mesh`.
     """
     pairs = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
@@ -96,7 +96,8 @@ def as_spectrum(
 ) -> Spectrum:
     """Return the `eigenpairs` of a mesh as a `Spectrum` of JAX's default float type.
 
-    The function adds outward normals, and positions relative to the centroid in units in which the area is 1.
+    The function adds outward normals and positions. The positions are relative to the centroid, in units in
+    which the area is 1.
 
     **Arguments:**
 
@@ -275,8 +276,8 @@ def _number_below(factors: SuperLU) -> int:
 def _factorized_midway(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[float, SuperLU]:
     """Return a shift with about k/2 eigenvalues below it, and the LU factors of W - shift A.
 
-    Weyl's law gives the first trial shift. If the number of eigenvalues below it is far from k/2, as on a
-    thin tube, up to three other shifts are tried.
+    Weyl's law gives the first trial shift. If the number of eigenvalues below this shift is far from k/2, as
+    on a thin tube, up to three other shifts are tried.
     """
     following = 2 * np.pi * k / mass.sum()
     for _ in range(4):
@@ -311,8 +312,8 @@ def _lanczos(
     than ARPACK's restarts.
 
     Blocks of b vectors find at most b copies of a multiple eigenvalue. If the result lacks some eigenvalues,
-    the method is repeated with larger blocks. An eigenpair has converged when its relative residual as an
-    eigenpair of the inverse is at most `tolerance`.
+    the method is repeated with larger blocks. An eigenpair has converged when its relative residual, computed
+    as an eigenpair of the inverse, is at most `tolerance`.
 
     **Raises:** `RuntimeError` if the method does not converge.
     """
@@ -471,7 +472,7 @@ _MOST_LOWERED = 0.015
 
 
 def _slices(number: int) -> Iterator[slice]:
-    """Divide columns into slices of at most 32. Copies of more columns at a time may not fit into memory."""
+    """Return slices of at most 32 columns, because copies of more columns may not fit into memory."""
     return (slice(start, min(start + 32, number)) for start in range(0, number, 32))
 
 

@@ -178,8 +178,8 @@ def _unfold(
     - `depth`: the number of sides to cross.
 
     **Returns:** An iterator with `depth` pairs. Pair i contains the beams that have crossed i + 1 sides. For
-    each of these beams, it also contains the position of the third corner of the triangle that the beam has
-    entered.
+    each of these beams, pair i also contains the position of the third corner of the triangle that the beam
+    has entered.
     """
     right, left = -position * sides.length[side], (1 - position) * sides.length[side]
     beams = _Beams(origin, side, right, left, right, left)
@@ -249,7 +249,7 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
 
     - `mesh`: the surface with n vertices. Boundaries, several connected components and non-manifold edges are
         allowed.
-    - `depth`: the largest number of edges that a straight line may cross, at least 1. On bodies, the shortest
+    - `depth`: the maximum number of edges that a straight line may cross, at least 1. On bodies, the shortest
         paths in a graph of depth 6 are too long by 0.1 to 0.2 % on average. The shortest paths in a graph of
         depth 10 are too long by 0.03 to 0.07 % on average. Searches in a graph of depth 10 take 1.4 times as
         long as in a graph of depth 6.
@@ -307,9 +307,9 @@ def geodesic_distances(
     **Returns:** Distances (s, n), float64, in the unit of the mesh. A distance is inf if no path connects the
     source and the vertex, or if the distance is above the limit.
 
-    **Raises:** `InputError` for sources that are not on the mesh, or an unknown method. With `"exact"`, also
-    `InputError` for `SurfacePoints`, and for meshes with non-manifold edges, non-manifold vertices or faces
-    of almost zero height.
+    **Raises:** `InputError` for sources that are not on the mesh, or an unknown method. With `"exact"`,
+    `InputError` is also raised for `SurfacePoints`, and for meshes with non-manifold edges, non-manifold
+    vertices or faces of almost zero height.
     """
     check_choice(method, GeodesicMethod, "a method for geodesic distances")
     points = check_points(sources, mesh, "sources")
@@ -331,7 +331,7 @@ def geodesic_distances_between(
     *,
     method: GeodesicMethod = "strips",
 ) -> Float64[np.ndarray, " p"]:
-    """Compute the geodesic distance between the two points of each of p pairs.
+    """Compute the geodesic distance between the two points of each given pair.
 
     Pair i consists of `points[i]` and `partners[i]`. The search starts from `points` or from `partners`,
     whichever has fewer distinct points. The radius of the search grows in steps. If the two points of each
@@ -344,10 +344,11 @@ def geodesic_distances_between(
     - `points`, `partners`: p points each, as 0-based vertex indices (p,) or as `SurfacePoints`.
     - `method`: `"strips"` or `"exact"`; see `geodesic_distances`.
 
-    **Returns:** Distances (p,) in the unit of the mesh; inf if no path connects the two points.
+    **Returns:** Distances (p,), one for each of the p pairs, in the unit of the mesh. A distance is inf if no
+    path connects the two points.
 
     **Raises:** `InputError` for points that are not on the mesh, an unknown method, or different numbers of
-    points and partners. With `"exact"`, also `InputError` for `SurfacePoints`, and for meshes with
+    points and partners. With `"exact"`, `InputError` is also raised for `SurfacePoints`, and for meshes with
     non-manifold edges, non-manifold vertices or faces of almost zero height.
     """
     check_choice(method, GeodesicMethod, "a method for geodesic distances")

@@ -36,11 +36,12 @@ def assemble_laplacian(
       intrinsic Delaunay Laplacian (Sharp and Crane 2020), or `"auto"` for the Laplacian that
       `choose_laplacian` returns. The robust Laplacian also handles non-manifold and badly shaped meshes.
 
-    **Returns:** W (n, n), symmetric and positive semi-definite, without unit, and A (n,), in the squared unit
-    of the mesh. The rows of W and the entries of A are zero for unreferenced vertices.
+    **Returns:** The dimensionless matrix W (n, n), which is symmetric and positive semi-definite, and the
+    areas A (n,), in the squared unit of the mesh. The rows of W and the entries of A are zero for
+    unreferenced vertices.
 
-    **Raises:** `InputError` if the cotangent Laplacian is requested but is undefined because faces have no
-    area.
+    **Raises:** `InputError` if the cotangent Laplacian is requested, but faces without area make this
+    Laplacian undefined.
     """
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)

@@ -31,10 +31,10 @@ DEGENERATE_HEIGHT = 1e-10
 # unsuitable unit. Descriptors contain squares of areas, which neither overflow nor underflow within these
 # limits.
 SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
-# The limits for the distances of vertices from the origin and from the middle of the mesh, in units of the
-# median edge length. At `LARGEST_COORDINATE` from the origin, float64 rounds positions by 1e-4 edge lengths.
-# Maps are refined in float32. At `LARGEST_DISTANCE` from the middle of a mesh, float32 rounds positions by
-# 0.1 edge lengths. (The meshes of the data sets measure at most 1e4 edge lengths.)
+# The largest accepted distance of a vertex from the origin, and from the middle of the mesh. Both distances
+# are in units of the median edge length. At `LARGEST_COORDINATE` from the origin, float64 rounds positions by
+# 1e-4 edge lengths. Maps are refined in float32. At `LARGEST_DISTANCE` from the middle of a mesh, float32
+# rounds positions by 0.1 edge lengths. (The meshes of the data sets measure at most 1e4 edge lengths.)
 LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
 
 
@@ -57,7 +57,7 @@ class Mesh:
     - `notes`: a tuple of sentences about changes made by cleaning, and about unusual elements such as
       unreferenced vertices.
     - `dropped_faces`: the faces of the file that cleaning dropped, as ascending 0-based indices (d,). Face
-      numbers in other files, such as ground-truth files, include the dropped faces.
+      numbers in other files, such as ground-truth files, still count the dropped faces.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -103,8 +103,8 @@ class Mesh:
     def vertex_areas(self) -> Float64[np.ndarray, " n"]:
         """The vertex areas (n,), in the squared unit of the vertices.
 
-        A vertex area is a third of the area of the faces around the vertex. Unreferenced vertices have area
-        0.
+        The area of a vertex is a third of the total area of the faces around the vertex. Unreferenced
+        vertices have area 0.
         """
         return self._sum_at_vertices(self.face_areas / 3)
 
@@ -141,7 +141,7 @@ class Mesh:
 
     @cached_property
     def edges(self) -> Int64[np.ndarray, "e 2"]:
-        """The undirected edges (e, 2), each once, lower vertex index first, in lexicographic order."""
+        """The undirected edges (e, 2) in lexicographic order, each once, with its lower index first."""
         return self._edge_table.edges
 
     @cached_property
@@ -175,7 +175,7 @@ class Mesh:
         """A table of all edges, with the number of faces and the orientation balance of each edge.
 
         The orientation balance of an edge is the number of faces that traverse it in one direction, minus the
-        number that traverse it in the opposite direction.
+        number of faces that traverse it in the opposite direction.
         """
         n = len(self.vertices)
         tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
@@ -249,8 +249,8 @@ class Diagnosis:
     def brief_sentences(self) -> tuple[str, ...]:
         """Return a sentence about the size of the mesh, and one with the numbers of all unusual elements.
 
-        The second sentence leaves out unreferenced vertices, because the notes of a mesh report them. Without
-        other unusual elements, there is only the first sentence.
+        The second sentence leaves out unreferenced vertices, because the notes of a mesh report them. If the
+        mesh has no unusual elements besides unreferenced vertices, only the first sentence is returned.
         """
         unusual = self._unusual()
         unusual.pop("unreferenced vertices", None)
@@ -265,7 +265,7 @@ class Diagnosis:
         )
 
     def _unusual(self) -> dict[str, tuple[str, str]]:
-        """Return the number of each kind of unusual element that exists, and its meaning, both as text."""
+        """Return, for each kind of unusual element that exists, the number and the meaning, both as text."""
         loops = count_of(self.boundary_loops, "loop")
         found = {
             "unreferenced vertices": (
@@ -385,15 +385,15 @@ def make_mesh(
 ) -> Mesh:
     """Make a mesh from vertices and faces, or from a mesh of another library, after checks and cleaning.
 
-    The function drops faces that repeat a vertex, and faces with the same three vertices as an earlier face.
-    Vertices are never dropped or renumbered.
+    The function drops two kinds of faces: faces that repeat a vertex, and faces with the same three vertices
+    as an earlier face. Vertices are never dropped or renumbered.
 
     Scans may contain vertices without a usable position, and small components such as dust. A vertex is lost
     if its position is not finite or is very far away. If at most one vertex in 1000 is lost, each lost vertex
     is moved to the mean of its neighbours, and its faces are dropped. If more vertices are lost, they stay,
-    and the checks under "Raises" apply to them. Faces of components with less than 1 %
-    of the area are dropped if another component has at least half of the area. Vertices that lose all their
-    faces become unreferenced, and receive the match of the nearest referenced vertex.
+    and the checks under "Raises" apply to them. If one component has at least half of the area, the faces of
+    components with less than 1 % of the area are dropped. Vertices that lose all their faces become
+    unreferenced, and receive the match of the nearest referenced vertex.
 
     **Arguments:**
 
@@ -405,9 +405,9 @@ def make_mesh(
     - `faces`: vertex indices (f, 3), 0-based, of any integer type, or floats that are whole numbers. The
         array is copied.
     - `name`: the name of the mesh in messages.
-    - `weld`: if True, faces use only the lowest-numbered of all vertices at exactly the same position. The
-        other vertices at the same position become unreferenced. Welding closes seams along which some
-        programs duplicate vertices.
+    - `weld`: whether to merge vertices at exactly the same position. If True, faces use only the
+        lowest-numbered vertex at each position, and the other vertices at this position become unreferenced.
+        Welding closes seams along which some programs duplicate vertices.
     - `notes`: sentences to which this function appends its own notes.
 
     **Returns:**
@@ -419,10 +419,10 @@ def make_mesh(
     **Raises:**
 
     `InputError` if an array has a wrong shape or type, a coordinate is not finite, or an index is out of
-    range. Also `InputError` if there are no faces, all faces are degenerate, or an object is not a triangle
-    mesh. Also `InputError` if the extent of the mesh is below 1e-60 or above 1e60. Also `InputError` if a
-    vertex is more than 1e12 median edge lengths from the origin, or if a vertex of a face is more than 1e6
-    median edge lengths from the middle of the mesh.
+    range. `InputError` is also raised if there are no faces, all faces are degenerate, or an object is not a
+    triangle mesh. `InputError` is also raised if the extent of the mesh is below 1e-60 or above 1e60.
+    `InputError` is also raised if a vertex is more than 1e12 median edge lengths from the origin, or if a
+    vertex of a face is more than 1e6 median edge lengths from the middle of the mesh.
     """
     if faces is None:
         vertices, faces = _parts(vertices, name)
@@ -606,7 +606,8 @@ def numeric_rows(values: ArrayLike, what: str, name: str) -> np.ndarray:
 
 def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
     """Check that faces are valid indices of n vertices, and return them as int64."""
-    # The comparison precedes the cast, which would wrap numbers too large for int64.
+    # The comparison precedes the cast, because the cast would wrap around numbers that are too large for
+    # int64.
     outside = ~((faces >= 0) & (faces < n))
     if outside.any():
         at = int(outside.any(axis=1).argmax())

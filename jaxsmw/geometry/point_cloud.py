@@ -1,9 +1,9 @@
 """Surfaces of point clouds: triangle meshes whose vertices are the given points.
 
-A mesh through the points makes all methods for meshes work for point clouds. The tetrahedra of the Delaunay
-triangulation of the points are labelled inside or outside, and the surface consists of the triangles between
-the two. Unlike triangulations in tangent planes, this method separates sheets that nearly touch, and orients
-the surface consistently.
+With a mesh through its points, a point cloud can be used with all methods for meshes. The tetrahedra of the
+Delaunay triangulation of the points are labelled inside or outside, and the surface consists of the triangles
+between the two. Unlike triangulations in tangent planes, this method separates sheets that nearly touch, and
+orients the surface consistently.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _AROUND, _DISTANCE_AROUND = 60, 3.0
 # A tetrahedron is almost flat if the radius of its circumsphere is above `_LARGEST_RADIUS` times the extent
 # of the cloud.
 _LARGEST_RADIUS = 20.0
-# At this relative residual, the signs of the labels no longer change. The solver reaches it in 100 to 200
-# iterations.
+# At this relative residual, the signs of the labels no longer change. The solver reaches this residual in 100
+# to 200 iterations.
 _TOLERANCE, _ITERATIONS = 1e-6, 5000
 # Triangles that close holes are dropped. A triangle closes a hole if one of its edges is longer than `_GAP`
 # times the spacing at each end of the edge. The spacing at a point is the distance to its 12th nearest point.
@@ -46,7 +46,7 @@ _ON_SURFACE = 0.5
 _KNOWN_NORMALS = 0.5
 # Points on a surface have about 7 tetrahedra per point. Qhull takes very long for points that have far more
 # tetrahedra, for example points on two lines. Therefore `_TRIED` random points are triangulated first. No
-# surface is computed if they have more than `_MOST_TETRAHEDRA` tetrahedra per point.
+# surface is computed if these random points have more than `_MOST_TETRAHEDRA` tetrahedra per point.
 _MOST_TETRAHEDRA, _TRIED = 50, 1000
 
 
@@ -74,7 +74,8 @@ def triangulate_points(
 
     **Arguments:**
 
-    - `points`: positions (n, 3) in any unit, on the surface of a solid body, also with noise or holes.
+    - `points`: positions (n, 3) in any unit, on the surface of a solid body. The points may be noisy and have
+      holes.
     - `normals`: the normals of the points (n, 3), of any length and either sign, or None. Normals help to
         find the poles where the surface is thin.
     - `name`: the name of the point cloud in messages.
@@ -144,7 +145,7 @@ def _surface(
 
 
 class _Tetrahedra(NamedTuple):
-    """The Delaunay triangulation of the given points, scaled to extent 1, and of points added far away.
+    """The Delaunay triangulation of the given points (scaled to extent 1) and of points added far away.
 
     `neighbors[t, i]` is the tetrahedron across the triangle opposite to corner i of tetrahedron t, or -1.
     `outer` is True for a tetrahedron if at least one of its corners is an added point.
@@ -193,7 +194,8 @@ def _circumspheres(
 ) -> tuple[Float64[np.ndarray, "t 3"], Float64[np.ndarray, " t"]]:
     """Return the centres and radii of circumspheres.
 
-    For a tetrahedron that is almost flat, the centroid and `_LARGEST_RADIUS` replace centre and radius.
+    For a tetrahedron that is almost flat, the centroid replaces the centre, and `_LARGEST_RADIUS` replaces
+    the radius.
     """
     a, b, c = (corners[:, k] - corners[:, 0] for k in (1, 2, 3))
     volume = np.einsum("ti,ti->t", a, np.cross(b, c))
@@ -210,7 +212,7 @@ def _circumspheres(
 def _poles(
     tetrahedra: _Tetrahedra, n: int, normals: Float64[np.ndarray, "n 3"] | None
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
-    """Return the tetrahedra of the two poles of each point that has poles on both sides.
+    """Return, for each point with poles on both sides, the tetrahedra of its two poles.
 
     Poles are circumcentres of tetrahedra around a point. Without normals, the first pole is the farthest
     circumcentre, and the second pole is the farthest circumcentre in the opposite half-space. With normals,
@@ -247,9 +249,9 @@ def _inside(
 ) -> Bool[np.ndarray, " t"]:
     """Label the tetrahedra: True for inside.
 
-    The labels x are real numbers, negative for inside. They minimise the sum of w (x_i - x_j)^2 over adjacent
-    tetrahedra i, j plus the sum of w (x_i + x_j)^2 over the two poles i, j of each point. The label of every
-    outer tetrahedron is fixed at 1.
+    The labels x are real numbers, negative for inside. These labels minimise the sum of w (x_i - x_j)^2 over
+    adjacent tetrahedra i, j plus the sum of w (x_i + x_j)^2 over the two poles i, j of each point. The label
+    of every outer tetrahedron is fixed at 1.
     """
     count = int((~tetrahedra.outer).sum())
     unknown = np.full(len(tetrahedra.outer), count)  # outer tetrahedra share the label of index `count`

@@ -63,10 +63,10 @@ class SurfaceSamples(NamedTuple):
 
     @classmethod
     def along_surface(cls, mesh: Mesh, vertices: Int64[np.ndarray, " s"]) -> SurfaceSamples:
-        """Return given samples (s,) of a mesh in ascending order, with the nearest sample along the surface.
+        """Return given samples (s,) in ascending order, and each vertex's nearest sample along the surface.
 
-        Distances are measured along edges. Limbs that touch each other do not share samples. In a connected
-        component without samples, the nearest sample is the nearest in space.
+        Distances are measured along edges, so limbs that touch each other do not share samples. For a vertex
+        of a connected component without samples, the nearest sample is the sample nearest in space.
         """
         vertices = np.sort(vertices)
         lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)

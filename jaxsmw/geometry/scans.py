@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float64, Int32, Int64
 # lost vertices are kept, and later checks refuse positions that are not finite or too far away.
 _MOST_LOST = 1e-3
 # A vertex is lost if its distance from the median position exceeds `_FAR` times the 90th percentile of these
-# distances. It is also lost if its position is not finite. Scans contain vertices of size 1e30 where a
-# program wrote uninitialised memory.
+# distances. It is also lost if its position is not finite. Some scans have coordinates of about 1e30, because
+# a program wrote uninitialised memory.
 _FAR = 100.0
-# A component is small if it has less than this share of the area of the mesh, and the largest component has
-# at least _LARGEST of the area. Such components of scans are dust and enclosed bubbles.
+# A component is small if it has less than the share _SMALL of the mesh's area, and the largest component has
+# at least the share _LARGEST. Such components of scans are dust and enclosed bubbles.
 _SMALL, _LARGEST = 0.01, 0.5
 
 
@@ -28,7 +28,7 @@ def usable_positions(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, "
 
 
 def lost_vertices(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the vertices without a usable position; all False if there are too many."""
+    """Return a mask of the vertices without a usable position; all False if there are too many of them."""
     lost = ~usable_positions(position)
     return lost if lost.sum() <= _MOST_LOST * len(position) else np.zeros_like(lost)
 

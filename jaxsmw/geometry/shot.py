@@ -40,9 +40,9 @@ def shot_descriptors(
 
     The frame divides the neighbourhood into 32 sectors: 8 ranges of azimuth times 2 ranges of elevation times
     2 ranges of distance. Each sector has an 11-bin histogram of the cosine of the angle between a neighbour's
-    normal and the z axis. A neighbour contributes to the two nearest bins of azimuth, elevation, distance and
-    cosine, with the weights of linear interpolation. All neighbours have equal total weights in the
-    histograms. Each descriptor is scaled to unit length.
+    normal and the z axis. A neighbour contributes to the two nearest bins in each of azimuth, elevation,
+    distance and cosine, with the weights of linear interpolation. All neighbours have equal total weights in
+    the histograms. Each descriptor is scaled to unit length.
 
     Descriptors are invariant to rotation, translation and scale, but not to reflection, so they distinguish
     left from right. A renumbering of the vertices only permutes the rows of the result. If the enclosed
@@ -58,11 +58,11 @@ def shot_descriptors(
       samples are given, descriptors are computed only at the samples, and only samples are used as
       neighbours. The normal of a sample is the mean normal of the vertices nearest to the sample. Without
       samples, the time grows with the square of the number of vertices.
-    - `required`: whether the caller cannot avoid SHOT. Messages then advise only a finer mesh.
+    - `required`: whether the caller cannot avoid SHOT. If True, messages advise only a finer mesh.
 
-    **Returns:** Descriptors as float32, without unit: one row per vertex (n, 352), or one row per sample
-    (s, 352) if samples are given. The row is zero for unreferenced vertices and for vertices with fewer than
-    3 neighbours. The function issues a `UserWarning` if more than 1 % of the vertices have fewer than 3
+    **Returns:** Dimensionless descriptors as float32: one row per vertex (n, 352), or one row per sample (s,
+    352) if samples are given. The row is zero for unreferenced vertices and for vertices with fewer than 3
+    neighbours. The function issues a `UserWarning` if more than 1 % of the vertices have fewer than 3
     neighbours.
 
     **Raises:** `InputError` if the radius is not positive, or if most vertices have fewer than 3 neighbours.

@@ -20,14 +20,14 @@ def nearest_surface_points(
     - `points`: positions (p, 3), in the unit and the coordinate system of the mesh.
     - `mesh`: a `Mesh`. Unreferenced vertices have no influence.
 
-    **Returns:** The nearest points, p `SurfacePoints`, and the Euclidean distances to them (p,), in the
-    unit of the mesh.
+    **Returns:** The nearest points as a `SurfacePoints` with p points, and the Euclidean distances to these
+    points (p,), in the unit of the mesh.
     """
     return SurfaceTree(mesh).nearest(points)
 
 
 class SurfaceTree:
-    """A tree of the triangles of a mesh, for several searches of nearest points.
+    """A tree of a mesh's triangles, for several searches for nearest points.
 
     **Arguments:**
 
@@ -52,7 +52,7 @@ class SurfaceTree:
         faces = np.atleast_1d(faces).astype(np.int64)
         corners = (np.ascontiguousarray(vertices[self._faces[faces, corner]]) for corner in range(3))
         weights = np.atleast_2d(igl.barycentric_coordinates(np.atleast_2d(nearest), *corners))
-        # A triangle without area has no barycentric coordinates: its nearest corner represents the point.
+        # A triangle without area has no barycentric coordinates, so its nearest corner represents the point.
         undefined = ~np.isfinite(weights).all(axis=1)
         if undefined.any():
             offsets = vertices[self._faces[faces[undefined]]] - np.atleast_2d(nearest)[undefined, None]
@@ -83,7 +83,7 @@ def bounding_box_diagonal(mesh: Mesh) -> float:
 def nearest_points_of_triangles(
     points: Float64[np.ndarray, "p 3"], triangles: Float64[np.ndarray, "p 3 3"]
 ) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-    """Find the nearest point of one triangle for each point in space.
+    """Find the nearest point on a triangle for each point in space; each point has its own triangle.
 
     **Arguments:**
 

@@ -11,7 +11,7 @@ from jaxsmw.geometry.sampling import poisson_disk_samples
 
 # The alignment uses about this number of evenly spread samples per shape.
 _SAMPLES = 2000
-# The weight of positions, in units of the square root of the area, relative to SHOT. (Entry R24)
+# The weight of positions relative to SHOT. Positions are in units of the square root of the area. (Entry R24)
 _POSITION_WEIGHT = 3.0
 
 

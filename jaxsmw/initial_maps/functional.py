@@ -12,8 +12,8 @@ from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.descriptors import SampledPair
 
 # The weight of commutativity with the Laplacian relative to preservation of SHOT. On eight pairs of real
-# bodies, the weights 0, 1, 10 and 100 give initial maps with mean geodesic errors of 0.313, 0.076, 0.055 and
-# 0.052.
+# bodies, the mean geodesic error of the initial maps is 0.313 with weight 0, 0.076 with weight 1, 0.055 with
+# weight 10, and 0.052 with weight 100.
 _COMMUTATIVITY = 10.0
 
 

@@ -52,8 +52,8 @@ def initial_map(
         - `"aligned"`: nearest neighbours in SHOT descriptors and in space, after X was scaled to the area of
           Y and aligned rigidly. Use this map for rigid shapes such as teeth and bones.
         - an integer array (m,): a given pointwise map, as 0-based vertices of Y.
-        - m `SurfacePoints` on Y: a map to points on faces. Each point is replaced by the nearest corner of
-          its face.
+        - a `SurfacePoints` with m points on Y: a map to points on faces. Each point is replaced by the
+          nearest corner of its face.
         - an integer array (l, 2): landmarks, with a vertex of X and its match on Y in each row. The initial
           map is then computed by nearest-neighbour search in SHOT and in geodesic distances to the landmarks.
     - `sampled`: the result of `jaxsmw.descriptors.sample_pair` for this pair, if it was already computed.
@@ -62,9 +62,9 @@ def initial_map(
     issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
 
     **Raises:** `InputError` for an unknown name, an array that is neither a map nor landmarks, or indices
-    that are out of range or belong to unreferenced vertices. Also `InputError` for a spectrum of another
-    mesh, a mesh that is too coarse for SHOT, or signatures that are not finite. `ArithmeticError` if the
-    functional map of `"functional"` cannot be computed.
+    that are out of range or belong to unreferenced vertices. `InputError` is also raised for a spectrum of
+    another mesh, a mesh that is too coarse for SHOT, or signatures that are not finite. `ArithmeticError` if
+    the functional map of `"functional"` cannot be computed.
     """
     if isinstance(init, SurfacePoints):
         init = check_surface_points(init, pair.mesh_y, "initial map").nearest_corners(pair.mesh_y)

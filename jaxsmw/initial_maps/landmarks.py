@@ -32,8 +32,8 @@ def landmark_features(
     The first 352 columns are SHOT, and the other l columns are distances.
 
     **Raises:** `InputError` if `landmarks` does not have the shape (l, 2), or gives two matches to one vertex
-    of X. Also `InputError` if a number in `landmarks` is not a referenced vertex, or if a mesh is too coarse
-    for SHOT.
+    of X. `InputError` is also raised if a number in `landmarks` is not a referenced vertex, or if a mesh is
+    too coarse for SHOT.
     """
     if landmarks.shape[1:] != (2,) or not len(landmarks):
         raise InputError(
@@ -70,7 +70,7 @@ def distance_features(
 
     - `side`: X or Y, as a `SampledShape`.
     - `vertices`: vertices of the mesh (l,), to which distances are computed.
-    - `unit`: the unit of the returned distances, as a length in the unit of the mesh; see
+    - `unit`: the unit of the returned distances, expressed as a length in the unit of the mesh; see
       `Pair.units_of_length`.
 
     **Returns:** The weighted distances (n, l) from the n compared vertices to the l given vertices.

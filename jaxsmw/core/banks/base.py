@@ -27,7 +27,7 @@ class FilterBank(eqx.Module):
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
     ) -> Float[Array, "filters p"]:
-        """Returns the responses of all filters at the given points of the eigenvalue axis.
+        """Return the responses of all filters at the given points of the eigenvalue axis.
 
         `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) at the eigenvalues of a shape.
 
@@ -37,14 +37,14 @@ class FilterBank(eqx.Module):
         - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit as the points. The
           last eigenvalue is lambda_max. Most banks use only lambda_max and ignore all other eigenvalues.
 
-        **Returns:** The responses (filters, p), numbers without unit. Row 0 is the scaling function.
+        **Returns:** The responses (filters, p), which are dimensionless. Row 0 is the scaling function.
         """
 
 
 def sample_bank(
     bank: FilterBank, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
 ) -> Float[Array, "filters p"]:
-    """Returns the responses (filters, p) of a bank, and checks their shape.
+    """Return the responses (filters, p) of a bank, and check their shape.
 
     The check is necessary because users can define their own banks.
 
@@ -60,7 +60,7 @@ def sample_bank(
 
 
 def check_number_of_filters(bank: FilterBank, filters: int, least: int) -> None:
-    """Checks the number of filters of a bank.
+    """Check the number of filters of a bank.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below the minimum
     `least`.

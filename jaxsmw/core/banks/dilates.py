@@ -29,11 +29,11 @@ class _LogSpacedDilates(FilterBank):
 
     @abc.abstractmethod
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        """Returns the values of the wavelet. Each entry of `scaled` is a scale times an eigenvalue."""
+        """Return the values of the wavelet. Each entry of `scaled` is a scale times an eigenvalue."""
 
     @abc.abstractmethod
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Returns the scaling function at `scaled`, which is `ratio * lambda / lambda_max`."""
+        """Return the scaling function at `scaled`, which is `ratio * lambda / lambda_max`."""
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]

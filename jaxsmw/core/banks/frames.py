@@ -13,7 +13,7 @@ from jaxsmw.core.checks import check_choice
 
 
 def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
-    """Returns the values (k,) of the frame function G of a filter bank at k eigenvalues.
+    """Return the values (k,) of the frame function G of a filter bank at k eigenvalues.
 
     The frame function `G(lambda) = sum_l g_l(lambda)²` is the sum of the squared filters g_l (equation (7) of
     the MWP paper). G is constant for a tight frame, and 1 for a Parseval frame.
@@ -34,7 +34,8 @@ class FrameBounds(NamedTuple):
 
     **Attributes:**
 
-    - `lower`, `upper`: the minimum and the maximum of the frame function, arrays of shape () without unit.
+    - `lower`, `upper`: the minimum and the maximum of the frame function, as dimensionless arrays of shape
+      ().
     """
 
     lower: Float[Array, ""]
@@ -48,7 +49,7 @@ def frame_bounds(
     over: Literal["eigenvalues", "interval"] = "eigenvalues",
     resolution: int = 10_001,
 ) -> FrameBounds:
-    """Returns the frame bounds of a filter bank: the minimum and the maximum of its frame function G.
+    """Return the frame bounds of a filter bank: the minimum and the maximum of its frame function G.
 
     The frame function `G = sum_l g_l²` is the sum of the squared filters g_l.
 
@@ -68,7 +69,7 @@ def frame_bounds(
       filters.
 
     **Returns:** A `FrameBounds` with the attributes `lower` and `upper`, the smallest and the largest value
-    of G, as arrays of shape () without unit.
+    of G, as dimensionless arrays of shape ().
 
     **Raises:** `ValueError` if `over` is unknown, if `resolution` is below 2 with `over="interval"`, or if
     the bank returns responses that are not of shape (filters, points).
@@ -103,7 +104,7 @@ class Tightened(FilterBank):
 
 
 def tighten(bank: FilterBank) -> FilterBank:
-    """Returns the canonical tight frame of a filter bank: each filter g_l divided by `sqrt(G)`.
+    """Return the canonical tight frame of a filter bank: each filter g_l divided by `sqrt(G)`.
 
     G is the frame function `sum_l g_l²`. At every eigenvalue, the canonical tight frame is the Parseval frame
     closest to the given bank in the least-squares sense. If the given bank is a Parseval frame, its responses

@@ -46,11 +46,11 @@ class SoftmaxFrame(FilterBank):
 
     @classmethod
     def like(cls, bank: FilterBank, knots: int = 32, *, floor: float = 0.01) -> SoftmaxFrame:
-        """Returns a `SoftmaxFrame` that imitates a given filter bank.
+        """Return a `SoftmaxFrame` that imitates a given filter bank.
 
         At each knot, the squared filters of the frame are proportional to the squared filters of the bank.
-        The bank is evaluated at `knots` evenly spaced points from 0 to 1, which also serve as the eigenvalues
-        of a shape.
+        The bank is evaluated at `knots` evenly spaced points from 0 to 1. The bank also receives these points
+        as the eigenvalues of a shape.
 
         **Arguments:**
 

@@ -55,8 +55,8 @@ class ExponentialWindow(FilterBank):
 class LowPass(FilterBank):
     """A filter bank of one low-pass filter, for experiments without wavelets. The bank is not tight.
 
-    The filter is the scaling function of `Meyer` with an adjustable edge. It is 1 up to the edge, and falls
-    smoothly to 0 at twice the edge.
+    The filter is the scaling function of `Meyer` with an adjustable edge. The filter is 1 up to the edge, and
+    then falls smoothly to 0 at twice the edge.
 
     `bank(points, eigenvalues)` returns the responses (1, p) at `points` (p,) in [0, lambda_max].
     `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same (arbitrary) unit as

@@ -24,7 +24,7 @@ class _Transitions(FilterBank):
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
     ) -> Float[Array, "wavelets p"]:
-        """Returns the angle of each transition, divided by pi / 2. The quotient rises from 0 to 1."""
+        """Return the angle of each transition, divided by pi / 2. The quotient rises from 0 to 1."""
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
@@ -47,7 +47,7 @@ class _DyadicBands(_Transitions):
 
     @abc.abstractmethod
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        """Returns `theta / (pi / 2)`, which rises from 0 to 1 as `ramp` rises from 0 to 1."""
+        """Return `theta / (pi / 2)`, which rises from 0 to 1 as `ramp` rises from 0 to 1."""
 
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
@@ -60,7 +60,7 @@ class _DyadicBands(_Transitions):
 
 
 def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Returns the Meyer polynomial nu(u), elementwise, for numbers u from 0 to 1.
+    """Return the Meyer polynomial nu(u), elementwise, for numbers u from 0 to 1.
 
     The polynomial rises from 0 to 1, and its first 3 derivatives vanish at 0 and 1. It satisfies
     `nu(u) + nu(1 - u) = 1`.
@@ -71,9 +71,9 @@ def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
 class Meyer(_DyadicBands):
     """The Meyer frame: a filter bank of octave bands that is a Parseval frame.
 
-    The scaling function is 1 up to `lambda_max / 2^L`, where `L = filters - 1` is the number of wavelets. It
-    falls to 0 over the next octave, while the first wavelet rises. The last wavelet rises from
-    `lambda_max / 2` to lambda_max.
+    The scaling function is 1 up to `lambda_max / 2^L`, where `L = filters - 1` is the number of wavelets. The
+    scaling function then falls to 0 over the next octave, while the first wavelet rises. The last wavelet
+    rises from `lambda_max / 2` to lambda_max.
 
     `bank(points, eigenvalues)` returns the responses (filters, p) at `points` (p,) in [0, lambda_max]. Row 0
     is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
@@ -130,7 +130,7 @@ class _TwoBands(_Transitions):
 
     @abc.abstractmethod
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Returns `theta / (pi / 2)` of the transition as a function of `lambda / edge - 1`."""
+        """Return `theta / (pi / 2)` of the transition as a function of `lambda / edge - 1`."""
 
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]

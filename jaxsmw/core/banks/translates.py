@@ -27,7 +27,7 @@ class _UniformTranslates(FilterBank):
 
     @abc.abstractmethod
     def window(self, position: Float[Array, "filters p"]) -> Float[Array, "filters p"]:
-        """Returns the window at positions in (-1/2, 1/2), which are in units of the window's width."""
+        """Return the window at positions in (-1/2, 1/2), which are in units of the window's width."""
 
     def __call__(
         self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]

@@ -18,8 +18,8 @@ class Warp(eqx.Module):
     A `Warped` bank evaluates another filter bank on the warped eigenvalue axis. Ready subclasses of `Warp`
     are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define `__call__(points,
     eigenvalues)`, which returns the warped points (p,). The warped points must be non-negative and increase
-    with the points; nothing checks this. `points` (p,) are in [0, lambda_max]. `eigenvalues` (k,) are the
-    shape's eigenvalues in ascending order; the last one is lambda_max.
+    with the points, but these conditions are not checked. `points` (p,) are in [0, lambda_max]. `eigenvalues`
+    (k,) are the shape's eigenvalues in ascending order; the last one is lambda_max.
 
     A constant factor in a warp has no effect on the banks of `jaxsmw.banks`, because these banks depend only
     on ratios of eigenvalues.
@@ -27,7 +27,7 @@ class Warp(eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
-        """Returns the warped points (p,), in any unit.
+        """Return the warped points (p,), in any unit.
 
         **Arguments:**
 
@@ -90,7 +90,7 @@ class Logarithm(Warp):
 class Power(Warp):
     """The warp `(lambda / lambda_max)^exponent` of the eigenvalue axis, for use in `Warped(bank, Power())`.
 
-    Like every `Warp`, it is called with points (p,) and a shape's eigenvalues (k,), and returns the warped
+    A call takes points (p,) and a shape's eigenvalues (k,), as for every `Warp`. The call returns the warped
     points (p,), from 0 to 1. lambda_max is the last eigenvalue. The default exponent 0.5 (the square root)
     turns eigenvalues into frequencies.
 

@@ -70,7 +70,7 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     def active_eigenvectors(
         self, prepared: PreparedT, iteration: Int32[Array, ""]
     ) -> tuple[Bool[Array, " k_x"], Bool[Array, " k_y"]]:
-        """Returns which eigenvectors of X (k_x,) and of Y (k_y,) an iteration uses, as Boolean arrays.
+        """Return two masks, True for the eigenvectors of X (k_x,) and of Y (k_y,) that an iteration uses.
 
         **Arguments:**
 
@@ -88,13 +88,13 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
         return active(sizes[0]), active(sizes[1])
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
-        """Returns whether this iteration and all later iterations use all eigenvectors."""
+        """Return whether this iteration and all later iterations use all eigenvectors."""
         assert isinstance(state, CoarseToFineState)
         return state.iteration >= len(self.levels)
 
 
 def check_descriptors(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """Checks that two shapes have the same number of descriptors, which may be zero.
+    """Check that two shapes have the same number of descriptors, which may be zero.
 
     **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
     """
@@ -112,12 +112,12 @@ def partial_matching_weights(
     weights_y: Float[Array, " n"],
     residuals_y: Float[Array, " n"],
 ) -> tuple[Float[Array, " m"], Float[Array, " n"]]:
-    """Reduces the weights of vertices of the full shape that are probably missing on the partial shape.
+    """Reduce the weights of those vertices of the full shape that the partial shape probably lacks.
 
     The shape with the larger mean residual is treated as the full shape. For each vertex of the full shape,
     the weight w becomes `w / (1 + (r / mean)²)`. In this formula, r is the residual of the vertex, and `mean`
-    is the weighted mean residual of the other shape. Then the weights of the full shape are scaled to sum 1.
-    The weights of the other shape stay the same.
+    is the weighted mean residual of the other shape. Then the weights of the full shape are scaled so that
+    they sum to 1. The weights of the other shape stay the same.
 
     **Arguments:**
 

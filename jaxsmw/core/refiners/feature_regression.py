@@ -42,8 +42,8 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     reverse map, the features of Y are regressed on the features of X in the same way. The argument `levels`
     increases the number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi et al. 2019).
 
-    The method does not assume isometry. If the initial map is as accurate as a result of
-    `WaveletPreservation`, refinement reduces its error. docs/accuracy.md contains the measurements.
+    The method does not assume isometry. Refinement reduces the error of an initial map that is as accurate as
+    a map from `WaveletPreservation`. docs/accuracy.md contains the measurements.
 
     If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape with large residuals receive
     smaller weights (`partial_matching_weights`). A residual is the squared Mahalanobis distance from a vertex
@@ -68,7 +68,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     """
 
     def prepare(self, problem: Problem) -> PreparedFeatures:
-        """Collects the features of all vertices and, if there are samples, of the samples.
+        """Collect the features of all vertices and, if there are samples, of the samples.
 
         **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
         """
@@ -85,7 +85,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def update(
         self, prepared: PreparedFeatures, pointwise_map: Int[Array, " m"], previous: Regression | None
     ) -> tuple[Regression, RESULTS]:
-        """Computes both regressions from matched features. Returns the next state and `RESULTS.successful`.
+        """Compute both regressions from matched features. Return the next state and `RESULTS.successful`.
 
         If there is a previous state, the regressions also use the matches of the reverse map.
         """
@@ -113,14 +113,14 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         return state, RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " m"]:
-        """Returns the vertex of Y that is nearest to each vertex of X in the Mahalanobis distance, (m,)."""
+        """Return, for each vertex of X, the nearest vertex of Y in the Mahalanobis distance, (m,)."""
         if prepared.patches is None:
             return state.forward.search(prepared.x, prepared.all_y)
         queries, database = self._eigenvector_embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
-        """Returns the vertex of X that is nearest to each vertex of Y, (n,).
+        """Return, for each vertex of Y, the nearest vertex of X, (n,).
 
         Distances are computed between the points of `embeddings`.
         """
@@ -132,13 +132,13 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def energy(
         self, prepared: PreparedFeatures, state: Regression, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the uncertainty of the predictions; see `Regression.uncertainty`."""
+        """Return the uncertainty of the predictions; see `Regression.uncertainty`."""
         return state.uncertainty
 
     def embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m d_x"], Float[Array, "n d_x"]]:
-        """Returns points (m, d_x) for X and (n, d_x) for Y, without unit.
+        """Return dimensionless points (m, d_x) for X and (n, d_x) for Y.
 
         The dimension d_x is the number of features of X. The distance between a point of X and a point of Y
         is a Mahalanobis distance. This distance compares the features of the vertex of X with the prediction
@@ -149,7 +149,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def _eigenvector_embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """Returns the first k_x coordinates of the `embeddings`, which do not depend on descriptors.
+        """Return the first k_x coordinates of the `embeddings`, which do not depend on descriptors.
 
         The search in patches uses only these coordinates, because the vertices of a patch are close together
         in them.
@@ -160,11 +160,10 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
 
 class _Features(NamedTuple):
-    """The features, weights and mask of the vertices of one shape. The weights are the vertex areas, scaled
-    to sum 1.
+    """The features, weights and mask of the vertices of one shape.
 
     Each row of `values` contains the values of the eigenvectors at a vertex, and then the descriptors of the
-    vertex if the spectrum has descriptors.
+    vertex if the spectrum has descriptors. The weights are the vertex areas, scaled so that they sum to 1.
     """
 
     values: Float[Array, "n d"]
@@ -222,17 +221,17 @@ class Prediction(NamedTuple):
     def embeddings(
         self, queries: _Features, targets: _Features
     ) -> tuple[Float[Array, "m d_out"], Float[Array, "n d_out"]]:
-        """Returns the points of the query vertices (m, d_out) and of the target vertices (n, d_out)."""
+        """Return the points of the query vertices (m, d_out) and of the target vertices (n, d_out)."""
         return product(queries.values, self.queries), product(targets.values, self.database)
 
     def search(self, queries: _Features, targets: _Features) -> Int32[Array, " m"]:
-        """Returns the target vertex that is nearest to each query vertex, (m,)."""
+        """Return, for each query vertex, the nearest target vertex, (m,)."""
         return nearest_neighbor(*self.embeddings(queries, targets), database_mask=targets.mask)
 
     def residuals(
         self, queries: _Features, targets: _Features, matches: Int[Array, " m"]
     ) -> Float[Array, " m"]:
-        """Returns the squared distance from each query vertex to its match, (m,), without unit."""
+        """Return the squared distance from each query vertex to its match, (m,), dimensionless."""
         points, database = self.embeddings(queries, targets)
         return jnp.sum((points - database[matches]) ** 2, axis=1)
 
@@ -283,7 +282,7 @@ class _Moments(NamedTuple):
 def _regress(
     moments: _Moments, active_x: Bool[Array, " k_x"], active_y: Bool[Array, " k_y"]
 ) -> tuple[Float[Array, "k_x k_y"], Prediction]:
-    """Returns the functional map, and the prediction of the features of X from the features of Y.
+    """Return the functional map, and the prediction of the features of X from the features of Y.
 
     The functional map and the prediction use only the active eigenvectors.
     """

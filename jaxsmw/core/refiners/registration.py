@@ -90,7 +90,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     """
 
     def prepare(self, problem: Problem) -> PreparedSurfaces:
-        """Scales both surfaces and prepares the search.
+        """Scale both surfaces and prepare the search.
 
         **Raises:** `ValueError` if a spectrum has no positions or no normals, or if the shapes have different
         numbers of descriptors.
@@ -116,7 +116,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     def update(
         self, prepared: PreparedSurfaces, pointwise_map: Int[Array, " m"], previous: Registered | None
     ) -> tuple[Registered, RESULTS]:
-        """Computes the deformations from the matches. Returns the next state and `RESULTS.successful`."""
+        """Compute the deformations from the matches. Return the next state and `RESULTS.successful`."""
         x, y, all_x, all_y = prepared.x, prepared.y, prepared.all_x, prepared.all_y
         patches = prepared.reverse_patches
         iteration = jnp.asarray(0, jnp.int32) if previous is None else previous.iteration + 1
@@ -139,25 +139,25 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         return state, RESULTS.successful  # type: ignore[return-value]
 
     def recover(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " m"]:
-        """Returns the vertex of Y that is nearest to each vertex of X in the `embeddings`, (m,)."""
+        """Return, for each vertex of X, the nearest vertex of Y in the `embeddings`, (m,)."""
         queries, database = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.all_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " n"]:
-        """Returns the vertex of X that is nearest to each vertex of Y in the `embeddings`, (n,)."""
+        """Return, for each vertex of Y, the nearest vertex of X in the `embeddings`, (n,)."""
         database, queries = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.x.mask, prepared.reverse_patches)
 
     def energy(
         self, prepared: PreparedSurfaces, state: Registered, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the `objective` for the pointwise map from which the state was computed."""
+        """Return the `objective` for the pointwise map from which the state was computed."""
         return self.objective(prepared, state, pointwise_map)
 
     def embeddings(
         self, prepared: PreparedSurfaces, state: Registered
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Returns points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
+        """Return points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
         The coordinates are weighted positions, normals, eigenfunctions and descriptors. Each row of the first
         array contains the coordinates of a vertex of X deformed onto Y, followed by the coordinates of the
@@ -187,7 +187,7 @@ class _Surface(NamedTuple):
 
     @classmethod
     def of(cls, spectrum: Spectrum, area: Float[Array, ""]) -> _Surface:
-        """Returns the surface of a spectrum. Lengths are divided by the square root of `area`."""
+        """Return the surface of a spectrum. Lengths are divided by the square root of `area`."""
         if spectrum.positions is None or spectrum.normals is None:
             raise ValueError(
                 "Registration needs positions and normals, but a spectrum lacks them: use compute_spectrum, "
@@ -217,7 +217,7 @@ class _Surface(NamedTuple):
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
-        """Returns a surface that contains only the given vertices (s,), whose spectrum is `spectrum`."""
+        """Return a surface that contains only the given vertices (s,), with their spectrum `spectrum`."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
@@ -226,7 +226,7 @@ class _Surface(NamedTuple):
         )
 
     def reweighted(self, weights: Float[Array, " s"]) -> _Surface:
-        """Returns the same vertices with new weights for the least-squares fit of coefficients."""
+        """Return the same vertices with new weights for the least-squares fit of coefficients."""
         weighted = self.eigenvectors * weights[:, None]
         gram = product(self.eigenvectors.T, weighted)
         ridge = _RIDGE * jnp.trace(gram) / gram.shape[0] * jnp.eye(gram.shape[0], dtype=gram.dtype)
@@ -280,7 +280,7 @@ class Deformation(NamedTuple):
         matches: Int[Array, " s"],
         active: Bool[Array, " k_x"],
     ) -> Deformation:
-        """Computes the deformation of one surface onto another surface from given matches.
+        """Compute the deformation of one surface onto another surface from given matches.
 
         **Arguments:**
 
@@ -307,7 +307,7 @@ class Deformation(NamedTuple):
         )
 
     def points(self, surface: _Surface) -> Float[Array, "s d"]:
-        """Returns the weighted positions, normals and eigenfunctions of the deformed vertices, (s, d)."""
+        """Return the weighted positions, normals and eigenfunctions of the deformed vertices, (s, d)."""
         low = product(surface.eigenvectors, jnp.concatenate([self.own, self.matched, self.moments], axis=1))
         own, matched, moments = low[:, :3], low[:, 3:-24], low[:, -24:]
         rotations = _rotations(moments, surface)
@@ -335,7 +335,7 @@ class Registered(CoarseToFineState):
 def _product_space(
     x: _Surface, y: _Surface, state: Registered, weight: Float[Array, ""]
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Returns points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
+    """Return points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
     A vertex x of X and a vertex y of Y have nearby points under two conditions: the deformed x is close to y
     on Y, and the deformed y is close to x on X.
@@ -352,7 +352,7 @@ def _without_missing_parts(
     pointwise_map: Int[Array, " s"],
     reverse_map: Int[Array, " t"],
 ) -> tuple[_Surface, _Surface]:
-    """Returns both surfaces, with the vertex weights of `partial_matching_weights`.
+    """Return both surfaces, with the vertex weights of `partial_matching_weights`.
 
     The residuals are the squared distances between matched points of the joint space. Descriptors do not
     contribute to these distances.
@@ -368,7 +368,7 @@ def _without_missing_parts(
 
 
 def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array, "s 3 3"]:
-    """Returns the rotations that best align the neighbourhoods of vertices with those of their matches.
+    """Return the rotations that best align the neighbourhoods of vertices with those of their matches.
 
     If one surface is a mirror image of the other, all rotations include a reflection.
     """
@@ -383,7 +383,7 @@ def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array,
 
 
 def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 3"]:
-    """Returns, for each covariance S, the rotation R that maximises the trace of R S (Horn 1987).
+    """Return, for each covariance S, the rotation R that maximises the trace of R S (Horn 1987).
 
     The trace is a quadratic form in the unit quaternion of R. The best quaternion is the eigenvector for the
     largest eigenvalue of this form.
@@ -408,7 +408,7 @@ def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 
 
 @cache
 def _rotations_of_quaternions() -> Float64[np.ndarray, "9 16"]:
-    """Returns the matrix of the linear map that takes quaternion products to a rotation matrix.
+    """Return the matrix of the linear map that takes quaternion products to a rotation matrix.
 
     The 16 inputs are the products of any two components of a quaternion. The 9 outputs are the entries of the
     rotation matrix of this quaternion.

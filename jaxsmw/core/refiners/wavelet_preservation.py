@@ -61,9 +61,9 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
       at the same eigenvalue on both shapes: the larger of the two shapes' largest eigenvalues.
     - `search`: the method of nearest-neighbour search. `"exhaustive"` compares all vertices of X with all
       vertices of Y. `"patches"` finds the same neighbours but skips patches of Y that are too far away. For
-      large shapes on a CPU, the search in patches is several times as fast, but its compilation takes some
-      seconds longer. `"auto"` chooses `"patches"` on CPUs if the geometric mean of the numbers of vertices is
-      at least 15 000, and `"exhaustive"` otherwise.
+      large shapes on a CPU, the search in patches is several times as fast as exhaustive search, but takes
+      some seconds longer to compile. `"auto"` chooses `"patches"` on CPUs if the geometric mean of the
+      numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
 
     **Raises:** `TypeError` if `bank` is not a `FilterBank` or `solution` is not a `Solution`; `ValueError` if
     `convention`, `lambda_max` or `search` is unknown.
@@ -83,7 +83,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         check_choice("search", self.search, get_args(Search))
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
-        """Returns a `WaveletProblem`: both shapes, and the responses of the filter bank at their eigenvalues.
+        """Return a `WaveletProblem`: both shapes, and the responses of the filter bank at their eigenvalues.
 
         **Arguments:**
 
@@ -106,7 +106,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         )
 
     def prepare(self, problem: Problem) -> PreparedWavelets:
-        """Evaluates the filter bank, and prepares the solution and the nearest-neighbour search."""
+        """Evaluate the filter bank, and prepare the solution and the nearest-neighbour search."""
         spectrum_x, spectrum_y = problem.query_spectra()
         wavelets = self.problem(spectrum_x, spectrum_y, sampled=problem.samples is not None)
         patches = chosen_patches(self.search, spectrum_x, spectrum_y)
@@ -115,7 +115,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def update(
         self, prepared: PreparedWavelets, pointwise_map: PointwiseMap, previous: State | None
     ) -> tuple[State, RESULTS]:
-        """Computes the functional map with `solution`. Returns the next state and a status code.
+        """Compute the functional map with `solution`. Return the next state and a status code.
 
         The status code is a member of `RESULTS`.
         """
@@ -124,12 +124,12 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         return State(found), result
 
     def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
-        """Returns the vertex of Y that is nearest to each vertex of X in the `embeddings`, (m,)."""
+        """Return, for each vertex of X, the nearest vertex of Y in the `embeddings`, (m,)."""
         queries, database = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
 
     def recover_reverse(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " n"]:
-        """Returns the vertex of X that is nearest to each vertex of Y in the `embeddings`, (n,)."""
+        """Return, for each vertex of Y, the nearest vertex of X in the `embeddings`, (n,)."""
         queries, database = self.embeddings(prepared, state)[::-1]
         patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
         return nearest_vertices(queries, database, prepared.spectrum_x.mask, patches)
@@ -137,13 +137,13 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def energy(
         self, prepared: PreparedWavelets, state: State, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Returns the energy of equation (5) of the MWP paper, with areas as the weights of vertices."""
+        """Return the energy of equation (5) of the MWP paper, with the vertex areas as weights."""
         return prepared.wavelets.energy(pointwise_map)(state.functional_map)
 
     def embeddings(
         self, prepared: PreparedWavelets, state: State
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Returns the `spectral_embeddings` of the functional map."""
+        """Return the `spectral_embeddings` of the functional map."""
         return spectral_embeddings(
             state.functional_map, prepared.spectrum_x, prepared.spectrum_y, convention=self.convention
         )

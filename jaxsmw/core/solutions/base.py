@@ -32,7 +32,7 @@ class Solution(eqx.Module, Generic[PreparedT]):
     """
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:
-        """Returns the values that `solve` needs and that do not depend on the pointwise map.
+        """Return the values that `solve` needs and that do not depend on the pointwise map.
 
         A refinement calls `prepare` only once, before the first iteration. The base class returns None.
 
@@ -51,7 +51,7 @@ class Solution(eqx.Module, Generic[PreparedT]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Computes the functional map C that corresponds to a pointwise map T.
+        """Compute the functional map C that corresponds to a pointwise map T.
 
         **Arguments:**
 

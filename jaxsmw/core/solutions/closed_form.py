@@ -40,10 +40,10 @@ class Filtering(Solution[PreparedFiltering]):
     """A solution for Parseval frames, which filters the functional map C_0 of a pointwise map T.
 
     The result is `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (equation (8) of the MWP paper), where g_l
-    are the filters of the bank. The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of the
-    shape that C maps to and of the shape that C maps from. The sum equals the elementwise product of C_0 and
-    the `multiscale_kernel` of the bank, so no linear system is solved. `Filtering` is a `Solution`, for the
-    argument `solution` of `WaveletPreservation`.
+    are the filters of the bank. The diagonal matrix Lambda_out contains the eigenvalues of the shape that C
+    maps to. The diagonal matrix Lambda_in contains the eigenvalues of the shape that C maps from. The sum
+    equals the elementwise product of C_0 and the `multiscale_kernel` of the bank, so no linear system is
+    solved. `Filtering` is a `Solution`, for the argument `solution` of `WaveletPreservation`.
 
     If the bank is a Parseval frame, C minimises the wavelet-preservation energy in the area norm. In the
     default pullback convention, C is the exact minimiser only if T preserves area; otherwise C is only close
@@ -65,7 +65,7 @@ class Filtering(Solution[PreparedFiltering]):
         check_choice("pseudo_inverse", self.pseudo_inverse, get_args(PseudoInverse))
 
     def prepare(self, problem: WaveletProblem) -> PreparedFiltering:
-        """Returns the multiscale kernel, and the dual eigenvectors of the shape that C maps to."""
+        """Return the multiscale kernel, and the dual eigenvectors of the shape that C maps to."""
         spectrum_out, _ = problem.spectra
         pseudo_inverse: PseudoInverse = "least_squares" if problem.sampled else self.pseudo_inverse
         return PreparedFiltering(
@@ -79,7 +79,7 @@ class Filtering(Solution[PreparedFiltering]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the filtered map C (k_out, k_in), and `RESULTS.successful`."""
+        """Return the filtered map C (k_out, k_in), and `RESULTS.successful`."""
         unfiltered = problem.encode(pointwise_map, prepared.dual_out)
         return unfiltered * prepared.kernel, RESULTS.successful  # type: ignore[return-value]
 
@@ -102,7 +102,7 @@ class NearestOrthogonal(Solution[PreparedT]):
     solution: Solution[PreparedT] = Filtering()  # type: ignore[assignment]
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:
-        """Returns the values that the other solution prepares."""
+        """Return the values that the other solution prepares."""
         return self.solution.prepare(problem)
 
     def solve(
@@ -112,7 +112,7 @@ class NearestOrthogonal(Solution[PreparedT]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the polar factor (k_out, k_in) of the other solution's map, and the status code."""
+        """Return the polar factor (k_out, k_in) of the other solution's map, and the status code."""
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
         left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
         return product(left, right), result
@@ -149,7 +149,7 @@ class LeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the minimiser C (k_out, k_in) of the energy, and a status code (`RESULTS`)."""
+        """Return the minimiser C (k_out, k_in) of the energy, and a status code (`RESULTS`)."""
         energy = problem.energy(pointwise_map, norm=self.norm)
         _, responses_in = problem.responses
         frame = frame_function(responses_in)

@@ -28,7 +28,7 @@ class ProjectedDescriptors(eqx.Module):
     def project(
         cls, descriptors: Float[Array, "n d"], spectrum: Spectrum, *, operators: bool
     ) -> ProjectedDescriptors:
-        """Projects the values (n, d) of d functions at the vertices of one shape onto its eigenbasis.
+        """Project the values (n, d) of d functions at the vertices of one shape onto its eigenbasis.
 
         If `operators` is True, the method also computes the multiplication operators. Only
         `DescriptorPair.project` checks the shapes of the arrays.
@@ -87,7 +87,7 @@ class DescriptorPair(eqx.Module):
         *,
         operators: bool = False,
     ) -> DescriptorPair:
-        """Returns a `DescriptorPair` from the values of corresponding functions at the vertices of X and Y.
+        """Return a `DescriptorPair` from the values of corresponding functions at the vertices of X and Y.
 
         **Arguments:**
 

@@ -45,9 +45,10 @@ class RegularizedLeastSquares(Solution[None]):
     functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
     - Wavelet preservation is the energy of equation (5) of the MWP paper.
-    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrices Lambda_out and
-      Lambda_in contain the eigenvalues of the shape that C maps to and of the shape that C maps from. Both
-      matrices are divided by the larger of the two shapes' largest eigenvalues.
+    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrix Lambda_out contains
+      the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains the eigenvalues of
+      the shape that C maps from. Both matrices are divided by the larger of the two shapes' largest
+      eigenvalues.
     - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This is the
       only term that is not quadratic in C.
     - Descriptor preservation is `||C F_in - F_out||²`, where F_in and F_out contain the coefficients of the
@@ -62,9 +63,9 @@ class RegularizedLeastSquares(Solution[None]):
 
     The terms for wavelet preservation and descriptor preservation are sums over thousands of columns. First,
     these columns are replaced by k_in equivalent columns. Then `optimistix.least_squares` takes Gauss–Newton
-    steps. Conjugate gradients solve each step without a matrix of size k² x k². The solver starts from the
-    functional map of the previous iteration; in the first iteration, it starts from an estimate. C is
-    differentiable, by implicit differentiation at the minimum.
+    steps. The linear system of each step is solved by conjugate gradients, without a matrix of size k² x k².
+    The solver starts from the functional map of the previous iteration; in the first iteration, it starts
+    from an estimate. C is differentiable, by implicit differentiation at the minimum.
 
     The status code of `solve` is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
     `RESULTS.singular_system`, `RESULTS.nonfinite_functional_map` and `RESULTS.solver_not_converged`.
@@ -79,15 +80,15 @@ class RegularizedLeastSquares(Solution[None]):
       `DescriptorPair.project(..., operators=True)`.
     - `norm`: the weights of the vertices of X in the wavelet term. `"area"` (the default) weights each vertex
       by its area. `"frobenius"` gives all vertices the same weight.
-    - `tolerance`: a positive number, by default 1e-3, which is both the relative and the absolute
+    - `tolerance`: a positive number, by default 1e-3. This number is both the relative and the absolute
       tolerance of `optimistix.GaussNewton`.
-    - `max_steps`: the largest number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
+    - `max_steps`: the maximum number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
       reach the tolerance, `solve` returns the status code `RESULTS.solver_not_converged`.
 
     **Raises:** `ValueError` if a weight is not a single positive number, the tolerance is not positive,
     `max_steps` is below 1, or `norm` is unknown. `ValueError` if neither `wavelet_preservation` nor
-    `descriptor_preservation` has a weight. `ValueError` if `descriptors` is given, but neither descriptor
-    term has a weight, or if a descriptor term has a weight, but `descriptors` is None. `ValueError` if
+    `descriptor_preservation` has a weight. `ValueError` if `descriptors` is given without a weight for a
+    descriptor term, or if a descriptor term has a weight, but `descriptors` is None. `ValueError` if
     `descriptor_commutativity` has a weight, but the descriptors on X or Y have no operators.
     """
 
@@ -139,7 +140,7 @@ class RegularizedLeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Returns the minimiser C (k_out, k_in) of the weighted terms, and a status code (`RESULTS`).
+        """Return the minimiser C (k_out, k_in) of the weighted terms, and a status code (`RESULTS`).
 
         The solver starts from `previous`, or from an estimate if `previous` is None.
 
@@ -166,7 +167,7 @@ class RegularizedLeastSquares(Solution[None]):
         *,
         initial: Float[Array, "k_out k_in"] | None = None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the weighted terms, with a given energy in place of the wavelet-preservation energy.
+        """Minimise the weighted terms, with a given energy in place of the wavelet-preservation energy.
 
         **Arguments:**
 
@@ -194,7 +195,7 @@ class RegularizedLeastSquares(Solution[None]):
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
         initial: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Implements `solve` and `minimize`.
+        """Implement `solve` and `minimize`.
 
         `descriptors` contains the descriptors of the shape that C maps to, and then those of the other shape.
         """
@@ -227,7 +228,7 @@ class RegularizedLeastSquares(Solution[None]):
         shape: tuple[int, int],
         dtype: DTypeLike,
     ) -> QuadraticEnergy:
-        """Returns the weighted sum of the given energy and the descriptor-preservation term."""
+        """Return the weighted sum of the given energy and the descriptor-preservation term."""
         if (energy is None) != (self.wavelet_preservation is None):
             raise ValueError(
                 "an energy needs the weight wavelet_preservation, and the weight needs an energy: "
@@ -256,7 +257,7 @@ class RegularizedLeastSquares(Solution[None]):
         eigenvalues_in: Float[Array, " k_in"],
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
     ) -> list[_Term]:
-        """Returns all terms of the objective that have a weight. The first term is the quadratic energy."""
+        """Return all terms of the objective that have a weight. The first term is the quadratic energy."""
         dtype = eigenvalues_in.dtype
         terms = [_energy_term(quadratic)]
         if self.laplacian_commutativity is not None:
@@ -277,9 +278,9 @@ class RegularizedLeastSquares(Solution[None]):
         initial: Float[Array, "k_out k_in"],
         solvable: Bool[Array, ""],
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimises the sum of the squared residuals. The variable of the solver is `C / unit`, elementwise.
+        """Minimise the sum of the squared residuals. The variable of the solver is `C / unit`, elementwise.
 
-        Returns the functional map and `RESULTS.successful` or `RESULTS.solver_not_converged`.
+        Return the functional map and `RESULTS.successful` or `RESULTS.solver_not_converged`.
 
         If `solvable` is False, the residuals are replaced by zeros, so the solver stops immediately.
         """
@@ -321,7 +322,7 @@ class _Term(NamedTuple):
 
 
 def _energy_term(energy: QuadraticEnergy) -> _Term:
-    """Returns the energy, up to a constant, as the squared norm of a residual (k_out, k_in).
+    """Return the energy, up to a constant, as the squared norm of a residual (k_out, k_in).
 
     The energy is a sum of squares over many columns. The columns can be replaced by the Cholesky factor of
     the gram matrix, because the factor has the same inner products as the columns. Adding the rounding error
@@ -338,7 +339,7 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
 def _laplacian_term(
     weight: Float[Array, ""], eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"]
 ) -> _Term:
-    """Returns the weighted term of Laplacian commutativity."""
+    """Return the weighted term of Laplacian commutativity."""
     largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
     gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
     gaps = gaps * jnp.sqrt(weight)
@@ -346,7 +347,7 @@ def _laplacian_term(
 
 
 def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Term:
-    """Returns the weighted term of orthogonality."""
+    """Return the weighted term of orthogonality."""
     root, identity = jnp.sqrt(weight), jnp.eye(min(k_out, k_in), dtype=weight.dtype)
     return _Term(lambda c: root * ((product(c.T, c) if k_in <= k_out else product(c, c.T)) - identity), None)
 
@@ -354,7 +355,7 @@ def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Ter
 def _operator_term(
     weight: Float[Array, ""], d_out: Float[Array, "d k_out k_out"], d_in: Float[Array, "d k_in k_in"]
 ) -> _Term:
-    """Returns the weighted term of descriptor commutativity."""
+    """Return the weighted term of descriptor commutativity."""
     scale = jnp.sqrt(weight * d_out.shape[1] / jnp.sum(d_out**2))
     diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
     squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]
