@@ -30,7 +30,10 @@ APPROXIMATE_FROM = 50_000
 """The smallest number of vertices for which the eigensolver `"auto"` chooses `"approximate"`."""
 
 Search = Literal["auto", "exhaustive", "patches"]
-"""The methods of nearest-neighbour search, with equal results; `"auto"` chooses the faster method."""
+"""The methods of nearest-neighbour search; `"auto"` chooses the faster method.
+
+`"patches"` compares embeddings only, so a refiner that also compares descriptors can find other matches.
+"""
 
 GeodesicMethod = Literal["strips", "exact"]
 """The methods that compute geodesic distances; see `jaxsmw.geometry.geodesic_distances`."""

@@ -390,7 +390,8 @@ def match(
 
         - `"auto"` (the default): `"shot"`. The initial map `"aligned"` is refined as well if `partial` is
           False, the preset has repair, and both shapes differ from their own mirror images, as teeth do. The
-          map with the smaller expected error is then returned.
+          map from `"aligned"` is then returned unless the mean expected error of the map from `"shot"` is at
+          least 2 % smaller.
         - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
           with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, repair also tries alternative maps.

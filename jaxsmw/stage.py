@@ -162,8 +162,8 @@ class Stage:
     ) -> tuple[Spectrum, Spectrum]:
         """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
 
-        For a partial pair, the spectra are then cut at a common limit, the smaller of the two spectra's
-        largest eigenvalues: eigenpairs with eigenvalues above this limit are removed
+        If the stage uses fewer eigenvectors than a partial pair has, the spectra are then cut at a common
+        limit, the smaller of the two spectra's largest eigenvalues: eigenpairs with eigenvalues above this limit are removed
         (`jaxsmw.pair.common_range`).
 
         **Arguments:**

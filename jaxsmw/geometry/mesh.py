@@ -43,7 +43,7 @@ class Mesh:
     """A triangle mesh whose vertices have the same order as in the file or in the given array.
 
     Vertex i of the mesh is always vertex i of the file, because cleaning drops only faces. A vertex without
-    faces keeps its position and its number, and its entry in `referenced_vertices` is False.
+    faces keeps its number, and its entry in `referenced_vertices` is False.
 
     Use `read_mesh` or `make_mesh` to make a `Mesh`, because the constructor does not check or clean its
     input. Properties such as `area`, `vertex_areas` (n,), `vertex_normals` (n, 3) and `edges` (e, 2) are
@@ -390,7 +390,8 @@ def make_mesh(
 
     Scans may contain vertices without a usable position, and small components such as dust. A vertex is lost
     if its position is not finite or is very far away. If at most one vertex in 1000 is lost, each lost vertex
-    is moved to the mean of its neighbours, and its faces are dropped. If more vertices are lost, they stay,
+    is moved to the mean of its neighbours, or of all usable vertices if it has no usable neighbour, and its
+    faces are dropped. If more vertices are lost, they stay,
     and the checks under "Raises" apply to them. If one component has at least half of the area, the faces of
     components with less than 1 % of the area are dropped. Vertices that lose all their faces become
     unreferenced, and receive the match of the nearest referenced vertex.
@@ -413,8 +414,9 @@ def make_mesh(
     **Returns:**
 
     A `Mesh` with the attributes `vertices` (n, 3), float64, and `faces` (f, 3), int64. The `notes` of the
-    mesh report how many faces were dropped, and how many faces welding changed. The notes also report how
-    many vertices appear to be duplicated along a seam, and how many vertices are unreferenced.
+    mesh report how many faces were dropped, and how many faces welding changed. The notes also report lost
+    vertices, ignored small components, vertices that appear to be duplicated along a seam, and unreferenced
+    vertices.
 
     **Raises:**
 
