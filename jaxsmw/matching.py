@@ -519,7 +519,7 @@ def match_prepared(
     alternatives: bool = True,
     refined: Sequence[Outcome | None] = (),
 ) -> Match:
-    """Refine the initial maps of a prepared pair, and return the match with the smallest expected error.
+    """Refine the initial maps of a prepared pair, and return the better match.
 
     **Arguments:**
 

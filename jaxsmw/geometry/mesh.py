@@ -391,9 +391,9 @@ def make_mesh(
     Scans may contain vertices without a usable position, and small components such as dust. A vertex is lost
     if its position is not finite or is very far away. If at most one vertex in 1000 is lost, each lost vertex
     is moved to the mean of its neighbours, or of all usable vertices if it has no usable neighbour, and its
-    faces are dropped. If more vertices are lost, they stay,
-    and the checks under "Raises" apply to them. If one component has at least half of the area, the faces of
-    components with less than 1 % of the area are dropped. Vertices that lose all their faces become
+    faces are dropped. If more vertices are lost, they stay, and the checks under "Raises" apply to them. If
+    one component has at least half of the area, the faces of components with less than 1 % of the area are
+    dropped. Vertices that lose all their faces become
     unreferenced, and receive the match of the nearest referenced vertex.
 
     **Arguments:**

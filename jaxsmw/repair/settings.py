@@ -213,7 +213,7 @@ class ChiralitySettings:
     - `radii` (entry R20): the sets of radii of SHOT, in units of 0.06 times the square root of the area. For
       each set, coarse maps are computed both from X and from its mirror image. With the usual radius alone,
       descriptors hardly distinguish a tooth from its mirror image.
-    - `descriptors`, `levels` (entry R14): the number of descriptors and the levels of the feature regression
+    - `descriptors`, `levels`: the number of descriptors and the levels of the feature regression
       that refines coarse maps.
     - `asymmetry_radii` (entry R23): the radii of SHOT for the asymmetry, in the same unit.
     - `asymmetric_from` (entry R23): shapes are asymmetric if the mean asymmetry of X and Y is at least this
