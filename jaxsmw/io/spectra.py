@@ -67,9 +67,9 @@ def make_spectrum(
         sparse. Vertices of zero area are masked. The unit of length is arbitrary.
     - `name`: the name of the spectrum in messages.
 
-    **Returns:** A `Spectrum` with `eigenvalues` (k,), `eigenvectors` (n, k), `vertex_areas` (n,) and `mask`
-    (n,), for total area 1, without descriptors, positions and normals. Its arrays have JAX's default
-    float type (float32 unless `jax_enable_x64` is set).
+    **Returns:** A `Spectrum` of a surface of area 1, with `eigenvalues` (k,), `eigenvectors` (n, k),
+    `vertex_areas` (n,) and `mask` (n,). It has no descriptors, positions or normals. Its arrays have JAX's
+    default float type (float32 unless `jax_enable_x64` is set).
 
     **Raises:** `InputError` if the arrays do not fit each other or are not finite real numbers. `InputError`
     is also raised if the eigenvalues are negative or not ascending, a vertex area is negative, the
@@ -170,12 +170,12 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     - `path`: the file.
         - A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,).
         - A `.mat` file contains the following variables, or one struct with fields of these names. `evals`
-          (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are given by `A`,
-          the lumped mass matrix (n, n) or its diagonal, or by a list `area` (n).
+          (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are either
+          `A`, which is the lumped mass matrix (n, n) or its diagonal, or a list `area` (n).
 
-    **Returns:** A `Spectrum` with `eigenvalues` (k,), `eigenvectors` (n, k), `vertex_areas` (n,) and `mask`
-    (n,), for total area 1, without descriptors, positions and normals. Its arrays have JAX's default
-    float type (float32 unless `jax_enable_x64` is set).
+    **Returns:** A `Spectrum` of a surface of area 1, with `eigenvalues` (k,), `eigenvectors` (n, k),
+    `vertex_areas` (n,) and `mask` (n,). It has no descriptors, positions or normals. Its arrays have JAX's
+    default float type (float32 unless `jax_enable_x64` is set).
 
     **Raises:** `InputError` if the file cannot be read, has another suffix, is damaged, lacks a field, or
     does not contain exactly one eigenbasis. The message names the file and the fault.
