@@ -38,9 +38,9 @@ class GroundTruth:
     **Attributes:**
 
     - `source_vertices`: 0-based vertices of X (p,), as int64. A vertex may occur several times or not at all.
-    - `targets`: the true point on Y of each source vertex. The true points are either p vertices of Y (an
-      int64 array of 0-based vertices), or p `SurfacePoints` on Y. A surface point consists of a triangle and
-      three barycentric weights.
+    - `targets`: the true point on Y of each source vertex. The true points are either an int64 array (p,) of
+      0-based vertices of Y, or `SurfacePoints` on Y with p entries. A surface point consists of a triangle
+      and three barycentric weights.
 
     **Raises:** `InputError` if the number of source vertices differs from the number of targets.
     """
@@ -109,9 +109,9 @@ def read_ground_truth(
     - `index_base`: the index of the first vertex and of the first face in the files, 0 or 1. If None (the
       default), the index base of the format is used, as listed above.
 
-    **Returns:** A `GroundTruth`, with the attributes `source_vertices` (p,) and `targets`. The targets are p
-    vertices of Y, or p `SurfacePoints` if the file has the format `.baryc_gt`. Vertices of X that no face
-    references are left out, and a `UserWarning` states their number.
+    **Returns:** A `GroundTruth`, with the attributes `source_vertices` (p,) and `targets`. The targets are
+    vertices of Y (p,), or `SurfacePoints` with p entries if the file has the format `.baryc_gt`. Vertices of
+    X that no face references are left out, and a `UserWarning` states their number.
 
     **Raises:** `InputError` if a file cannot be read, has an unknown format or does not fit the meshes. The
     message names the file, the line and the fault.
@@ -178,8 +178,8 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 
     **Arguments:**
 
-    - `path`: the file to create or to replace. The suffix should be `.baryc_gt`, by which `read_ground_truth`
-      recognises the format.
+    - `path`: the file to create or to replace. The suffix should be `.baryc_gt`, because `read_ground_truth`
+      recognises the format by this suffix.
     - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
     - `mesh_y`: the target Y, a `Mesh`. Faces are written as their 1-based positions in the mesh file of Y.
       These positions count all faces of the file, including faces that were dropped when the mesh was read.

@@ -42,7 +42,7 @@ class GeodesicError:
 
     - `errors`: the errors (p,), float64, one for each evaluated row of the ground truth. An error is inf if
       the match and the true point are on different connected components of Y.
-    - `source_vertices`: the 0-based vertices of X (p,), int64, to which the errors belong.
+    - `source_vertices`: the vertex of X at which each error was measured (p,), int64, 0-based.
     - `method`: the method that computed the geodesic distances, `"strips"` or `"exact"`.
     """
 

@@ -96,15 +96,15 @@ def refine_pairs(
     - `refiner`: the method, a `Refiner` such as `WaveletPreservation()`.
     - `iterations`: the number of iterations, an integer of at least 1.
     - `samples`: for each shape, an integer array (s,) of the vertices on which the refiner iterates. The
-      number s must be the same for all shapes. With None, all iterations use all vertices.
+      number s must be the same for all shapes. If None, all iterations use all vertices.
     - `partial`: whether one shape of each pair is a partial shape and the other shape is the full shape. If
       True, both shapes must have the same unit of length.
     - `stop_when_unchanged`: whether to stop the refinement of a pair when an iteration changes no match.
     - `history`: whether to record a `History` of each pair.
     - `batch_size`: the number of pairs that each device receives at the same time. Accelerators refine these
-      pairs at the same time, and CPUs refine them one after another. The default on CPUs is 1,
-      because larger batches save no time there. The default on other devices is as many pairs as fit into
-      `memory`, up to 64.
+      pairs at the same time, and CPUs refine them one after another. The default on CPUs is 1, because larger
+      batches save no time there. On other devices, the default is the number of pairs that fit into `memory`,
+      but at most 64.
     - `memory`: the memory in bytes that a batch may use on each device if `batch_size` is None. The default
       is half of the device's memory.
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
@@ -280,7 +280,8 @@ def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settin
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
         return refine(spectrum_x, spectrum_y, initial_map, refiner=refiner, samples=samples, **settings)
 
-    # In some programs of `jax.vmap`, XLA's threads for CPUs wait for each other forever.
+    # CPUs use `lax.map`, because XLA's threads for CPUs wait for each other forever in some programs of
+    # `jax.vmap`.
     each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
     if mesh.size == 1:
         return each(batch)
@@ -303,7 +304,7 @@ def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Setting
 def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.Device) -> int:
     """Returns the default number of pairs that a device refines at the same time.
 
-    The number is 1 on CPUs. On other devices, as many pairs as fit into the memory are refined, at most 64.
+    The number is 1 on CPUs. On other devices, it is the number of pairs that fit into the memory, at most 64.
     """
     if _one_at_a_time(device):
         return 1

@@ -25,8 +25,8 @@ from jaxsmw.stage import Stage
 MOST_SAMPLES = 1000
 """The number of samples of each shape in a prepared pair. No method uses more samples.
 
-If a shape has fewer referenced vertices, the number of samples of both shapes is the smaller of their numbers
-of referenced vertices.
+If a shape has fewer referenced vertices, both shapes have the same smaller number of samples. This is the
+number of referenced vertices of the shape with the fewest.
 """
 
 

@@ -106,9 +106,11 @@ def coherent_point_drift(
     points from their mean is then 1. The docstring of this module contains the equations. The default values
     are those of Myronenko's program, except for the rank. Myronenko's program uses the exact kernel matrix by
     default, and optionally an approximation of rank sqrt(n). The mean geodesic errors on a real pair with
-    5000 vertices show the effect of the rank. With 30 eigenvectors, the mean geodesic error is 22.4 x 10^-3
-    at rank 70, and 20.8 x 10^-3 at the ranks 300 and 1200. With 100 eigenvectors, the mean geodesic error is
-    17.2 x 10^-3 at rank 150, 11.4 x 10^-3 at rank 600, and 11.3 x 10^-3 at rank 1200.
+    5000 vertices show the effect of the rank:
+
+    - with 30 eigenvectors, 22.4 x 10^-3 at rank 70, and 20.8 x 10^-3 at the ranks 300 and 1200;
+    - with 100 eigenvectors, 17.2 x 10^-3 at rank 150, 11.4 x 10^-3 at rank 600, and 11.3 x 10^-3 at rank
+      1200.
 
     **Arguments:**
 
@@ -305,8 +307,8 @@ def _drift(
     infinite = jnp.asarray(jnp.inf, x.dtype)
     initial = _State(
         jnp.zeros((rank, d), x.dtype),
-        # The initial variance is the mean squared distance between data and centroids, divided by d. The
-        # initial variance is 2 / d, because both sets have zero mean and a mean squared norm of 1.
+        # The initial variance is the mean squared distance between data and centroids, divided by d. This
+        # value is 2 / d, because both sets have zero mean and a mean squared norm of 1.
         jnp.asarray(2 / d, x.dtype),
         objective=infinite,
         change=infinite,

@@ -89,7 +89,7 @@ from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.stage import Stage
 
 FIDELITY = 60.0
-"""The factor of the fidelity term in the minimisation over C, in which column norms are averaged."""
+"""The factor of the fidelity term in the minimisation over C. The fidelity term averages column norms."""
 MAP_WEIGHTS = (1.0, 100.0, 1.0)
 """The published weights mu_1, mu_2 and mu_3 of the terms that regularise the functional map."""
 REGION_WEIGHTS = (10.0, 0.01)
