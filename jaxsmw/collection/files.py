@@ -85,7 +85,7 @@ def _write_mesh(path: Path, data: MeshData, *, told: bool) -> None:
 
 
 def _turned(data: MeshData) -> MeshData:
-    """Return the mesh with reversed faces, so that the normals of a mirror image point outward."""
+    """Return the mesh with the corners of all faces reversed, so that mirrored normals point outward."""
     texture = None if data.texture is None else (data.texture[0], data.texture[1][:, ::-1])
     mesh = replace(data.mesh, faces=np.ascontiguousarray(data.mesh.faces[:, ::-1]))
     return replace(data, mesh=mesh, faces=data.faces[:, ::-1], texture=texture)

@@ -67,8 +67,9 @@ class MatchedEdge:
       estimate is the error that the cycles of the graph show (`edge_errors`), but at least half of the
       expected error. A term that grows with the distortion is added (`CollectionSettings.distortion_weight`).
     - `residual`: the mean distance between the map and the map through the template.
-    - `decision`: `"kept"`, `"replaced"` (matched again from the consistent map, because the first map
-      contradicted the other maps), or `"contradicted"` (still contradicts the other maps, and hardly counts).
+    - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. A replaced map was matched again from the
+      consistent map, because the first map contradicted the other maps. A contradicted map still contradicts
+      the other maps, and hardly counts.
     - `doubtful`: whether the map contradicts the other maps, or its estimated error is at least
       `CollectionSettings.outlier_from`.
     """
@@ -197,12 +198,12 @@ class Collection:
         return self.registered[shape].surface_points.nearest_corners(self.meshes[shape])
 
     def to_template(self, shape: int) -> Int64[np.ndarray, " m"]:
-        """Return the map from a shape to the template, as 0-based vertices of the template (m,)."""
+        """Return the map from a shape (m vertices) to the template, as 0-based template vertices (m,)."""
         self._check_number(shape)
         return self.registered[shape].points_of_target.nearest_corners(self.meshes[self.template])
 
     def pointwise_map(self, source: int, target: int) -> Int64[np.ndarray, " m"]:
-        """Return the map from one shape to another through the template, as 0-based vertices (m,).
+        """Return the map from a shape (m vertices) to another through the template, as 0-based vertices (m,).
 
         The maps of all pairs are consistent: a vertex that is carried around a cycle returns to itself, up to
         the rounding to vertices.

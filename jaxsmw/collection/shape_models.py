@@ -137,8 +137,8 @@ class ShapeModel:
 
     The modes are the principal components of the shapes (Cootes, Taylor, Cooper, Graham, "Active shape
     models", CVIU 1995). The inner product of two fields u and v of displacements is sum_i w_i u_i · v_i, with
-    the weights w of the vertices. If a score changes by one standard deviation, the root mean square
-    of the displacements over the surface is therefore this standard deviation.
+    the weights w of the vertices. If a score changes by one standard deviation, the root mean square of the
+    displacements over the surface is therefore this standard deviation.
 
     **Attributes:**
 
@@ -299,7 +299,7 @@ class ShapeModel:
         seed = check_whole_number("seed", seed, 0)
         numbers = _checked_numbers(numbers_of_modes, len(self.modes), "the model has")
         coordinates = _coordinates(self.alignment)
-        # The modes are drawn one after another, so further modes do not change the first numbers.
+        # The numbers are drawn mode by mode, so further modes do not change the numbers of the first modes.
         normal = np.random.default_rng(seed).standard_normal((len(self.modes), samples)).T
         drawn = normal * np.sqrt(self.variances)
         distances = []

@@ -214,9 +214,10 @@ class Network:
 def synchronize(network: Network, template: int) -> list[SurfacePoints]:
     """Compute maps from the template to all shapes that agree with the maps of all edges.
 
-    The first maps follow the paths with the smallest errors. Each iteration then moves the points on a shape
-    to the robust mean of the points on its neighbours in the graph, carried along the edges. This is the
-    synchronisation of pointwise maps (Huang, Guibas 2013) by iterated averages on the surfaces.
+    The first maps follow the paths with the smallest errors. Each iteration then carries the points on the
+    neighbours of a shape to the shape, along the edges of the graph. The points on the shape move to the
+    robust mean of the carried points. This is the synchronisation of pointwise maps (Huang, Guibas 2013) by
+    iterated averages on the surfaces.
 
     **Arguments:**
 

@@ -90,7 +90,7 @@ def parse_positions(words: list[str], noun: str, numbers: Sequence[int]) -> Floa
 
 
 def left_out(numbers: Sequence[int], total: int, why: str) -> tuple[str, ...]:
-    """Return a note that lists the omitted landmarks by their numbers in the file. Without any, return ()."""
+    """Return a note with the numbers of the landmarks that were left out, or no note if there are none."""
     if not numbers:
         return ()
     listed = ", ".join(map(str, numbers[:10])) + (", …" if len(numbers) > 10 else "")

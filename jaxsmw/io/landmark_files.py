@@ -65,9 +65,9 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
     None. The `notes` report points that were left out, because Slicer has no defined position for them or
     because they are not active in MeshLab.
 
-    **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, is larger
-    than 128 MiB (`.mrk.json`: 32 MiB), or contains no landmarks or more than 2²⁰. `InputError` is also raised
-    if a coordinate is not finite, or if two landmarks have the same name.
+    **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, or is larger
+    than 128 MiB (`.mrk.json`: 32 MiB). `InputError` is also raised if the file contains no landmarks or more
+    than 2²⁰ landmarks, if a coordinate is not finite, or if two landmarks have the same name.
     """
     suffix = check_readable_suffix(path)
     _check_size(path, size_of_file(path), suffix)
@@ -126,7 +126,7 @@ def check_readable_suffix(path: str | os.PathLike[str]) -> str:
 def check_known_system(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
     """Check that the coordinate system of landmarks is known if the format of a file states one.
 
-    **Raises:** `InputError` if the format states a coordinate system, but the landmarks have none.
+    **Raises:** `InputError` if the format states a coordinate system, but that of the landmarks is None.
     """
     suffix = check_landmark_suffix(path)
     if landmarks.coordinates is None and suffix in _WITH_SYSTEM:

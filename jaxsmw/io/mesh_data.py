@@ -4,8 +4,8 @@ Vertices must keep their order, and a damaged file must cause one clear error me
 has its own parsers, one per module of `jaxsmw.io.formats`. The reader of libigl accepts indices out of range
 and aborts the process on some invalid headers. The reader of VTK 9.7 ends the process with a segmentation
 fault if a polygon declares too many corners. It also accepts files whose counts are wrong. The reader of
-trimesh splits and drops vertices of OBJ files, and it cannot read binary PLY files whose polygons have
-different numbers of corners. pygltflib only parses the JSON part of glTF files, without checks.
+trimesh splits and drops vertices of OBJ files. It also cannot read binary PLY files whose polygons have
+different numbers of corners. pygltflib parses only the JSON part of glTF files, and has no checks.
 """
 
 from __future__ import annotations

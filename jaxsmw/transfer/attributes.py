@@ -76,8 +76,9 @@ def transfer_attributes(
       `registered.mesh_y`.
 
     **Returns:** The `MeshData` of Y with the vertices and faces of `target`. The `notes` of its `mesh` tell
-    which data of Y were replaced, and how many vertices of Y are farther from the registered mesh than 3 % of
-    the square root of Y's area. These vertices also receive the values at the nearest point.
+    which data of Y were replaced. The notes also count the vertices of Y whose distance to the registered
+    mesh is above 3 % of the square root of Y's area. These vertices receive the values at the nearest point,
+    too.
 
     **Raises:** `InputError` if `data` or `target` do not belong to the registered meshes.
     """

@@ -63,8 +63,8 @@ class RegisteredMesh:
     - `mesh_x`, `mesh_y`: the source X (m vertices, f faces) and the target Y.
     - `vertices`: the positions of X's vertices on Y (m, 3), in Y's unit of length. Together with the faces of
       X, they form the registered mesh.
-    - `similarities`: the rotation and the scale of the neighbourhood of each vertex, from X in X's unit of
-      length to the registered mesh in Y's unit.
+    - `similarities`: the rotation and the scale of each vertex's neighbourhood. They take X, in X's unit of
+      length, to the registered mesh, in Y's unit.
 
     An unreferenced vertex of X has the similarity of the nearest referenced vertex and moves with it. A
     duplicate that welding replaced has exactly the position of its twin.
@@ -101,8 +101,8 @@ class RegisteredMesh:
     def flipped_faces(self) -> Bool[np.ndarray, " f"]:
         """A mask (f,), True for faces that are turned over relative to their neighbourhoods.
 
-        The normal of such a face makes an angle of more than 90 degrees with its normal on X, after the
-        normal on X is rotated with the face's neighbourhood.
+        The face's normal on X is first rotated with the face's neighbourhood. The face is turned over if the
+        angle between this rotated normal and the normal of the registered face is above 90 degrees.
         """
         normals = _normals(self.mesh_x.vertices, self.mesh_x)
         return _flipped_faces(self.mesh_x, normals, self.vertices, self.similarities)
@@ -264,8 +264,8 @@ def points_of_map(
 ) -> SurfacePoints:
     """Convert a map to vertices into a map to points between the vertices.
 
-    X is first registered with a stiffness of 0.01 in units of the square root of Y's area. The registration
-    smooths the map, whose matches jump from vertex to vertex.
+    X is first registered with a stiffness of 0.01 in units of the square root of Y's area. The matches
+    of a map to vertices jump from vertex to vertex, and the registration smooths these jumps.
 
     **Arguments:**
 

@@ -23,7 +23,7 @@ DAMAGED = "so the file is damaged: export the mesh again."
 TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
-# A file may require these extensions, because positions, faces and attributes are read without them.
+# Files may require these extensions, which do not change how positions, faces and attributes are read.
 _HARMLESS = re.compile(r"KHR_mesh_quantization|(KHR|EXT)_(materials|texture|lights|animation|xmp).*")
 
 
