@@ -15,11 +15,12 @@ from jaxsmw.errors import InputError, check_whole_number
 # An edge (i, j) with i < j, as the numbers of its two shapes.
 Edge = tuple[int, int]
 
-# Distances above this share of the square root of the area count as this share. Beyond it, a point of a limb
-# lies on another limb, and a larger distance says no more.
+# Distances above this share of the square root of the area count as this share. At such a distance, a point
+# of one limb lies on another limb, and the exact distance gives no further information.
 _LARGEST = 0.5
-# The sharpness of the weights in each iteration, in units of 1 / error, following the doubling sequence that
-# Lerman and Shi recommend. With the last value, cycles whose two other edges have an error of 0.1 count e^-4.
+# The sharpness of the weights in each iteration, in units of 1 / error. The values follow the doubling
+# sequence that Lerman and Shi recommend. With the last value, a cycle has the weight e^-4 if the errors of
+# its two other edges sum to 0.1.
 _SHARPNESS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 
 
@@ -80,7 +81,7 @@ def cycle_error(
     **Arguments:**
 
     - `first`, `second`, `third`: the maps i -> j, j -> k and k -> i, as 0-based vertices.
-    - `positions`: the vertices of shape i (i, 3), in units of the square root of the area.
+    - `positions`: the positions of the vertices of shape i (i, 3), in units of the square root of the area.
     - `samples`: the samples (s,), vertices of shape i.
 
     **Returns:** The mean Euclidean distance between samples and their images, in the same unit. Distances
@@ -98,11 +99,11 @@ def edge_errors(
 ) -> Float[Array, " e"]:
     """Estimate the error of each edge's map from the errors of cycles.
 
-    A cycle of three maps is consistent if all three maps are right. So the error of a cycle whose two other
-    maps are right is the error of the map at hand. Each iteration averages the errors of all cycles through
-    an edge. The weight of a cycle decreases exponentially with the estimated errors of its two other edges
-    (cycle-edge message passing; Lerman, Shi, "Robust group synchronization via cycle-edge message passing",
-    Foundations of Computational Mathematics 2022). The function is traced JAX code.
+    A cycle of three maps is consistent if all three maps are right. If two maps of a cycle are right, the
+    error of the cycle is therefore the error of the third map. Each iteration averages the errors of all
+    cycles through an edge. The weight of a cycle decreases exponentially with the estimated errors of its two
+    other edges (cycle-edge message passing; Lerman, Shi, "Robust group synchronization via cycle-edge message
+    passing", Foundations of Computational Mathematics 2022). The function is traced JAX code.
 
     **Arguments:**
 
@@ -110,7 +111,7 @@ def edge_errors(
     - `errors`: the error of each cycle (c,), from `cycle_error`.
     - `prior`: the first estimate of each edge's error (e,), for example the expected error.
 
-    **Returns:** The estimated errors (e,), in the unit of `errors`. An edge in no cycle keeps its prior.
+    **Returns:** The estimated errors (e,), in the unit of `errors`. An edge without cycles keeps its prior.
     """
     number = prior.shape[0]
     # Each cycle sends one message to each of its edges, from the two other edges.
@@ -140,7 +141,7 @@ def estimate_edge_errors(
 
     - `edges`: the edges (i, j).
     - `maps`: for each edge (i, j), the vertex maps with keys (i, j) and (j, i).
-    - `positions`: the vertices of each shape, in units of the square root of its area.
+    - `positions`: the positions of each shape's vertices, in units of the square root of the shape's area.
     - `samples`: samples of each shape, as 0-based vertices.
     - `prior`: the first estimate of each edge's error (e,).
 
@@ -175,7 +176,7 @@ def find_outliers(errors: Mapping[Edge, float], limit: float) -> tuple[int, ...]
     **Arguments:**
 
     - `errors`: the error of the map of each edge (i, j).
-    - `limit`: the smallest large error, in the unit of `errors`.
+    - `limit`: the smallest error that counts as large, in the unit of `errors`.
     """
     least: dict[int, float] = {}
     for edge, error in errors.items():

@@ -25,8 +25,8 @@ class EdgeMap:
 
     **Attributes:**
 
-    - `forward`: the match of every vertex of X, m `SurfacePoints` on Y.
-    - `backward`: the match of every vertex of Y, n `SurfacePoints` on X.
+    - `forward`: the match of every vertex of X, as `SurfacePoints` on Y with m entries.
+    - `backward`: the match of every vertex of Y, as `SurfacePoints` on X with n entries.
     - `expected_error`: the mean expected error, in units of the square root of the area; see
       `jaxsmw.repair.expected_error`.
     - `distortion`: the distortion of the map; see `jaxsmw.repair.scores.distortion`.
@@ -41,7 +41,7 @@ class EdgeMap:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> EdgeMap:
-        """Return the maps that `arrays` describes."""
+        """Return the maps, given the result of the method `arrays`."""
         forward, backward = (
             SurfacePoints(arrays[f"{name}_faces"].astype(np.int64), arrays[f"{name}_weights"])
             for name in ("forward", "backward")
@@ -78,7 +78,7 @@ class EdgeTask:
 
     **Attributes:**
 
-    - `x`, `y`: the source X (m vertices) and the target Y, of the same hand.
+    - `x`, `y`: the source X (m vertices) and the target Y, which have the same hand.
     - `init`: the initial map X -> Y (m,), as 0-based vertices of Y; None for `"shot"`.
     - `aligned`: whether to refine the initial map `"aligned"` as well, and to keep the better map; see
       `jaxsmw.match`.
@@ -109,8 +109,8 @@ def match_edges(
     - `preset`: the stages and the repair.
     - `devices`: the JAX devices. The default is all devices of the default backend.
 
-    **Returns:** An iterator with one `EdgeMap` per edge, in the order of `tasks`; an `ArithmeticError` for an
-    edge whose refinement fails numerically.
+    **Returns:** An iterator with one `EdgeMap` per edge, in the order of `tasks`. If the refinement of an
+    edge fails numerically, the iterator yields an `ArithmeticError` for this edge instead.
     """
     for starts, fitted, refined in refined_starts((task.starts() for task in tasks), preset, devices=devices):
         try:

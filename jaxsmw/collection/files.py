@@ -85,7 +85,7 @@ def _write_mesh(path: Path, data: MeshData, *, told: bool) -> None:
 
 
 def _turned(data: MeshData) -> MeshData:
-    """Return the mesh with reversed corners of all faces, so that normals of a mirror image point outward."""
+    """Return the mesh with the corners of all faces reversed, so that mirrored normals point outward."""
     texture = None if data.texture is None else (data.texture[0], data.texture[1][:, ::-1])
     mesh = replace(data.mesh, faces=np.ascontiguousarray(data.mesh.faces[:, ::-1]))
     return replace(data, mesh=mesh, faces=data.faces[:, ::-1], texture=texture)
@@ -94,7 +94,7 @@ def _turned(data: MeshData) -> MeshData:
 def write_attributes(
     collection: Collection, source: int, data: Sequence[MeshData], directory: Path, suffix: str
 ) -> list[Path]:
-    """Write each mesh with the attributes of one mesh; see `jaxsmw.transfer.transfer_attributes`.
+    """Write all other meshes with the attributes of one mesh; see `jaxsmw.transfer.transfer_attributes`.
 
     **Arguments:**
 
@@ -122,7 +122,7 @@ def write_attributes(
 def write_landmarks(
     collection: Collection, source: int, landmarks: Landmarks, directory: Path, suffix: str
 ) -> tuple[list[Path], tuple[str, ...]]:
-    """Write the landmarks of one shape on all other shapes.
+    """Transfer the landmarks of one shape to all other shapes, and write the transferred landmarks.
 
     **Arguments:**
 
@@ -245,13 +245,13 @@ def write_summary(
 def replace_results(new: Path, directory: Path) -> None:
     """Move complete results to a directory, and remove the results of an earlier run.
 
-    Files that the earlier `collection.json` lists, but the new one does not, are removed. They belong to
-    meshes or options of the earlier run. The new `collection.json` is moved first, so that it lists all
-    results even if the process is killed.
+    A file is removed if the earlier `collection.json` lists it, but the new `collection.json` does not. Such
+    files belong to meshes or options of the earlier run. The new `collection.json` is moved first, so that it
+    lists all results even if the process is killed.
 
     **Arguments:**
 
-    - `new`: the directory with the new results, which is removed.
+    - `new`: the directory with the new results. This directory is removed.
     - `directory`: the directory of the results.
 
     **Raises:** `InputError` if a file cannot be written.
@@ -270,7 +270,7 @@ def replace_results(new: Path, directory: Path) -> None:
 
 
 def _listed_files(summary: Path) -> list[str]:
-    """Return the files that an earlier summary lists, as far as they lie within its directory."""
+    """Return the files that an earlier summary lists, if they lie within the directory of the summary."""
     with suppress(OSError, ValueError, RecursionError):
         found = json.loads(summary.read_text("utf-8"))
         listed = found.get("files", []) if isinstance(found, dict) else []

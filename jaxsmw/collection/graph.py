@@ -21,15 +21,15 @@ def shape_distances(shapes: Sequence[PreparedShape]) -> Float64[np.ndarray, "N N
 
     The distance of two shapes is the root mean square of two parts, each divided by its median over all
     pairs. The first part compares the logarithms of the eigenvalues of the Laplacian (Reuter, Wolter,
-    Peinecke, "Laplace-Beltrami spectra as Shape-DNA of surfaces and solids", 2006), which hardly change with
-    the pose. The second part compares the second moments of the descriptors over the surface, which also
-    change with the pose.
+    Peinecke, "Laplace-Beltrami spectra as Shape-DNA of surfaces and solids", 2006). The eigenvalues hardly
+    change with the pose. The second part compares the second moments of the descriptors over the surface.
+    Unlike the eigenvalues, these moments change with the pose.
 
     **Arguments:**
 
     - `shapes`: the N shapes. Without descriptors, only eigenvalues are compared.
 
-    **Returns:** The distances (N, N), symmetric, without unit, with a zero diagonal.
+    **Returns:** A symmetric matrix of distances (N, N), without unit and with a zero diagonal.
     """
     features = [[_log_eigenvalues(shape) for shape in shapes]]
     if all(shape.spectrum.descriptors is not None for shape in shapes):
@@ -74,14 +74,14 @@ def choose_edges(
     - `edges_per_shape`: the number of edges divided by N. If there are fewer pairs, all pairs are chosen.
     - `random_share`: the share of random edges.
     - `given`: edges that are already matched and are kept. If shapes were added to a collection, only edges
-      of these shapes are added.
+      of the added shapes are new.
     - `seed`: the seed of the random edges.
 
     **Returns:** The edges (i, j) with i < j, in ascending order.
 
-    **Raises:** `InputError` if the distances are not a square matrix of finite numbers that are not negative,
-    the number of edges is not positive, the share is not from 0 to 1, the seed is negative, or a given edge
-    does not join two shapes.
+    **Raises:** `InputError` if the distances are not a square matrix of finite numbers that are not negative.
+    `InputError` is also raised if the number of edges is not positive, the share is not from 0 to 1, the seed
+    is negative, or a given edge does not join two shapes.
     """
     distances = np.asarray(distances)
     if not (

@@ -1,4 +1,4 @@
-"""The hand of each shape of a collection: whether it or its mirror image corresponds to the others."""
+"""The hand of each shape of a collection: whether the shape or its mirror image corresponds to the others."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxsmw.repair.chirality import Decision
 
 
 def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.ndarray, " N"]:
-    """Divide the shapes of a collection into two hands, such that the evidence of all edges agrees best.
+    """Divide the shapes of a collection into two hands that agree best with the evidence of all edges.
 
     The evidence of an edge is positive if the two shapes seem to be of opposite hands. The leading
     eigenvector of the matrix of the negative evidences gives the hands (synchronisation over the group of two
@@ -24,7 +24,7 @@ def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.nda
     - `number`: the number N of shapes.
     - `decisions`: for each compared edge (i, j), the `Decision`. Decisions without evidence are ignored.
 
-    **Returns:** An array (N,), True for shapes whose mirror image is matched. Most shapes have False.
+    **Returns:** An array (N,), True for shapes whose mirror image is matched. At most half are True.
     """
     agreement = np.zeros((number, number))
     for (i, j), decision in decisions.items():

@@ -63,12 +63,13 @@ class MatchedEdge:
     - `source`, `target`: the numbers of the two shapes.
     - `expected_error`: the mean expected error of the map by itself; infinite if the match failed.
     - `distortion`: the distortion of the map; infinite if the match failed.
-    - `estimated_error`: an estimate of the error of the map, from which its weight comes: the error that the
-      cycles of the graph show (`edge_errors`), or at least half of the expected error, plus a term that grows
-      with the distortion (`CollectionSettings.distortion_weight`).
+    - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The
+      estimate is the error that the cycles of the graph show (`edge_errors`), but at least half of the
+      expected error. A term that grows with the distortion is added (`CollectionSettings.distortion_weight`).
     - `residual`: the mean distance between the map and the map through the template.
-    - `decision`: `"kept"`, `"replaced"` (matched again from the consistent map, because the first map
-      contradicted the other maps), or `"contradicted"` (still contradicts the other maps, and hardly counts).
+    - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. A replaced map was matched again from the
+      consistent map, because the first map contradicted the other maps. A contradicted map still contradicts
+      the other maps, and hardly counts.
     - `doubtful`: whether the map contradicts the other maps, or its estimated error is at least
       `CollectionSettings.outlier_from`.
     """
@@ -102,14 +103,14 @@ class Collection:
 
     - `meshes`: the meshes of the N shapes.
     - `template`: the number of the template, which has n vertices.
-    - `points`: for each shape, the point of every vertex of the template, n `SurfacePoints` on its mesh.
+    - `points`: for each shape, one `SurfacePoints` on its mesh, with an entry per vertex of the template.
     - `mirrored`: a mask (N,), True for shapes of the other hand, such as right teeth among left teeth. Their
-      mirror images were matched. All points and positions belong to the meshes themselves.
+      mirror images were matched. All points and positions refer to the meshes, not to the mirror images.
     - `registered`: for each shape, the `RegisteredMesh` of the template on the shape.
     - `edges`: the matched pairs, each a `MatchedEdge`.
     - `axes`: the axes of the descriptors, or None.
-    - `cycle_errors`: the errors of all triangles of the graph, with the first and with the final maps of its
-      edges, as two arrays in units of the square root of the area.
+    - `cycle_errors`: two arrays with the errors of all triangles of the graph, in units of the square root of
+      the area. The first array was computed from the first maps of the edges, the second from the final maps.
     - `outliers`: the numbers of shapes that differ much from all other shapes: all their maps have large
       errors or distortions. Such a shape may be another kind of body.
     - `left_out`: a dictionary from the name of each mesh that could not be matched to the reason.
@@ -192,22 +193,22 @@ class Collection:
                 )
 
     def from_template(self, shape: int) -> Int64[np.ndarray, " n"]:
-        """Return the map from the template (n,) to a shape, as 0-based vertices of the shape."""
+        """Return the map from the template to a shape, as 0-based vertices of the shape (n,)."""
         self._check_number(shape)
         return self.registered[shape].surface_points.nearest_corners(self.meshes[shape])
 
     def to_template(self, shape: int) -> Int64[np.ndarray, " m"]:
-        """Return the map from a shape (m,) to the template, as 0-based vertices of the template."""
+        """Return the map from a shape (m vertices) to the template, as 0-based template vertices (m,)."""
         self._check_number(shape)
         return self.registered[shape].points_of_target.nearest_corners(self.meshes[self.template])
 
     def pointwise_map(self, source: int, target: int) -> Int64[np.ndarray, " m"]:
-        """Return the map from one shape (m,) to another through the template, as 0-based vertices.
+        """Return the map from a shape (m vertices) to another through the template, as 0-based vertices (m,).
 
         The maps of all pairs are consistent: a vertex that is carried around a cycle returns to itself, up to
         the rounding to vertices.
 
-        **Raises:** `InputError` if there is no shape with a number.
+        **Raises:** `InputError` if a number is not the number of a shape.
         """
         self._check_number(source, target)
         images = self.registered[target].carry(self.registered[source].points_of_target)
@@ -220,7 +221,7 @@ class Collection:
         With the registered mesh, `jaxsmw.transfer` transfers landmarks and attributes from `source` to
         `target`.
 
-        **Raises:** `InputError` if there is no shape with a number.
+        **Raises:** `InputError` if a number is not the number of a shape.
         """
         self._check_number(source, target)
         if source == self.template:
@@ -232,8 +233,8 @@ class Collection:
     def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
         """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
 
-        Lengths are in the unit of the meshes, or without unit if `scale` is True. Each vertex has the area
-        around it on the template as its weight. If a shape is of the other hand than the template, its mirror
+        Lengths are in the unit of the meshes, or without unit if `scale` is True. The weight of each vertex
+        is its vertex area on the template. If a shape does not have the hand of the template, its mirror
         image enters the model.
 
         **Arguments:**
@@ -279,8 +280,8 @@ def match_collection(
 
     - `meshes`: at least two meshes of the same kind of body, in any poses, units and triangulations. Each is
       a `Mesh`, or a mesh that `make_mesh` accepts.
-    - `names`: the names of the meshes. The default are the names of the meshes, which are numbered if two
-      names are equal.
+    - `names`: the new names of the meshes. By default, the meshes keep their names. If two of these names are
+      equal, all names are numbered.
     - `preset`: see `match`.
     - `template`: the number of the template. The default is the shape with the smallest sum of errors along
       the best paths to all other shapes (the medoid).
@@ -409,7 +410,8 @@ class _Matcher:
             edges = self._edges()
         with timed("edges", self.seconds):
             found = dict(self._match(dict.fromkeys(edges), "edges"))
-            # Workers finish edges in any order, but the order determines rounding errors.
+            # Workers finish edges in any order. The order of the maps is fixed here, because it determines
+            # rounding errors.
             self.maps = {edge: found[edge] for edge in edges if edge in found}
             self._check_connected()
         replaced: set[Edge] = set()
@@ -641,7 +643,7 @@ class _Matcher:
     def _check_connected(self) -> None:
         """Check that the matched edges connect all shapes.
 
-        **Raises:** `ArithmeticError` that names the shapes that are not connected to most other shapes.
+        **Raises:** `ArithmeticError` if not. The message names the shapes that most shapes cannot reach.
         """
         component = connected_components(np.array(list(self.maps)).reshape(-1, 2), len(self.shapes))[1]
         largest = np.bincount(component).argmax()
@@ -667,7 +669,7 @@ class _Matcher:
             [self._cycle_samples(number) for number in range(len(meshes))],
             prior,
         )
-        # A small cycle error can arise by chance, so a map is not trusted much more than it expects. Wrong
+        # A small cycle error can arise by chance, so the error of a map is at least half of its prior. Wrong
         # maps can be consistent with each other. Their distortions are then larger.
         errors = np.maximum(estimated, prior / 2) + self.settings.distortion_weight * self._distortions()
         network = Network(
@@ -712,7 +714,7 @@ class _Matcher:
     def _better(
         self, again: Mapping[Edge, EdgeMap], network: Network, points: Sequence[SurfacePoints]
     ) -> dict[Edge, EdgeMap]:
-        """Return the new maps that are closer to the consistent maps than the old maps, and no worse.
+        """Return the new maps that are closer to the consistent maps than the old, and not more distorted.
 
         If the consistent map is wrong, a new map that follows it has a larger distortion than the old map.
         """
@@ -759,6 +761,6 @@ def _both_directions(maps: Mapping[Edge, EdgeMap]) -> dict[tuple[int, int], Surf
 _MANY_OUTLIERS = 1 / 3
 # The number of pairs whose hands are compared, divided by the number of shapes.
 _HANDS_PER_SHAPE = 1.5
-# The number of pairs whose hands are compared first. If none of them is asymmetric, as bodies are not, hands
-# are not compared any further.
+# The number of pairs whose hands are compared first. If none of these pairs is asymmetric, as with bodies,
+# no further hands are compared.
 _FIRST_HANDS = 5

@@ -35,14 +35,14 @@ def match_pairs(
     """Match any pairs of several full shapes.
 
     Spectra, descriptors and samples are computed once per shape. All shapes are described along the same axes
-    (`DescriptorAxes`), so that a map can differ slightly from the map of `match`. Accelerators, and several
-    devices, refine pairs in batches (`jaxsmw.refine_pairs`); one CPU refines one pair after another. Only
-    maps that look wrong are repaired. Mirror images are not considered.
+    (`DescriptorAxes`), so a map can differ slightly from the map of `match`. On accelerators or on several
+    devices, pairs are refined in batches (`jaxsmw.refine_pairs`). On one CPU, pairs are refined one after
+    another. Only maps that look wrong are repaired. Mirror images are not considered.
 
     **Arguments:**
 
     - `meshes`: the meshes of the shapes, each a `Mesh` or a mesh that `make_mesh` accepts.
-    - `pairs`: the number of the source X and of the target Y of each pair.
+    - `pairs`: for each pair, a tuple with the numbers of the source X and the target Y in `meshes`.
     - `preset`: the name of a preset, or a `Preset`; see `match`.
     - `alternatives`: whether repair tries alternative maps.
     - `batch_size`: the number of pairs that each device refines at the same time; see `refine_pairs`.
@@ -50,8 +50,8 @@ def match_pairs(
 
     **Returns:** An iterator over tuples: the number of a pair in `pairs`, and its `Correspondence`.
 
-    **Raises:** `InputError` if a mesh or an argument cannot be used, or a pair names no shape. While the
-    iterator runs, `ArithmeticError` if the refinement of a pair fails numerically.
+    **Raises:** `InputError` if a mesh or an argument cannot be used, or if a pair contains a number that
+    belongs to no shape. The iterator raises `ArithmeticError` if the refinement of a pair fails numerically.
     """
     given = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
     checked = check_pairs(pairs, len(given), "pair")
@@ -99,9 +99,9 @@ def refined_starts(
     - `preset`: the preset, whose stages run. For each pair, the preset is adapted to small meshes.
     - `batch_size`, `devices`: see `refine_pairs`.
 
-    **Returns:** An iterator over the pairs, in the given order: the prepared pairs, the adapted preset, and
-    the outcomes before repair. On one CPU there are no outcomes, because `match_prepared` then runs the
-    stages itself.
+    **Returns:** An iterator over tuples, one for each pair in the given order. A tuple contains the prepared
+    pairs, the adapted preset, and the outcomes before repair. On one CPU there are no outcomes, because
+    `match_prepared` then runs the stages itself.
     """
     devices = jax.devices() if devices is None else devices
     fitted = ((one, fitted_preset(preset, *one[0].pair.meshes)) for one in starts)

@@ -28,7 +28,7 @@ class CollectionSettings:
     - `distortion_tolerance`: a new map replaces the old map of an edge only if its distortion is at most this
       multiple of the old distortion.
     - `outlier_from`: a shape is an outlier if the errors of all its edges are at least this value. On sets of
-      one kind of body, the smallest error of the edges of a shape was at most 0.04.
+      one kind of body, the smallest error among the edges of each shape was at most 0.04.
     - `rounds`: the largest number of times that contradicted edges are matched again.
     - `synchronization`: the settings of `synchronize`.
 

@@ -1,7 +1,7 @@
 """The statistical shape model of a collection: generalised Procrustes alignment, mean shape and modes.
 
 All shapes have the same n vertices, and vertex i is the same point of the body on every shape. Means over the
-surface are sums over the vertices with weights, which have the sum 1. The distance of two shapes is therefore
+surface are weighted sums over the vertices, and the weights sum to 1. The distance of two shapes is therefore
 in the unit of length of the shapes, and does not depend on the resolution.
 """
 
@@ -44,9 +44,9 @@ class Alignment:
 
     - `aligned`: the aligned shapes (N, n, 3), in the unit of length of the shapes.
     - `mean`: the mean of the aligned shapes (n, 3).
-    - `rotations`: a rotation (N, 3, 3) without reflection for each shape.
-    - `translations`: a translation (N, 3) for each shape.
-    - `scales`: a positive factor (N,) for each shape; 1 if shapes keep their size.
+    - `rotations`: a rotation without reflection for each shape (N, 3, 3).
+    - `translations`: a translation for each shape (N, 3).
+    - `scales`: a positive factor for each shape (N,). The factors are 1 if shapes keep their size.
     - `weights`: the weights of the vertices (n,), with the sum 1.
     - `scaled`: whether the alignment changed the sizes of shapes.
     """
@@ -137,8 +137,8 @@ class ShapeModel:
 
     The modes are the principal components of the shapes (Cootes, Taylor, Cooper, Graham, "Active shape
     models", CVIU 1995). The inner product of two fields u and v of displacements is sum_i w_i u_i · v_i, with
-    the weights w of the vertices. The change of a score by one standard deviation therefore moves the surface
-    by one standard deviation, as the root mean square over the surface.
+    the weights w of the vertices. If a score changes by one standard deviation, the root mean square of the
+    displacements over the surface is therefore this standard deviation.
 
     **Attributes:**
 
@@ -201,7 +201,7 @@ class ShapeModel:
         - `shape`: positions of the n vertices (n, 3), in any coordinate system of the same unit of length. If
           the model removes differences of size, the unit does not matter.
 
-        **Returns:** The scores (k,). A shape of the collection has its row of `scores`.
+        **Returns:** The scores (k,). For a shape of the collection, they are its row of `scores`.
 
         **Raises:** `InputError` if the shape has another number of vertices, a coordinate is not finite, or
         the shape is a single point.
@@ -224,17 +224,17 @@ class ShapeModel:
         return np.einsum("v,vc,kvc->k", self.weights, displacements, self.modes, optimize=True)
 
     def _common_factor(self, mean: Float64[np.ndarray, "n 3"]) -> float:
-        """The factor that `align` applies to shapes after their least-squares fit to the mean.
+        """Return the factor that `align` applies to shapes after their least-squares fit to the mean.
 
         Every aligned shape A satisfies |A|² = factor * <A, mean>. The sum of these equations over all shapes
-        gives the factor, because the mean of all A is the mean.
+        gives the factor, because the mean of all aligned shapes is `mean`.
         """
         squared_mean = float(self.weights @ (mean**2).sum(axis=1))
         count = len(self.scores)
         return 1 + self.total_variance * (count - 1) / count / squared_mean
 
     def compactness(self) -> Float64[np.ndarray, " k"]:
-        """Return the share of the total variance that the first 1, 2, …, k modes have (k,).
+        """Return the shares of the total variance that the first 1, 2, …, k modes have together (k,).
 
         The last share is 1 if the model has all modes.
         """
@@ -299,7 +299,7 @@ class ShapeModel:
         seed = check_whole_number("seed", seed, 0)
         numbers = _checked_numbers(numbers_of_modes, len(self.modes), "the model has")
         coordinates = _coordinates(self.alignment)
-        # The numbers of one mode after the other, so that further modes do not change the first numbers.
+        # The numbers are drawn mode by mode, so further modes do not change the numbers of the first modes.
         normal = np.random.default_rng(seed).standard_normal((len(self.modes), samples)).T
         drawn = normal * np.sqrt(self.variances)
         distances = []
@@ -314,7 +314,7 @@ class ShapeModel:
     def _mean_lengths(
         self, fields: Float64[np.ndarray, "p r"], coordinates: Float64[np.ndarray, "N r"]
     ) -> Float64[np.ndarray, " p"]:
-        """Return the mean length over the surface of fields of displacements, given by their coordinates.
+        """Return the mean length of each displacement field over the surface, given the fields' coordinates.
 
         `coordinates` are the coordinates of the shapes in the same orthonormal basis (`_coordinates`).
         """
@@ -495,7 +495,7 @@ def _displacements(alignment: Alignment) -> Iterator[tuple[slice, Float64[np.nda
 
 
 def _smallest_norm(alignment: Alignment) -> float:
-    """Return the norm of the scores of a mode below which the mode is a rounding error."""
+    """Return the limit of the norm of a mode's scores below which the mode is a rounding error."""
     centered = alignment.mean - alignment.weights @ alignment.mean
     size = np.sqrt(alignment.weights @ (centered**2).sum(axis=1))
     return float(_SMALLEST_DEVIATION * size * np.sqrt(max(len(alignment.aligned) - 1, 1)))
@@ -504,8 +504,9 @@ def _smallest_norm(alignment: Alignment) -> float:
 def _coordinates(alignment: Alignment) -> Float64[np.ndarray, "N r"]:
     """Return the scores of all modes, the coordinates of the shapes in an orthonormal basis.
 
-    A QR decomposition of one block of vertices after the other reduces the displacements to an N x N matrix
-    with the same inner products. This matrix keeps small singular values, which inner products square.
+    QR decompositions of one block of vertices after another reduce the displacements to an N x N matrix with
+    the same inner products. This matrix keeps small singular values accurate. A matrix of inner products
+    would contain their squares.
     """
     count = len(alignment.aligned)
     reduced = np.zeros((0, count))

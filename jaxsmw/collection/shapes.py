@@ -1,4 +1,4 @@
-"""The data of each shape of a collection, which all its pairs share."""
+"""The data of each shape of a collection, which all pairs of the shape share."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class PreparedShape:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], name: str) -> PreparedShape:
-        """Return the shape that `arrays` describes."""
+        """Return the shape, given the result of the method `arrays`."""
         names = [field.name for field in fields(Spectrum) if field.name in arrays]
         spectrum = Spectrum(**{name: jax.device_put(arrays[name]) for name in names})
         samples = jax.device_put(arrays["samples"]) if "samples" in arrays else None
@@ -100,7 +100,7 @@ def prepare_shape(
         samples = jax.device_put(farthest_point_samples(mesh, preset.number_of_samples))
     check_eigenvalues(mesh, spectrum)
     compared = compared_samples(mesh)
-    # The descriptors are kept in the cache. Meshes that are too coarse are refused.
+    # This call stores the descriptors in the cache, and refuses meshes that are too coarse.
     shot_descriptors(mesh, samples=compared, required=True)
     return PreparedShape(mesh, spectrum, compared, samples)
 
@@ -150,7 +150,7 @@ def prepare_shapes(
     - `meshes`: the meshes, each a `Mesh`.
     - `preset`: the preset.
 
-    **Returns:** The prepared shapes, and the axes of the descriptors; None if the preset uses no descriptors.
+    **Returns:** The prepared shapes, and the axes of the descriptors. Without descriptors, the axes are None.
 
     **Raises:** `InputError` if a mesh cannot be used.
     """

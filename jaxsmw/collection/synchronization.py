@@ -30,8 +30,8 @@ class SynchronizationSettings:
     - `iterations` (Table R26): the number of averagings.
     - `robust_scale` (Table R26): the distance at which a point has half of the weight of a point at distance
       zero. Points of wrong maps are much farther away.
-    - `discontinuity_distance`: if the matches of the corners of a triangle are farther apart, a point inside
-      the triangle follows the match of the nearest corner instead of an average.
+    - `discontinuity_distance`: if the matches of a triangle's corners are farther apart than this distance, a
+      point inside the triangle follows the match of the nearest corner instead of an average.
 
     **Raises:** `InputError` if a setting is not valid.
     """
@@ -47,7 +47,7 @@ class SynchronizationSettings:
 
 
 def vertices_as_points(mesh: Mesh) -> SurfacePoints:
-    """Return all vertices of a mesh as n `SurfacePoints`, each at or next to its vertex."""
+    """Return all vertices of a mesh as `SurfacePoints` with n entries, each at or next to its vertex."""
     return nearest_surface_points(mesh.vertices, mesh)[0]
 
 
@@ -57,13 +57,13 @@ def carry(
     images: Float64[np.ndarray, "n 3"],
     discontinuity_distance: float,
 ) -> Float64[np.ndarray, "p 3"]:
-    """Carry points on a mesh to another surface, by interpolation of the matches of the corners.
+    """Carry points on a mesh to another surface, by interpolating the matches of the corners.
 
     **Arguments:**
 
-    - `points`: p `SurfacePoints` on the mesh.
+    - `points`: `SurfacePoints` on the mesh with p entries.
     - `mesh`: the mesh (n vertices).
-    - `images`: the positions of the matches of the vertices on the other surface (n, 3).
+    - `images`: the position of each vertex's match on the other surface (n, 3).
     - `discontinuity_distance`: the largest distance between matches that are averaged, in the unit of
       `images`.
 
@@ -111,8 +111,8 @@ class Network:
     **Arguments:**
 
     - `meshes`: the meshes of the N shapes.
-    - `maps`: for each edge, the maps in both directions: the key (i, j) has one `SurfacePoints` on mesh j for
-      every vertex of mesh i.
+    - `maps`: for each edge, the maps in both directions. The value of the key (i, j) is one `SurfacePoints`
+      on mesh j, with one entry for every vertex of mesh i.
     - `errors`: the estimated error of each edge, with the key (i, j) for i < j, in units of the square root
       of the area.
     - `settings`: the settings of the synchronisation.
@@ -149,7 +149,7 @@ class Network:
     def along_best_paths(self, template: int) -> list[SurfacePoints]:
         """Map the vertices of the template to all shapes, each along the path with the smallest error.
 
-        **Returns:** For each shape, n `SurfacePoints` for the n vertices of the template.
+        **Returns:** For each shape, one `SurfacePoints` with n entries, one for each vertex of the template.
 
         **Raises:** `ValueError` if a shape has no path to the template.
         """
@@ -167,7 +167,7 @@ class Network:
         return [known for known in points if known is not None]
 
     def carried(self, points: SurfacePoints, source: int, target: int) -> Float64[np.ndarray, "p 3"]:
-        """Carry points on shape `source` along an edge. Returns positions (p, 3) near to shape `target`."""
+        """Carry points on shape `source` along an edge. Return positions near to shape `target` (p, 3)."""
         limit = self.settings.discontinuity_distance * self.units[target]
         return carry(points, self.meshes[source], self._images[source, target], limit)
 
@@ -214,16 +214,17 @@ class Network:
 def synchronize(network: Network, template: int) -> list[SurfacePoints]:
     """Compute maps from the template to all shapes that agree with the maps of all edges.
 
-    The first maps follow the paths with the smallest errors. Each iteration then moves the points on a shape
-    to the robust mean of the points on its neighbours in the graph, carried along the edges. This is the
-    synchronisation of pointwise maps (Huang, Guibas 2013) by iterated averages on the surfaces.
+    The first maps follow the paths with the smallest errors. Each iteration then carries the points on the
+    neighbours of a shape to the shape, along the edges of the graph. The points on the shape move to the
+    robust mean of the carried points. This is the synchronisation of pointwise maps (Huang, Guibas 2013) by
+    iterated averages on the surfaces.
 
     **Arguments:**
 
     - `network`: the `Network` of shapes and maps.
     - `template`: the number of the template.
 
-    **Returns:** For each shape, n `SurfacePoints` for the n vertices of the template.
+    **Returns:** For each shape, one `SurfacePoints` with n entries, one for each vertex of the template.
 
     **Raises:** `ValueError` if a shape has no path to the template.
     """

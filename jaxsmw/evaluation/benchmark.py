@@ -50,7 +50,7 @@ class Results(NamedTuple):
     failures: dict[str, str]
 
     def check(self) -> None:
-        """Checks that every shape and every pair was measured.
+        """Check that every shape and every pair was measured.
 
         **Raises:** `InputError` if a measurement failed. The message lists the causes of all failures. For
         each cause, the message names the first three shapes or pairs that failed.
@@ -73,7 +73,7 @@ class Results(NamedTuple):
 
 
 def _some(names: Sequence[str]) -> str:
-    """Returns a text that contains the first three names and the number of further names."""
+    """Return a text that contains the first three names and the number of further names."""
     more = len(names) - _NAMED_FAILURES
     return ", ".join(names[:_NAMED_FAILURES]) + (f" and {more} more" if more > 0 else "")
 
@@ -90,7 +90,7 @@ def run_benchmark(
     settings: Settings,
     executor: Executor,
 ) -> Results:
-    """Runs every method on every pair, and stores the errors and times in CSV files.
+    """Run every method on every pair, and store the errors and times in CSV files.
 
     If `output` already contains the result of a method on a pair, the method is not run again on this pair.
     Each new result is stored immediately. If a shape or pair cannot be measured, the benchmark continues with
@@ -100,7 +100,7 @@ def run_benchmark(
 
     - `data_set`: the `DataSet` that contains the pairs.
     - `pairs`: the pairs to match, each a `DataPair` of `data_set`.
-    - `output`: an existing directory, to which `results.csv`, `shapes.csv` and `provenance.json` are written.
+    - `output`: an existing directory for the files `results.csv`, `shapes.csv` and `provenance.json`.
     - `methods`: a dictionary from the name of each method to the method, for example `METHODS`. The names are
       written to the column `method` of `results.csv`.
     - `settings`: the `Settings` of the benchmark. Results that `output` already contains must have been
@@ -128,7 +128,7 @@ def run_benchmark(
 
 
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
-    """Returns the number of eigenvectors to precompute.
+    """Return the number of eigenvectors to precompute.
 
     All results in a directory must be measured with the same number of eigenvectors, because the time of the
     precomputation depends on this number. The returned number is at least `MOST_EIGENVECTORS`, which suffices
@@ -139,7 +139,7 @@ def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
 
 
 def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[str, Any]]:
-    """Returns the contents of `provenance.json`."""
+    """Return the contents of `provenance.json`."""
     # Only the name of the directory with initial maps is stored, because its path may change.
     chosen = asdict(settings) | {"init": Path(settings.init).name}
     return {
@@ -175,11 +175,11 @@ class _Store:
                 )
 
     def missing_shapes(self) -> dict[str, tuple[str, Path]]:
-        """Returns a dictionary from the name of each unmeasured shape to a tuple (name, mesh file)."""
+        """Return a dictionary from the name of each unmeasured shape to a tuple (name, mesh file)."""
         return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
 
     def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, Task]:
-        """Returns a dictionary from the name of each unfinished pair to its task.
+        """Return a dictionary from the name of each unfinished pair to its task.
 
         The task contains the methods that have no result for this pair.
         """
@@ -191,7 +191,7 @@ class _Store:
         return tasks
 
     def collected(self, methods: Mapping[str, Method], failed: Mapping[str, BaseException]) -> Results:
-        """Returns the results of the pairs for which every method has a result.
+        """Return the results of the pairs for which every method has a result.
 
         All methods are thus compared on the same pairs.
         """
@@ -212,7 +212,7 @@ def _measure_all(
     executor: Executor,
     journal: Journal,
 ) -> dict[str, BaseException]:
-    """Runs all tasks, shows a progress bar, and appends the rows of each finished task to a journal.
+    """Run all tasks, show a progress bar, and append the rows of each finished task to a journal.
 
     **Returns:** A dictionary from the name of each failed task to its exception.
     """

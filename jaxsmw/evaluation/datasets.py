@@ -35,8 +35,8 @@ class DataPair:
     - `source_file`, `target_file`: the paths of the mesh files of X and Y.
     - `truth`: a tuple with the paths of the one or two ground-truth files, in a format that
       `read_ground_truth` reads. If the tuple is empty, vertex i of X corresponds to vertex i of Y.
-    - `mirrored_truth`: a tuple with the paths of the files of the mirrored ground truth, in which left and
-      right are exchanged; None if the data set has no mirrored ground truth.
+    - `mirrored_truth`: a tuple with the paths of the files of the mirrored ground truth; None if the data set
+      has no mirrored ground truth. In the mirrored ground truth, left and right are exchanged.
     - `index_base`: the index of the first vertex in the ground-truth files, 0 or 1; None selects the default
       of the file format.
     - `partial`: whether X is a part of the full shape Y. The meshes of a partial pair have the same unit of
@@ -68,7 +68,7 @@ class DataPair:
         return self.source_file, self.target_file
 
     def ground_truth(self, mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool = False) -> GroundTruth:
-        """Reads and returns the direct or the mirrored ground truth of the pair.
+        """Read and return the direct or the mirrored ground truth of the pair.
 
         **Arguments:**
 
@@ -135,7 +135,7 @@ class DataSet:
 
 
 def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
-    """Opens a data set, and recognises its layout from its files.
+    """Open a data set, and recognise its layout from its files.
 
     The function recognises the following layouts. NAME, I, J, NN and NNN denote parts of file names.
 
@@ -155,9 +155,9 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
       corresponds to vertex i of every other shape. In TOSCA, vertices correspond only between shapes of the
       same class, such as `cat0` and `cat1`.
 
-    If the data set contains a list of pairs (`test_pairs.txt` or `PAIRS_list_….txt`, two names per line), the
-    attribute `pairs` of the result contains the listed pairs. Without a list of pairs, `pairs` contains all
-    ordered pairs of different shapes with ground truth. In remeshed sets and in TOSCA, only shapes of the
+    A data set can contain a list of pairs: a file `test_pairs.txt` or `PAIRS_list_….txt` with two names per
+    line. The attribute `pairs` of the result then contains the listed pairs. Without a list, `pairs` contains
+    all ordered pairs of different shapes with ground truth. In remeshed sets and in TOSCA, only shapes of the
     same class form pairs. The class of a shape is its name without the number at the end, for example `cat`
     for `cat0`.
 
@@ -202,7 +202,7 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
 
 
 def _recognise(directory: Path) -> tuple[str, _Pairs] | None:
-    """Returns the name of the first layout that fits a directory, and its pairs; None if no layout fits."""
+    """Return the name of the first layout that fits a directory, and its pairs; None if no layout fits."""
     for layout, open_layout in _LAYOUTS.items():
         if (pairs := open_layout(directory)) is not None:
             return layout, pairs
@@ -228,12 +228,12 @@ _EXPECTED = (
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Returns a sort key that puts cat2 before cat10."""
+    """Return a sort key that puts cat2 before cat10."""
     return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", name)]
 
 
 def _meshes(directory: Path) -> dict[str, Path]:
-    """Returns a dictionary from the name of each mesh in a directory to its file, sorted by `_natural`."""
+    """Return a dictionary from the name of each mesh in a directory to its file, sorted by `_natural`."""
     if not directory.is_dir():
         return {}
     files = [file for file in directory.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file()]
@@ -249,7 +249,7 @@ _Pairs = tuple[list[DataPair], list[DataPair]]
 
 
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
-    """Finds the meshes whose names match a pattern, and returns a dictionary from their names to their files.
+    """Find the meshes whose names match a pattern, and return a dictionary from their names to their files.
 
     Only the first folder that contains a mesh with a matching name is used. The directory itself is searched
     before the folders below it.
@@ -263,7 +263,7 @@ def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
 
 
 def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str, str]] | None:
-    """Reads the list of pairs in a data set, and returns the names of each pair; None if there is no list."""
+    """Read the list of pairs in a data set, and return the names of each pair; None if there is no list."""
     lists = sorted([*directory.glob("test_pairs.txt"), *directory.rglob("PAIRS_list*.txt")])
     if not lists:
         return None
@@ -271,7 +271,7 @@ def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str
 
 
 def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tuple[str, str]]:
-    """Reads a list of pairs of shapes.
+    """Read a list of pairs of shapes.
 
     Each line contains the names of the source and the target, separated by spaces, a comma or a semicolon.
     Text after `#` is a comment.
@@ -307,7 +307,7 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
 
 
 def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataPair]:
-    """Chooses pairs of a data set.
+    """Choose pairs of a data set.
 
     **Arguments:**
 
@@ -344,7 +344,7 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
 
 
 def class_of(name: str) -> str:
-    """Returns the class of a shape: its name without the number at the end."""
+    """Return the class of a shape: its name without the number at the end."""
     return re.sub(r"[_-]?\d+$", "", name)
 
 
@@ -357,7 +357,7 @@ def _listed_first(
     listed: Iterable[tuple[str, str]] | None,
     known: Iterable[tuple[str, str]],
 ) -> _Pairs:
-    """Returns two lists: the listed pairs, and the unlisted pairs with ground truth.
+    """Return two lists: the listed pairs, and the unlisted pairs with ground truth.
 
     If `listed` is None, the first list contains all pairs with ground truth.
     """
@@ -464,7 +464,7 @@ def _topology(directory: Path) -> _Pairs | None:
 
 
 def _identical(names: str) -> Callable[[Path], _Pairs | None]:
-    """Returns a function for `_LAYOUTS` that opens data sets whose mesh names match the pattern `names`.
+    """Return a function for `_LAYOUTS` that opens data sets whose mesh names match the pattern `names`.
 
     These data sets have no ground-truth files, because vertex i of one shape corresponds to vertex i of every
     other shape of its class.

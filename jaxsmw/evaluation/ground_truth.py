@@ -38,9 +38,9 @@ class GroundTruth:
     **Attributes:**
 
     - `source_vertices`: 0-based vertices of X (p,), as int64. A vertex may occur several times or not at all.
-    - `targets`: the true point on Y of each source vertex. The true points are either p vertices of Y (an
-      int64 array of 0-based vertices), or p `SurfacePoints` on Y. A surface point consists of a triangle and
-      three barycentric weights.
+    - `targets`: the true point on Y of each source vertex. The true points are either an int64 array (p,) of
+      0-based vertices of Y, or `SurfacePoints` on Y with p entries. A surface point consists of a triangle
+      and three barycentric weights.
 
     **Raises:** `InputError` if the number of source vertices differs from the number of targets.
     """
@@ -57,14 +57,14 @@ class GroundTruth:
 
     @classmethod
     def of_all_vertices(cls, targets: Int64[np.ndarray, " m"] | SurfacePoints) -> GroundTruth:
-        """Returns the ground truth in which entry i of `targets` (m,) is the true point of vertex i of X.
+        """Return the ground truth in which entry i of `targets` (m,) is the true point of vertex i of X.
 
         The targets are 0-based vertices of Y or `SurfacePoints` on Y.
         """
         return cls(np.arange(len(targets)), targets)
 
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
-        """Extends the ground truth to a map X -> Y (m,) for all vertices of X, with 0-based vertices of Y.
+        """Extend the ground truth to a map X -> Y (m,) for all vertices of X, with 0-based vertices of Y.
 
         A vertex without ground truth receives the target of the nearest vertex that has ground truth.
         Distances are Euclidean.
@@ -84,7 +84,7 @@ def read_ground_truth(
     *,
     index_base: IndexBase | None = None,
 ) -> GroundTruth:
-    """Reads the ground truth of a pair of meshes.
+    """Read the ground truth of a pair of meshes.
 
     The number of files, their suffix and their number of columns determine the format:
 
@@ -109,9 +109,9 @@ def read_ground_truth(
     - `index_base`: the index of the first vertex and of the first face in the files, 0 or 1. If None (the
       default), the index base of the format is used, as listed above.
 
-    **Returns:** A `GroundTruth`, with the attributes `source_vertices` (p,) and `targets`. The targets are p
-    vertices of Y, or p `SurfacePoints` if the file has the format `.baryc_gt`. Vertices of X that no face
-    references are left out, and a `UserWarning` states their number.
+    **Returns:** A `GroundTruth`, with the attributes `source_vertices` (p,) and `targets`. The targets are
+    vertices of Y (p,), or `SurfacePoints` with p entries if the file has the format `.baryc_gt`. Vertices of
+    X that no face references are left out, and a `UserWarning` states their number.
 
     **Raises:** `InputError` if a file cannot be read, has an unknown format or does not fit the meshes. The
     message names the file, the line and the fault.
@@ -172,14 +172,14 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
 
 
 def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, mesh_y: Mesh) -> None:
-    """Writes the true points of all vertices of X as a `.baryc_gt` file (see `read_ground_truth`).
+    """Write the true points of all vertices of X as a `.baryc_gt` file (see `read_ground_truth`).
 
     If the targets are vertices, use `jaxsmw.write_pointwise_map` instead.
 
     **Arguments:**
 
-    - `path`: the file to create or to replace. The suffix should be `.baryc_gt`, by which `read_ground_truth`
-      recognises the format.
+    - `path`: the file to create or to replace. The suffix should be `.baryc_gt`, because `read_ground_truth`
+      recognises the format by this suffix.
     - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
     - `mesh_y`: the target Y, a `Mesh`. Faces are written as their 1-based positions in the mesh file of Y.
       These positions count all faces of the file, including faces that were dropped when the mesh was read.
@@ -202,7 +202,7 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 
 
 def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
-    """Returns a column of a table as 0-based faces of a mesh.
+    """Return a column of a table as 0-based faces of a mesh.
 
     The face numbers in the table count all faces of the mesh file, including faces that were dropped when the
     mesh was read. The returned numbers refer to `mesh.faces`, which contains only the faces that were kept.
@@ -221,7 +221,7 @@ def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.n
 
 
 def _weights(table: Table, column: int) -> Float64[np.ndarray, "p 3"]:
-    """Returns three columns of a table as barycentric weights, which are at least 0 and sum to 1."""
+    """Return three columns of a table as barycentric weights, which are at least 0 and sum to 1."""
     weights = table.values[:, column : column + 3]
     good = (weights >= -_WEIGHT_TOLERANCE).all(axis=1)
     good &= np.abs(weights.sum(axis=1) - 1) <= _WEIGHT_TOLERANCE

@@ -36,7 +36,7 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
-    """Returns the mean of a sample and a confidence interval of this mean.
+    """Return the mean of a sample and a confidence interval of this mean.
 
     The interval is computed by the bias-corrected and accelerated (BCa) bootstrap (Efron 1987).
 

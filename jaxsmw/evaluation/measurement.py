@@ -50,7 +50,7 @@ Geodesic errors and thresholds are in units of the square root of the area of Y.
 
 
 def read_curve(text: str) -> list[float]:
-    """Parses a correspondence quality curve, as it is stored in `results.csv`.
+    """Parse a correspondence quality curve, as it is stored in `results.csv`.
 
     **Arguments:**
 
@@ -105,9 +105,9 @@ class Settings:
 
     **Attributes:**
 
-    - `init`: the initial map from which all methods start. It is the name of an initial map, `"shot"`
-      (default), `"wks"`, `"hks"`, `"wavelet"`, `"functional"` or `"aligned"` (see `jaxsmw.match`), or a
-      directory with initial maps in files named `X_Y.map`.
+    - `init`: the initial map from which all methods start. It is either a directory with initial maps in
+      files named `X_Y.map`, or the name of an initial map (see `jaxsmw.match`): `"shot"` (default), `"wks"`,
+      `"hks"`, `"wavelet"`, `"functional"` or `"aligned"`.
     - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. If True,
       errors are computed for both ground truths, and the errors with the smaller mean are stored. Use this
       setting for methods and initial maps that do not distinguish left from right.
@@ -137,7 +137,7 @@ class Settings:
         return self.init in INITIAL_MAPS
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """If `init` is a directory, checks that the directory contains a map for every pair.
+        """Check, if `init` is a directory, that the directory contains a map for every pair.
 
         **Raises:** `InputError` if a file with an initial map is missing.
         """
@@ -160,7 +160,7 @@ class Task:
 
 
 def file_digest(file: Path) -> str:
-    """Returns a short hash of the contents of a file.
+    """Return a short hash of the contents of a file.
 
     **Raises:** `InputError` if the file cannot be read.
     """
@@ -173,7 +173,7 @@ def file_digest(file: Path) -> str:
 
 
 def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[Row]:
-    """Computes and caches the spectrum and the SHOT descriptors of a shape, and measures their wall times.
+    """Compute and cache the spectrum and the SHOT descriptors of a shape, and measure their wall times.
 
     **Arguments:**
 
@@ -198,7 +198,7 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[
 
 
 def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) -> list[Row]:
-    """Matches a pair with every method of a task, and measures the errors of the maps.
+    """Match a pair with every method of a task, and measure the errors of the maps.
 
     **Arguments:**
 
@@ -239,7 +239,7 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
 
 
 def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
-    """Runs a method, and returns its map, its status code (`RESULTS`) and its wall time in seconds.
+    """Run a method, and return its map, its status code (`RESULTS`) and its wall time in seconds.
 
     The time does not include compilation. For maps that are read from files, the time is NaN.
     """
@@ -286,7 +286,7 @@ def _evaluate(
     truths: Mapping[str, GroundTruth],
     settings: Settings,
 ) -> Row:
-    """Evaluates a map with every ground truth, and returns the statistics with the smallest mean error.
+    """Evaluate a map with every ground truth, and return the statistics with the smallest mean error.
 
     `truths` is a dictionary with the ground truth `"direct"` and, if requested, the ground truth
     `"mirrored"`. If the method failed, all statistics are NaN.

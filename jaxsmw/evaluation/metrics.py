@@ -42,7 +42,7 @@ class GeodesicError:
 
     - `errors`: the errors (p,), float64, one for each evaluated row of the ground truth. An error is inf if
       the match and the true point are on different connected components of Y.
-    - `source_vertices`: the 0-based vertices of X (p,), int64, to which the errors belong.
+    - `source_vertices`: the vertex of X at which each error was measured (p,), int64, 0-based.
     - `method`: the method that computed the geodesic distances, `"strips"` or `"exact"`.
     """
 
@@ -86,7 +86,7 @@ class GeodesicError:
         )
 
     def as_dictionary(self) -> dict[str, Any]:
-        """Returns the main statistics and the correspondence quality curve as a dictionary for JSON.
+        """Return the main statistics and the correspondence quality curve as a dictionary for JSON.
 
         The keys are `mean`, `median`, `within`, `area_under_curve`, `unreachable`, `points` (the number of
         errors), `method` and `curve`. An infinite mean or median becomes None. `within` is a dictionary from
@@ -110,7 +110,7 @@ class GeodesicError:
         }
 
     def correspondence_quality_curve(self, thresholds: ArrayLike) -> Float64[np.ndarray, " t"]:
-        """Returns, for each threshold, the share of points with at most this error (Kim et al. 2011).
+        """Return, for each threshold, the share of points with at most this error (Kim et al. 2011).
 
         **Arguments:**
 
@@ -123,7 +123,7 @@ class GeodesicError:
         return counts / len(self.errors)
 
     def area_under_curve(self, largest: float = LARGEST_THRESHOLD) -> float:
-        """Returns the mean height of the correspondence quality curve between the thresholds 0 and `largest`.
+        """Return the mean height of the correspondence quality curve between the thresholds 0 and `largest`.
 
         The curve has a step at each error e, so its mean height is exactly the mean of
         `max(0, 1 - e/largest)` over all errors. The mean height is in [0, 1], and is 1 if all errors are
@@ -149,7 +149,7 @@ def geodesic_error(
     number_of_samples: int | None = None,
     seed: int = 0,
 ) -> GeodesicError:
-    """Computes the geodesic error of each match: the geodesic distance on Y from the match to the true point.
+    """Compute the geodesic error of each match: the geodesic distance on Y from the match to the true point.
 
     Distances are divided by the square root of the area of Y (Kim, Lipman and Funkhouser 2011). Errors
     therefore do not depend on the unit of length or on the size of a shape.
@@ -197,7 +197,7 @@ def geodesic_error(
 
 
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
-    """Returns the coverage of a pointwise map: the share of the area of Y that belongs to matched vertices.
+    """Return the coverage of a pointwise map: the share of the area of Y that belongs to matched vertices.
 
     Each matched vertex of Y contributes its vertex area, which is a third of the area of the triangles around
     the vertex. The coverage is in [0, 1], and needs no ground truth.

@@ -31,14 +31,14 @@ def prepare_pair(
     number_of_descriptors: int = 0,
     both_directions: bool = False,
 ) -> MethodInput:
-    """Computes the input that all compared methods share: spectra, descriptors, initial maps and samples.
+    """Compute the input that all compared methods share: spectra, descriptors, initial maps and samples.
 
     **Arguments:**
 
     - `data`: the `DataPair`. The function uses only the names of the shapes and the attribute `partial`.
     - `mesh_x`, `mesh_y`: the meshes of X, with m vertices, and of Y, with n vertices.
-    - `init`: the name of an initial map: `"shot"`, `"wks"`, `"hks"`, `"wavelet"`, `"functional"` or
-      `"aligned"` (see `jaxsmw.match`); or a directory that contains initial maps in files named `X_Y.map`.
+    - `init`: either a directory with initial maps in files named `X_Y.map`, or the name of an initial map
+      (see `jaxsmw.match`): `"shot"`, `"wks"`, `"hks"`, `"wavelet"`, `"functional"` or `"aligned"`.
     - `number_of_eigenvectors`: the number of eigenvectors that are computed for each shape.
     - `number_of_descriptors`: the number of principal components of the SHOT descriptors; 0 for no
       descriptors.
@@ -62,15 +62,15 @@ def prepare_pair(
 
 
 def _init(init: str, names: tuple[str, str], pair: Pair) -> str | Int64[np.ndarray, " m"]:
-    """Returns `init` if it names an initial map; otherwise reads a map from the directory `init`."""
+    """Return `init` if it names an initial map; otherwise read a map from the directory `init`."""
     return init if init in INITIAL_MAPS else read_published_map(Path(init), names, pair.meshes)
 
 
 def _reverse_initial_map(data: DataPair, prepared: PreparedPair, init: str) -> Int64[np.ndarray, " n"]:
-    """Returns the initial map Y -> X, which is computed or read in the same way as the initial map X -> Y.
+    """Return the initial map Y -> X, which is computed or read in the same way as the initial map X -> Y.
 
     If a directory with initial maps contains no map Y -> X, the initial map X -> Y is converted to a
-    functional map, from which the map Y -> X is computed.
+    functional map. The map Y -> X is then computed from this functional map.
     """
     names, reversed_ = (data.target, data.source), prepared.pair.reversed()
     if init in INITIAL_MAPS or published_file(Path(init), names).is_file():

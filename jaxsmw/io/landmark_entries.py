@@ -27,8 +27,8 @@ SYSTEMS: dict[str, CoordinateSystem] = {"LPS": "LPS", "1": "LPS", "RAS": "RAS", 
 class Entries(NamedTuple):
     """The landmarks of a file, in the order of the file.
 
-    `numbers` contains the place of each landmark in the file, such as a line number. `noun` is the thing that
-    these numbers count, such as `line`. Messages contain both.
+    `numbers` contains the place of each landmark in the file, such as a line number. `noun` names what these
+    numbers count, such as `line`. Messages contain the noun and the number.
     """
 
     names: list[str]
@@ -75,7 +75,7 @@ def parse_positions(words: list[str], noun: str, numbers: Sequence[int]) -> Floa
     **Raises:** `InputError` if a word is not a number. The message names the first such landmark.
     """
     try:
-        # `float` accepts more than decimal numbers, such as underscores and `nan`.
+        # `float` also accepts words that are not decimal numbers, such as `1_0` and `nan`.
         if _NOT_IN_NUMBERS.search("\n".join(words)):
             raise ValueError
         values = np.array(list(map(float, words)), dtype=np.float64)
@@ -90,7 +90,7 @@ def parse_positions(words: list[str], noun: str, numbers: Sequence[int]) -> Floa
 
 
 def left_out(numbers: Sequence[int], total: int, why: str) -> tuple[str, ...]:
-    """Return a note about the landmarks that were left out (by their numbers in the file), or no note."""
+    """Return a note with the numbers of the landmarks that were left out, or no note if there are none."""
     if not numbers:
         return ()
     listed = ", ".join(map(str, numbers[:10])) + (", …" if len(numbers) > 10 else "")

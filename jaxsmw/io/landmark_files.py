@@ -39,22 +39,21 @@ LANDMARK_SUFFIXES = tuple(suffix for suffix, parse in _PARSERS.items() if parse 
 # Files of these formats always state a coordinate system.
 _WITH_SYSTEM = (".mrk.json", ".fcsv")
 
-# The largest size of a file in bytes: 128 MiB, about a million lines. JSON needs up to 25 times its size
-# in memory, so files of 32 MiB are the largest; they contain 50 000 points of Slicer.
+# The largest size of a file in bytes: 128 MiB, about a million lines. A JSON file needs up to 25 times its
+# size in memory, so its largest size is 32 MiB. A file of this size contains 50 000 points of Slicer.
 _LARGEST, _LARGEST_JSON = 2**27, 2**25
 
 
 def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
     """Read the landmarks of one mesh: named points, as a program for placing landmarks saves them.
 
-    The file is text in UTF-8. Landmarks without a name get their number in the file as their name, counted
-    from 1.
+    The file is text in UTF-8. If a landmark has no name, its 1-based number in the file becomes its name.
 
     **Arguments:**
 
     - `path`: the file. The suffix, in upper or lower case, determines the format:
         - `.mrk.json`: a Markups file of 3D Slicer with a single point list. A file with several markups is
-          refused. If the file states no coordinate system, LPS applies, the default of the format.
+          refused. If the file states no coordinate system, the default of the format applies, which is LPS.
         - `.fcsv`: a file of 3D Slicer. The numbers 0 and 1 mean RAS and LPS.
         - `.pp`: a file of MeshLab (PickedPoints).
         - `.mps`: a point set of MITK, whose world coordinates are LPS.
@@ -66,9 +65,9 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
     None. The `notes` report points that were left out, because Slicer has no defined position for them or
     because they are not active in MeshLab.
 
-    **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, is larger
-    than 128 MiB (`.mrk.json`: 32 MiB), or contains no landmarks or more than 2²⁰. `InputError` is also raised
-    if a coordinate is not finite, or if two landmarks have the same name.
+    **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, or is larger
+    than 128 MiB (`.mrk.json`: 32 MiB). `InputError` is also raised if the file contains no landmarks or more
+    than 2²⁰ landmarks, if a coordinate is not finite, or if two landmarks have the same name.
     """
     suffix = check_readable_suffix(path)
     _check_size(path, size_of_file(path), suffix)
@@ -90,7 +89,7 @@ def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> N
       3D Slicer, `.pp` for MeshLab, `.csv` for a table with commas, or `.txt` for a table with tabs.
     - `landmarks`: `Landmarks`. Files of Slicer state their coordinate system. Files of the format `.mrk.json`
       also state their unit if it is known. Files in the other formats cannot state a coordinate system, so
-      readers must know it.
+      their readers must know the coordinate system.
 
     **Raises:** `InputError` for another suffix, for a file that cannot be written, or for more landmarks or
     bytes than `read_landmark_file` accepts. For files of Slicer, `InputError` is also raised if the
@@ -125,9 +124,9 @@ def check_readable_suffix(path: str | os.PathLike[str]) -> str:
 
 
 def check_known_system(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
-    """Check that the coordinate system of landmarks is known, if the format of a file states it.
+    """Check that the coordinate system of landmarks is known if the format of a file states one.
 
-    **Raises:** `InputError` if the file states a coordinate system, but that of the landmarks is None.
+    **Raises:** `InputError` if the format states a coordinate system, but that of the landmarks is None.
     """
     suffix = check_landmark_suffix(path)
     if landmarks.coordinates is None and suffix in _WITH_SYSTEM:

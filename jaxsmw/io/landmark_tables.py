@@ -25,7 +25,7 @@ _FCSV_COLUMNS += ["associatedNodeID"]
 
 
 class _Columns(NamedTuple):
-    """The 0-based columns of x, y, z and of the name (None without names), and the total of columns."""
+    """The 0-based columns of x, y, z and the name (None if there are no names), and the number of columns."""
 
     positions: list[int]
     name: int | None
@@ -74,7 +74,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _lines(text: str) -> list[str]:
-    """Split a text into lines, and refuse too many or too long lines for a table of landmarks."""
+    """Split a text into lines, and refuse more or longer lines than a table of landmarks can have."""
     check_count(max(text.count("\n"), text.count("\r")))
     lines = re.split("\r\n|\r|\n", text)
     longest = max(range(len(lines)), key=lambda i: len(lines[i]))
@@ -88,7 +88,7 @@ def _lines(text: str) -> list[str]:
 
 def _rows(lines: list[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number and the cells of each line that is not empty."""
-    # With line ends, a quoted name over several lines contains a newline, so it is refused later.
+    # Lines keep their ends here. Thus a quoted name that spans lines contains a newline and is refused later.
     reader = csv.reader(
         (f"{line}\n" for line in lines), delimiter=separator, skipinitialspace=True, strict=True
     )
@@ -146,8 +146,8 @@ def format_table(landmarks: Landmarks, separator: str) -> str:
 def parse_fcsv(text: str) -> Entries:
     """Parse an `.fcsv` file of 3D Slicer (vtkMRMLMarkupsFiducialStorageNode in Slicer's source code).
 
-    Newer versions append the status of the position (0 undefined, 1 preview, 2 defined) as a 15th value,
-    without a column name.
+    Newer versions append a 15th value, which has no column name. This value is the status of the position
+    (0 undefined, 1 preview, 2 defined).
     """
     lines = _lines(text)
     stated = dict(_setting(line) for line in lines if line.startswith("#"))
@@ -191,7 +191,7 @@ def _setting(line: str) -> tuple[str, str]:
 
 
 def _fcsv_columns(stated: dict[str, str]) -> tuple[_Columns, list[str]]:
-    """Return the positions of the columns, and the names of all columns, of an `.fcsv` file."""
+    """Return the positions of the columns of an `.fcsv` file, and the names of all its columns."""
     if "columns" in stated:
         order = [title.strip() for title in stated["columns"].split(",")]
     elif "markups fiducial file version" in stated:

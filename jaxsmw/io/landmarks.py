@@ -39,8 +39,9 @@ class Landmarks:
     - `unit`: the unit of length that the file states, such as `"mm"`, or None if the file does not state one.
       Only `.mrk.json` files state a unit. No method converts positions to another unit.
 
-    **Raises:** `InputError` if there are no landmarks, a name is empty, repeated or not one line of text, the
-    positions are not an array (l, 3), or a coordinate is not finite or above 1e60.
+    **Raises:** `InputError` if there are no landmarks, or if the positions are not an array (l, 3).
+    `InputError` is also raised if a name is empty, repeated or not one line of text, or if a coordinate is
+    above 1e60 or not finite.
     """
 
     names: tuple[str, ...]
@@ -96,7 +97,7 @@ class Landmarks:
         return self if self.coordinates == coordinates else self.flipped()
 
     def stated(self, coordinates: CoordinateSystem) -> Landmarks:
-        """Return landmarks with the same positions, whose coordinate system is `coordinates`.
+        """Return landmarks with the same positions and the coordinate system `coordinates`.
 
         Use this method if the file of the landmarks does not state a coordinate system.
 
@@ -123,12 +124,12 @@ class Landmarks:
 
 
 def usable(positions: Float64[np.ndarray, "*any"]) -> np.ndarray:
-    """Return which coordinates are finite and at most 1e60, so that their squares do not overflow."""
+    """Return which coordinates are finite and at most 1e60. The squares of such numbers do not overflow."""
     return np.abs(positions) <= LARGEST_EXTENT
 
 
 class FaultyName(NamedTuple):
-    """The 0-based row of a name, the row of an equal name before it or None, and the fault in words."""
+    """The 0-based row of a name, the row of an earlier equal name (or None), and the fault in words."""
 
     row: int
     earlier: int | None
@@ -136,7 +137,7 @@ class FaultyName(NamedTuple):
 
 
 def first_faulty_name(names: Sequence[str]) -> FaultyName | None:
-    """Return the first name that is empty, repeated or not one line of text, or None."""
+    """Return the first name that is empty, repeated or not one line of text. Return None if all are good."""
     if len(set(names)) == len(names) and not any(map(_fault, names)):
         return None
     first: dict[str, int] = {}
@@ -162,7 +163,7 @@ class LandmarkMatch(NamedTuple):
 
     **Attributes:**
 
-    - `names`: the names that both have, in the order of the first landmarks.
+    - `names`: the names that both sets of landmarks have, in the order of the first landmarks.
     - `only_first`: the names that only the first landmarks have, in their order.
     - `only_second`: the names that only the second landmarks have, in their order.
     """
@@ -177,12 +178,12 @@ def match_landmarks(first: Landmarks, second: Landmarks) -> LandmarkMatch:
 
     **Arguments:**
 
-    - `first`, `second`: the `Landmarks` of two meshes. `Landmarks.select` returns the positions of the names
-      that both have.
+    - `first`, `second`: the `Landmarks` of two meshes. With the common names, `Landmarks.select` returns the
+      positions of each mesh in the same order.
 
     **Returns:** A `LandmarkMatch` with the attributes `names`, `only_first` and `only_second`, each a tuple.
 
-    **Raises:** `InputError` if no name is in both. Upper and lower case differ.
+    **Raises:** `InputError` if the landmarks have no common name. Names that differ in case are different.
     """
     in_first, in_second = set(first.names), set(second.names)
     common = tuple(name for name in first.names if name in in_second)
@@ -205,7 +206,7 @@ class FrameDistances(NamedTuple):
     **Attributes:**
 
     - `as_read`: the mean distance from the landmarks to the surface.
-    - `flipped`: the mean distance after the signs of x and y are reversed, as between LPS and RAS.
+    - `flipped`: the mean distance after a change between LPS and RAS, which reverses the signs of x and y.
     """
 
     as_read: float
@@ -233,18 +234,18 @@ def find_frame(landmarks: Landmarks, mesh: Mesh) -> FrameDistances:
 
 
 def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
-    """Check that landmarks lie on a surface, and do not have to be converted between LPS and RAS first.
+    """Check that landmarks lie on a surface as they are, without a conversion between LPS and RAS.
 
     **Arguments:**
 
     - `landmarks`: `Landmarks` in the unit of the mesh.
     - `mesh`: the `Mesh` to which the landmarks belong.
 
-    **Returns:** A sentence for each landmark that is further from the surface than 2 % of the diagonal of the
-    box around the mesh.
+    **Returns:** A sentence for each landmark whose distance to the surface is above 2 % of the diagonal of
+    the box around the mesh.
 
-    **Raises:** `InputError` if the landmarks are on average further from the surface than 5 % of the
-    diagonal, but nearer than 2 % in the other coordinate system.
+    **Raises:** `InputError` if the mean distance of the landmarks to the surface is above 5 % of the
+    diagonal, but would be below 2 % in the other coordinate system.
     """
     diagonal = bounding_box_diagonal(mesh)
     distances = distances_to_surface(landmarks.positions, mesh)

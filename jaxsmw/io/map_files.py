@@ -26,8 +26,8 @@ from jaxsmw.io.mesh_data import MESH_SUFFIXES, POINT_CLOUD_SUFFIXES
 from jaxsmw.io.text import is_number
 from jaxsmw.runtime.files import atomic_write, read_bytes
 
-# Suffixes of other kinds of files, whose programs cannot open a map. The suffixes `.mat` and `.npy` are
-# removed, because maps are also written in these formats.
+# Suffixes of other kinds of files. The programs that open such files cannot open a map. The suffixes `.mat`
+# and `.npy` are removed, because maps are also written in these formats.
 _NOT_MAPS = {
     *(".npz", ".baryc_gt", ".vts", ".json"),
     *(".png", ".jpg", ".jpeg", ".gif", ".bmp", ".tif", ".tiff", ".webp", ".svg", ".pdf", ".eps", ".ps"),
@@ -95,7 +95,7 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
     **Arguments:**
 
     - `path`: the file to create or to replace.
-    - `pointwise_map`: the target vertex of each source vertex (m,), 0-based integers.
+    - `pointwise_map`: the target vertex of each source vertex, as 0-based integers (m,).
 
     **Raises:** `InputError` if the array is not a list of non-negative integers, or the file cannot be
     written. `InputError` is also raised for the suffixes that `check_map_name` refuses, such as `.ply`.
@@ -146,7 +146,8 @@ class Table:
 
     Each row of the matrix is one line of a text file, or one row of an array in a file.
 
-    The readers of maps, landmarks and ground truth use this class, so the same fault causes the same message.
+    The readers of maps, landmarks and ground truth all use this class, so a fault causes the same message in
+    each of them.
     In text files, spaces or tabs separate numbers. Commas are refused, because `3,5` could be a number with a
     decimal comma or the two vertices 3 and 5.
 
@@ -268,7 +269,7 @@ class Table:
             )
 
     def vertices(self, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
-        """Return a column as 0-based vertices of a mesh (p,), where p is the number of rows.
+        """Return a column as 0-based vertices of a mesh, in an array (p,) where p is the number of rows.
 
         **Arguments:**
 
@@ -291,7 +292,7 @@ class Table:
         - `base`: the index of the first element in the file, 0 or 1.
 
         **Raises:** `InputError` if a number is not a valid index. The message names the first such row. If
-        all numbers are valid with the other index base, the message recommends this index base.
+        all numbers are valid with the other index base, the message recommends that index base.
         """
         numbers = self.values[:, column]
         good = (numbers == np.floor(numbers)) & (numbers >= base) & (numbers < count + base)

@@ -99,7 +99,7 @@ def _single_list(document: Any) -> dict[str, Any]:
 
 
 def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[str, ...]]:
-    """Return the coordinate system of a markup, and a note if it is the default of the schema."""
+    """Return the coordinate system of a markup, and a note if the markup states none (so LPS applies)."""
     if "coordinateSystem" not in markup:
         return "LPS", ("The file states no coordinate system, so LPS applies, the default of the format.",)
     stated = markup["coordinateSystem"]
@@ -120,7 +120,7 @@ def _unit(markup: dict[str, Any]) -> tuple[str | None, tuple[str, ...]]:
 
 
 def _is_defined(point: dict[str, Any], number: int) -> bool:
-    """Return whether the position of a control point is defined. A point without a status is defined."""
+    """Return whether the position of a control point is defined. Without a status, it counts as defined."""
     status = point.get("positionStatus", "defined")
     if status != "defined" and status not in _NOT_DEFINED:
         _refuse(number, f"has the unknown position status {_excerpt(status)}")
@@ -141,7 +141,7 @@ def format_markups(landmarks: Landmarks) -> str:
 
     The file states a unit only if the unit of the landmarks is known. Otherwise, Slicer assumes mm.
     """
-    # In Slicer's RAS axes, the orientation is the identity.
+    # The orientation is the identity in Slicer's RAS axes, so two of its entries are negative in LPS axes.
     sign = -1.0 if landmarks.coordinates == "LPS" else 1.0
     points = [
         {

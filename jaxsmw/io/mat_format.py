@@ -21,13 +21,13 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import largest_contents
 
 _MATRIX, _COMPRESSED = 14, 15
-# The number of bytes per number for each data type. All other data types have 1 byte per number.
+# The number of bytes per number for some data types. All other data types have 1 byte per number.
 _BYTES_OF_NUMBER = {3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 17: 2, 18: 4}
 # The array classes cell, struct and object.
 _CONTAINERS = 1, 2, 3
 
-# This number of bytes is added for every array, even for an empty array. SciPy takes at least 10 microseconds
-# per array; in this time, it can read a few KiB of numbers.
+# This number of bytes is added for every array, even for an empty array, because each array costs time. SciPy
+# takes at least 10 microseconds per array, and in this time it could read a few KiB of numbers.
 _LEAST_BYTES_OF_ARRAY = 4096
 # The largest accepted size of all field names of a struct, in bytes. The limit allows 1000 fields with names
 # of 64 bytes. The structs of shapes have about ten fields.

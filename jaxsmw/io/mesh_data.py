@@ -4,8 +4,8 @@ Vertices must keep their order, and a damaged file must cause one clear error me
 has its own parsers, one per module of `jaxsmw.io.formats`. The reader of libigl accepts indices out of range
 and aborts the process on some invalid headers. The reader of VTK 9.7 ends the process with a segmentation
 fault if a polygon declares too many corners. It also accepts files whose counts are wrong. The reader of
-trimesh splits and drops vertices of OBJ files, and it cannot read binary PLY files whose polygons have
-different numbers of corners. pygltflib only parses the JSON part of glTF files, without checks.
+trimesh splits and drops vertices of OBJ files. It also cannot read binary PLY files whose polygons have
+different numbers of corners. pygltflib parses only the JSON part of glTF files, and has no checks.
 """
 
 from __future__ import annotations
@@ -75,17 +75,17 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     The data of each format:
 
     - `.off`: colours of vertices and faces, normals, and texture coordinates (COFF, NOFF, STOFF).
-    - `.obj`: the `vt` lines as texture. The `g`, `o` and `usemtl` lines as the face data `group`, `object`
-      and `material`. Colours after the positions.
+    - `.obj`: the `vt` lines become the texture. The `g`, `o` and `usemtl` lines become the face data `group`,
+      `object` and `material`. Colours that follow the positions are read as well.
     - `.ply`: all properties with one number per row. Properties `a_0`, `a_1`, … become the columns of an
       array `a`. The texture comes from the face lists `texcoord`, or from the vertex properties `s` and `t`,
       `u` and `v`, or `texture_u` and `texture_v`.
     - `.stl`: none.
     - `.mat`: the data that `write_mesh_data` writes into the struct, besides vertices and faces.
-    - `.vtk`: VTK legacy files up to version 5.1, text or binary, with a POLYDATA or an UNSTRUCTURED_GRID of
-      triangles, polygons and triangle strips: all arrays on points and cells.
-    - `.vtp`: VTK XML files in all encodings, also compressed: all arrays on points and cells. Compression
-      with LZ4 needs the extra `vtk`.
+    - `.vtk`: all arrays on points and cells. The file is a VTK legacy file up to version 5.1, text or binary.
+      It contains a POLYDATA or an UNSTRUCTURED_GRID of triangles, polygons and triangle strips.
+    - `.vtp`: all arrays on points and cells. The file is a VTK XML file in any encoding, and may be
+      compressed. Compression with LZ4 needs the extra `vtk`.
     - `.gltf`, `.glb`: glTF 2.0 files. The attribute TEXCOORD_0 is the texture, and COLOR_0 becomes `colors`.
       Further attributes, morph targets and skins are read as well.
     - `.npz`: arrays with the names of the attributes of a `MeshData`.
@@ -100,8 +100,8 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     A glTF file duplicates vertices along texture seams. All duplicates stay in the list of vertices, but
     vertices at exactly the same position are welded, as if `weld` were True. All meshes of the scene are
     joined, in the order of the nodes, after the transforms of the nodes. Skinned meshes stay in their bind
-    pose. A glTF file reads only buffers that are files in its own folder or below. Normals, tangents,
-    animations and pictures are not read.
+    pose. Buffers in other files are read only if these files are in the folder of the glTF file or below.
+    Normals, tangents, animations and pictures are not read.
 
     **Arguments:**
 
@@ -118,8 +118,8 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
 
     **Raises:**
 
-    `InputError` if `read_mesh` refuses the file, or its data is damaged: for example because an array has a
-    wrong length, or a face uses a texture vertex that the file does not have.
+    `InputError` if `read_mesh` refuses the file, or if its data is damaged. For example, the data is damaged
+    if an array has a wrong length, or if a face uses a texture vertex that the file does not have.
     """
     path = Path(path)
     data = read_bytes(path)
@@ -203,8 +203,9 @@ def check_mesh_suffix(path: str | os.PathLike[str]) -> None:
 def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, ...]:
     """Write a mesh together with all data on its vertices and faces.
 
-    `read_mesh_data` lists the formats. It reads the same data from the file, in the precision of the format:
-    float32 in STL and glTF files, and float64 in the other formats. Colours in OBJ files become floats.
+    The docstring of `read_mesh_data` lists the formats. `read_mesh_data` reads the same data from the file,
+    in the precision of the format: float32 in STL and glTF files, and float64 in the other formats. Colours
+    in OBJ files become floats.
 
     Vertices keep their order in all formats except STL. glTF files need one texture vertex per vertex, so
     vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
@@ -219,8 +220,8 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
     - `data`: a `MeshData`. The file contains all of its `faces`, including faces that cleaning dropped from
         its `mesh`.
 
-    **Returns:** Sentences about the data that the format cannot hold; an empty tuple if the file contains
-    everything. Only a `.npz` file can contain all data of any `MeshData`.
+    **Returns:** A tuple of sentences about the data that the format cannot hold. The tuple is empty if the
+    file contains everything. Only a `.npz` file can contain all data of any `MeshData`.
 
     **Raises:** `InputError` for another suffix, positions that the format cannot hold, or a file that cannot
     be written.

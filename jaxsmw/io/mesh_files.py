@@ -30,15 +30,15 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
         - `.obj`: a text file.
         - `.ply`: a text file, or a binary file in either byte order.
         - `.stl`: a text file or a binary file.
-        - `.mat`: a file with a struct that has the coordinates X, Y and Z (or a matrix VERT) and the 1-based
-          faces TRIV, such as `surface` in the TOSCA data set. The struct may be a field of another struct, as
-          in the files of `write_spectrum`.
+        - `.mat`: a file with a struct, such as `surface` in the TOSCA data set. The struct has the
+          coordinates X, Y and Z (or a matrix VERT) and the 1-based faces TRIV. It may be a field of another
+          struct, as in the files of `write_spectrum`.
         - `.vtk`, `.vtp`: a VTK file of polygons, text or binary.
         - `.gltf`, `.glb`: a glTF 2.0 file. Such a file duplicates vertices along texture seams, so vertices
           at exactly the same position are always welded.
         - `.npz`: a file with the arrays `vertices` and `faces`.
-        - `.xyz`, `.pcd`, `.npy`: a point cloud. A file in another format without faces is a point cloud, too.
-          `jaxsmw.geometry.triangulate_points` makes a mesh whose vertices are the points.
+        - `.xyz`, `.pcd`, `.npy`: a point cloud. Files in the other formats are also point clouds if they
+          contain no faces. `jaxsmw.geometry.triangulate_points` makes a mesh whose vertices are the points.
     - `weld`: if True, vertices at exactly the same position are merged. Faces then use only the
         lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so no vertex is
         renumbered. Welding has no effect on an STL file, whose corners are always merged.
@@ -64,8 +64,8 @@ def write_mesh(
     """Write a mesh to a file in one of the formats of `write_mesh_data`.
 
     OFF files are text, and PLY files are binary and little endian. `read_mesh` reads the same faces and
-    exactly the same vertex positions from the file, except from glTF and STL files, whose positions are
-    float32. The write is atomic: an incomplete file never appears under this name.
+    exactly the same vertex positions from the file. glTF and STL files are exceptions, because their
+    positions are float32. The write is atomic: an incomplete file never appears under this name.
 
     **Arguments:**
 
@@ -74,8 +74,8 @@ def write_mesh(
     - `colors`: the red, green and blue components of the colour of each vertex (n, 3), as floats from 0 to 1
         or as uint8. None, the default, writes no colours. An OFF file with colours begins with COFF.
 
-    **Returns:** Sentences about what the format cannot hold, such as colours in an STL file; an empty tuple
-    if the file contains everything.
+    **Returns:** A tuple of sentences about what the format cannot hold, such as colours in an STL file. The
+    tuple is empty if the file contains everything.
 
     **Raises:**
 

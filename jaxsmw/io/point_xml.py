@@ -19,8 +19,9 @@ from jaxsmw.io.text import is_number
 # Limits far above any file of points, so that a malicious file cannot use gigabytes of memory.
 _DEEPEST, _LONGEST_TAG = 20, 2**16
 
-# Functions for the beginning and the end of an element. The list contains the names of all ancestors and,
-# last, of the element. The other argument contains the attributes, or the text.
+# Functions that are called at the beginning and at the end of an element. Their first argument lists the
+# names of all ancestors, followed by the name of the element. Their second argument contains the attributes
+# or the text.
 _OnStart = Callable[[list[str], dict[str, str]], None]
 _OnText = Callable[[list[str], str], None]
 
@@ -79,8 +80,8 @@ def _check_doctype(name: str, system: str | None, public: str | None, has_declar
 def parse_picked_points(text: str) -> Entries:
     """Parse a `.pp` file of MeshLab (the class PickedPoints in MeshLab's source code).
 
-    Positions are in the coordinate system of the mesh. Points with `active="0"` are names of a template that
-    nobody has placed, so they are left out.
+    Positions are in the coordinate system of the mesh. Points with `active="0"` are left out, because they
+    are names of a template that nobody has placed.
     """
     names: list[str] = []
     words: list[str] = []
@@ -123,10 +124,10 @@ def format_picked_points(landmarks: Landmarks) -> str:
 def parse_point_set(text: str) -> Entries:
     """Parse an `.mps` file of MITK (PointSetReaderService in MITK's source code).
 
-    The file contains index coordinates; its element Geometry3D takes them to world coordinates. MITK's world
-    coordinates (https://docs.mitk.org/2024.12/GeometryOverviewPage.html) are the physical coordinates of ITK
-    and DICOM, which are LPS in mm. The points have no names. Each is named by its number, from 1: this is
-    `id` + 1, because MITK counts from 0.
+    The file contains index coordinates, and its element Geometry3D takes them to world coordinates. MITK's
+    world coordinates (https://docs.mitk.org/2024.12/GeometryOverviewPage.html) are the physical coordinates
+    of ITK and DICOM, which are LPS in mm. The points have no names, so each point is named by its 1-based
+    number. This number is `id` + 1, because MITK counts from 0.
     """
     points: list[dict[str, str]] = []
     geometry: dict[str, dict[str, str]] = {}
@@ -158,7 +159,7 @@ def parse_point_set(text: str) -> Entries:
 
 
 def _point_name(point: dict[str, str], number: int) -> str:
-    """Return the name of a point of an `.mps` file, after a check that the point is complete."""
+    """Check that a point of an `.mps` file is complete, and return its name."""
     for key in ("id", "x", "y", "z"):
         if key not in point:
             _refuse(number, f"has no {key}")

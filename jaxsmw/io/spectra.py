@@ -52,24 +52,25 @@ def make_spectrum(
     """Make a `Spectrum` from an eigenbasis that was computed elsewhere.
 
     The arrays are checked and scaled to a surface of area 1. If the surface has area a, the eigenvalues are
-    multiplied by a, the eigenvectors are multiplied by the square root of a, and the vertex areas are divided
-    by a. If the unscaled surfaces X and Y have areas a_X and a_Y, multiply a pullback C by sqrt(a_Y / a_X) to
-    use it with the scaled spectra.
+    multiplied by a, and the eigenvectors by the square root of a. The vertex areas are divided by a. To use a
+    pullback C of the unscaled surfaces with the scaled spectra, multiply C by sqrt(a_Y / a_X), where a_X and
+    a_Y are the areas of the unscaled surfaces X and Y.
 
     **Arguments:**
 
     - `eigenvalues`: the eigenvalues (k,), ascending and not negative, in units of 1 / length². If
         `eigenvectors` and `vertex_areas` are None, `eigenvalues` is instead a shape of another library. The
-        shape can be a `TriMesh` of pyFM after a call of its method `process`, any other object with the
-        attributes `eigenvalues`, `eigenvectors` and `vertex_areas`, or a shape of geomfum with an eigenbasis.
+        shape can be a `TriMesh` of pyFM after a call of its method `process`, or a shape of geomfum with an
+        eigenbasis. Any other object with the attributes `eigenvalues`, `eigenvectors` and `vertex_areas` is
+        also accepted.
     - `eigenvectors`: the eigenvectors (n, k), orthonormal with respect to the vertex areas.
     - `vertex_areas`: the vertex areas (n,), in units of length², or the lumped mass matrix (n, n), dense or
         sparse. Vertices of zero area are masked. The unit of length is arbitrary.
     - `name`: the name of the spectrum in messages.
 
-    **Returns:** A `Spectrum` with `eigenvalues` (k,), `eigenvectors` (n, k), `vertex_areas` (n,) and `mask`
-    (n,), for total area 1, without descriptors, positions and normals. Its arrays have JAX's default
-    float type (float32 unless `jax_enable_x64` is set).
+    **Returns:** A `Spectrum` of a surface of area 1, with `eigenvalues` (k,), `eigenvectors` (n, k),
+    `vertex_areas` (n,) and `mask` (n,). It has no descriptors, positions or normals. Its arrays have JAX's
+    default float type (float32 unless `jax_enable_x64` is set).
 
     **Raises:** `InputError` if the arrays do not fit each other or are not finite real numbers. `InputError`
     is also raised if the eigenvalues are negative or not ascending, a vertex area is negative, the
@@ -170,12 +171,12 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     - `path`: the file.
         - A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,).
         - A `.mat` file contains the following variables, or one struct with fields of these names. `evals`
-          (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are given by `A`,
-          the lumped mass matrix (n, n) or its diagonal, or by a list `area` (n).
+          (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are either
+          `A`, which is the lumped mass matrix (n, n) or its diagonal, or a list `area` (n).
 
-    **Returns:** A `Spectrum` with `eigenvalues` (k,), `eigenvectors` (n, k), `vertex_areas` (n,) and `mask`
-    (n,), for total area 1, without descriptors, positions and normals. Its arrays have JAX's default
-    float type (float32 unless `jax_enable_x64` is set).
+    **Returns:** A `Spectrum` of a surface of area 1, with `eigenvalues` (k,), `eigenvectors` (n, k),
+    `vertex_areas` (n,) and `mask` (n,). It has no descriptors, positions or normals. Its arrays have JAX's
+    default float type (float32 unless `jax_enable_x64` is set).
 
     **Raises:** `InputError` if the file cannot be read, has another suffix, is damaged, lacks a field, or
     does not contain exactly one eigenbasis. The message names the file and the fault.

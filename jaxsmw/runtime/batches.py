@@ -33,7 +33,7 @@ Tree = TypeVar("Tree")
 
 
 def stack(spectra: Sequence[Spectrum]) -> Spectrum:
-    """Returns one `Spectrum` that contains several shapes, for `jax.vmap`.
+    """Return one `Spectrum` that contains several shapes, for `jax.vmap`.
 
     Every array of the result has a leading axis, with one entry per shape. All shapes are padded with masked
     vertices to the number of vertices of the largest shape.
@@ -75,7 +75,7 @@ def refine_pairs(
     memory: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[tuple[int, Refinement]]:
-    """Refines many pairs of shapes, of equal or different sizes, in batches on all devices.
+    """Refine many pairs of shapes, of equal or different sizes, in batches on all devices.
 
     Shapes are padded to a few common sizes (`jaxsmw.runtime.padding.padded_size`). One compiled program
     serves all pairs with the same combination of sizes. Each batch is divided among all devices. With several
@@ -96,15 +96,15 @@ def refine_pairs(
     - `refiner`: the method, a `Refiner` such as `WaveletPreservation()`.
     - `iterations`: the number of iterations, an integer of at least 1.
     - `samples`: for each shape, an integer array (s,) of the vertices on which the refiner iterates. The
-      number s must be the same for all shapes. With None, all iterations use all vertices.
+      number s must be the same for all shapes. If None, all iterations use all vertices.
     - `partial`: whether one shape of each pair is a partial shape and the other shape is the full shape. If
       True, both shapes must have the same unit of length.
     - `stop_when_unchanged`: whether to stop the refinement of a pair when an iteration changes no match.
     - `history`: whether to record a `History` of each pair.
     - `batch_size`: the number of pairs that each device receives at the same time. Accelerators refine these
-      pairs at the same time, and CPUs refine them one after another. The default on CPUs is 1,
-      because larger batches save no time there. The default on other devices is as many pairs as fit into
-      `memory`, up to 64.
+      pairs at the same time, and CPUs refine them one after another. The default on CPUs is 1, because larger
+      batches save no time there. On other devices, the default is the number of pairs that fit into `memory`,
+      but at most 64.
     - `memory`: the memory in bytes that a batch may use on each device if `batch_size` is None. The default
       is half of the device's memory.
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
@@ -160,7 +160,7 @@ def _check_pairs(
     pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     samples: Sequence[Int[Array, " _"]] | None,
 ) -> None:
-    """Raises `ValueError` if an argument of `refine_pairs`, other than `batch_size`, is not valid."""
+    """Raise `ValueError` if an argument of `refine_pairs`, other than `batch_size`, is not valid."""
     if len(pairs) != len(pointwise_maps):
         raise ValueError(
             f"there are {len(pairs)} pairs and {len(pointwise_maps)} initial maps: give one map per pair"
@@ -213,14 +213,14 @@ class _Sizes(NamedTuple):
     k_y: int
 
     def bytes_per_pair(self, itemsize: int) -> int:
-        """Returns the memory of one pair of these sizes; see the function `bytes_per_pair`."""
+        """Return the memory of one pair of these sizes; see the function `bytes_per_pair`."""
         return bytes_per_pair(self.m, self.n, max(self.k_x, self.k_y), itemsize)
 
 
 def _positions_by_size(
     spectra: Sequence[Spectrum], pairs: Sequence[tuple[int, int]]
 ) -> dict[_Sizes, list[int]]:
-    """Returns a dictionary from each combination of sizes to the indices of its pairs in `pairs`."""
+    """Return a dictionary from each combination of sizes to the indices of its pairs in `pairs`."""
     groups: dict[_Sizes, list[int]] = {}
     for position, pair in enumerate(pairs):
         (m, k_x), (n, k_y) = (spectra[shape].eigenvectors.shape for shape in pair)
@@ -263,7 +263,7 @@ class _Stack:
         self._side: Side = jax.device_put(side, NamedSharding(mesh, _EVERYWHERE))
 
     def rows(self, shapes: Sequence[int]) -> Side:
-        """Returns the given shapes, divided among the devices. A shape may occur several times."""
+        """Return the given shapes, divided among the devices. A shape may occur several times."""
         places = jnp.asarray([self._place[shape] for shape in shapes])
         return _take(self._side, places, self._mesh)
 
@@ -280,7 +280,8 @@ def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settin
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
         return refine(spectrum_x, spectrum_y, initial_map, refiner=refiner, samples=samples, **settings)
 
-    # In some programs of `jax.vmap`, XLA's threads for CPUs wait for each other forever.
+    # CPUs use `lax.map`, because XLA's threads for CPUs wait for each other forever in some programs of
+    # `jax.vmap`.
     each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
     if mesh.size == 1:
         return each(batch)
@@ -292,7 +293,7 @@ def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settin
 
 
 def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settings) -> Iterator[Refinement]:
-    """Refines a batch and yields the refinement of each pair."""
+    """Refine a batch and yield the refinement of each pair."""
     with one_blas_thread():
         refined = compiled(_refine_batch)(refiner, batch, mesh, settings)
         refined = multihost_utils.process_allgather(refined, tiled=True)
@@ -301,9 +302,9 @@ def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Setting
 
 
 def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.Device) -> int:
-    """Returns the default number of pairs that a device refines at the same time.
+    """Return the default number of pairs that a device refines at the same time.
 
-    The number is 1 on CPUs. On other devices, as many pairs as fit into the memory are refined, at most 64.
+    The number is 1 on CPUs. On other devices, it is the number of pairs that fit into the memory, at most 64.
     """
     if _one_at_a_time(device):
         return 1
@@ -314,7 +315,7 @@ def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.De
 
 
 def _one_at_a_time(device: jax.Device) -> bool:
-    """Returns whether a device should refine pairs one after another.
+    """Return whether a device should refine pairs one after another.
 
     On CPUs, a batch of pairs takes about 33 % more time than the same pairs one after another.
     """
@@ -322,7 +323,7 @@ def _one_at_a_time(device: jax.Device) -> bool:
 
 
 def bytes_per_pair(m: int, n: int, k: int, itemsize: int = 4) -> int:
-    """Returns the approximate memory that `refine` uses on a device for one pair, in bytes.
+    """Return the approximate memory that `refine` uses on a device for one pair, in bytes.
 
     The memory includes the spectra of the pair, and grows linearly with m and n.
 

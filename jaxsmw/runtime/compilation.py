@@ -26,7 +26,7 @@ _LARGEST_SHARE = 0.25
 
 
 def compiler_options() -> dict[str, str | bool]:
-    """Returns options of `jax.jit` that make nearest-neighbour searches fast on CPUs.
+    """Return options of `jax.jit` that make nearest-neighbour searches fast on CPUs.
 
     Pass the result to `jax.jit` as `compiler_options`. By default, XLA uses the library YNNPACK for products
     and sums on CPUs. Waking the threads of YNNPACK takes longer than a small operation. The options disable
@@ -50,7 +50,7 @@ def _options_for(backend: str) -> dict[str, str | bool]:
 
 
 def _known(option: str, value: str | bool) -> bool:
-    """Returns whether the installed XLA supports an option."""
+    """Return whether the installed XLA supports an option."""
     try:
         jax.jit(lambda: 0).lower().compile({option: value})
     except (jax.errors.JaxRuntimeError, ValueError):
@@ -59,7 +59,7 @@ def _known(option: str, value: str | bool) -> bool:
 
 
 def compiled(function: Function) -> Function:
-    """Returns the function compiled with `compiler_options`, for calls from Python.
+    """Return the function compiled with `compiler_options`, for calls from Python.
 
     Do not call the compiled function inside another compiled function. If `compiled` is called again with the
     same function, it returns the same compiled function.
@@ -78,7 +78,7 @@ def compile_ahead(
     arguments: Callable[[], tuple[tuple[PyTree, ...], Mapping[str, PyTree]]],
     **settings: object,
 ) -> Future[object]:
-    """Starts to compile `compiled(function)` in the background, for arguments of given sizes.
+    """Start to compile `compiled(function)` in the background, for arguments of given sizes.
 
     Wait for the returned future before you call `compiled(function)`. Otherwise the call compiles the program
     again.
@@ -113,7 +113,7 @@ def compile_ahead(
 
 
 def release_programs() -> None:
-    """Releases all compiled programs if the process uses a large share of its allowed memory maps.
+    """Release all compiled programs if the process uses a large share of its allowed memory maps.
 
     Commands, and functions that match many pairs, call this function between pairs. Functions that match one
     pair must not call it, because `jax.clear_caches` also clears the programs of the caller. On Linux, the

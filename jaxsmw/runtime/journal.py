@@ -79,7 +79,7 @@ class Journal:
         return self._rows[tuple(map(str, key))]
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Appends rows to the file, and returns after the rows have been written to disk.
+        """Append rows to the file, and return after the rows have been written to disk.
 
         **Arguments:**
 
@@ -116,7 +116,7 @@ class Journal:
         self._remember({name: str(value) for name, value in row.items()} for row in rows)
 
     def sort(self, keys: Iterable[Sequence[Any]]) -> None:
-        """Rewrites the file with the rows of `keys` only, in the order of `keys`.
+        """Rewrite the file with the rows of `keys` only, in the order of `keys`.
 
         Before this call the order of rows is arbitrary, because workers finish tasks in an arbitrary order.
 
@@ -130,7 +130,7 @@ class Journal:
             writer.writerows(self.rows)
 
     def _read(self, contents: bytes, columns: Columns) -> None:
-        """Parses complete lines, checks their values, and stores their rows in memory.
+        """Parse complete lines, check their values, and store their rows in memory.
 
         **Raises:** `InputError` if the contents are not a table with these columns.
         """
@@ -181,7 +181,7 @@ def claimed_directory(
     provenance: Mapping[str, Mapping[str, Any]],
     noted: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[None]:
-    """Locks a directory against other processes while results are added.
+    """Lock a directory against other processes while results are added.
 
     The function is a context manager, and releases the lock at the end of the `with` block. The first call
     for a directory writes `provenance` to the file `provenance.json`. Later calls check that their argument

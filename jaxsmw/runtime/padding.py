@@ -15,7 +15,7 @@ _SUBDIVISION = 8
 
 
 def padded_size(number_of_vertices: int) -> int:
-    """Returns the number of vertices to which a shape is padded.
+    """Return the number of vertices to which a shape is padded.
 
     One compiled program serves all shapes with the same padded size.
     """
@@ -25,7 +25,7 @@ def padded_size(number_of_vertices: int) -> int:
 
 
 def pad_rows(rows: Shaped[np.ndarray, "n ..."], number_of_rows: int) -> Shaped[np.ndarray, "p ..."]:
-    """Returns an array (n, ...) extended by rows of zeros to a given number of rows.
+    """Return an array (n, ...) extended by rows of zeros to a given number of rows.
 
     `number_of_rows` must be at least n.
     """

@@ -12,7 +12,7 @@ logger = logging.getLogger("jaxsmw")
 
 @contextmanager
 def timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Logs the name of a step, and stores the wall time of the block in `seconds[name]`, in seconds.
+    """Log the name of a step, and store the wall time of the block in `seconds[name]`, in seconds.
 
     If the block raises an exception, no time is stored.
     """

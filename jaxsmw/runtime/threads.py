@@ -16,7 +16,7 @@ Result = TypeVar("Result")
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Returns a context in which the linear algebra of NumPy and SciPy uses one thread.
+    """Return a context in which the linear algebra of NumPy and SciPy uses one thread.
 
     On CPUs the limit also applies to XLA, which uses the LAPACK of SciPy. On small arrays, more threads save
     no time. The threads of OpenBLAS also keep their cores busy while they wait for the next matrix.
@@ -26,12 +26,12 @@ def one_blas_thread() -> AbstractContextManager[object]:
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """Returns the loaded linear-algebra libraries. The result is cached, because the lookup is slow."""
+    """Return the loaded linear-algebra libraries. The result is cached, because the lookup is slow."""
     return ThreadpoolController()
 
 
 def side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[Result, Result]:
-    """Returns the results of a function for X and for Y, computed at the same time in two threads.
+    """Return the results of a function for X and for Y, computed at the same time in two threads.
 
     If the function raises an exception in a thread, `side_by_side` raises this exception.
     """

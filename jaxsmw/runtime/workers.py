@@ -52,7 +52,7 @@ class Workers(ProcessPoolExecutor):
         super().__init__(count, self._context, initializer=_start_worker)
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
-        """Submits a call to a worker, like `concurrent.futures.Executor.submit`."""
+        """Submit a call to a worker, like `concurrent.futures.Executor.submit`."""
         return super().submit(_call_in_worker, function, *arguments, **options)
 
     def __exit__(self, kind: type[BaseException] | None, *details: object) -> None:
@@ -76,7 +76,7 @@ class _OneCoreProcess(SpawnProcess):
 
 
 class _OneCoreContext(SpawnContext):
-    """Creates processes that are limited to one core each, and keeps a list of these processes."""
+    """A context that creates processes, each limited to one core, and keeps a list of these processes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -95,7 +95,7 @@ def _one_thread_flags() -> str:
 
 @contextmanager
 def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Sets environment variables within the `with` block, and restores the previous values at its end."""
+    """Set environment variables within the `with` block, and restore the previous values at its end."""
     with _starting:
         before = {name: os.environ.get(name) for name in variables}
         os.environ.update(variables)
@@ -115,7 +115,7 @@ _starting = threading.Lock()
 
 
 def _start_worker() -> None:
-    """Makes a worker ignore Ctrl-C, and makes the worker exit when the calling process exits.
+    """Make a worker ignore Ctrl-C, and make the worker exit when the calling process exits.
 
     Only the calling process handles Ctrl-C. Warnings are kept for the calling process; see `run_tasks`.
     """
@@ -136,7 +136,7 @@ _warnings: list[Warning] = []
 
 
 def _with_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[Warning]]:
-    """Calls a function in a worker. Returns its result, and the warnings since the last such call."""
+    """Call a function in a worker. Return its result, and the warnings since the last such call."""
     result = function(task)
     issued = _warnings.copy()
     _warnings.clear()
@@ -144,7 +144,7 @@ def _with_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Resu
 
 
 def _call_in_worker(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """Releases compiled programs in a worker if they use too much memory, then calls a function.
+    """Release compiled programs in a worker if they use too much memory, then call a function.
 
     A worker processes many pairs of different sizes, and each size needs its own compiled programs.
     """
@@ -159,13 +159,13 @@ class _DaskWorkers(Executor):
         self._executor = executor
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
-        """Submits a call to a worker, like `concurrent.futures.Executor.submit`."""
+        """Submit a call to a worker, like `concurrent.futures.Executor.submit`."""
         return self._executor.submit(_call_in_worker, function, *arguments, **options)
 
 
 @contextmanager
 def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Executor]:
-    """Starts local worker processes, or connects to the workers of a Dask cluster.
+    """Start local worker processes, or connect to the workers of a Dask cluster.
 
     The function is a context manager. When the `with` block ends, the local processes end or the connection
     is closed.
@@ -207,7 +207,7 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
 def run_tasks(
     function: Callable[[Task], Result], tasks: Mapping[str, Task], executor: Executor
 ) -> Iterator[tuple[str, Result | BaseException]]:
-    """Submits every task to an executor, and yields the result of each task as soon as the task ends.
+    """Submit every task to an executor, and yield the result of each task as soon as the task ends.
 
     **Arguments:**
 

@@ -30,7 +30,7 @@ _Value = TypeVar("_Value")
 
 
 class _Corners(NamedTuple):
-    """For each of p results, k rows of an array and the weights of these rows."""
+    """The k rows of an array from which each of p results is computed, and the weights of these rows."""
 
     rows: Int64[np.ndarray, "p k"]
     weights: Float64[np.ndarray, "p k"]
@@ -46,8 +46,8 @@ def transfer_attributes(
 ) -> MeshData:
     """Transfer all data on the vertices and faces of X to Y.
 
-    Each vertex of Y receives the values at the nearest point of the registered mesh, and each face of Y the
-    values at four of its points:
+    Each vertex of Y receives the values at the nearest point of the registered mesh. Each face of Y receives
+    the values at four points of the face:
 
     - Floats and colours are interpolated. If the vertex with the largest weight has a value that is not
       finite, this value is the result. Otherwise, values that are not finite are left out. Components of
@@ -65,19 +65,20 @@ def transfer_attributes(
       interpolated.
     - Normals describe the shape of X, so they are not transferred.
 
-    Data of Y are kept where X has no data of the same name. Face data of X also replace vertex data of Y with
-    the same name, and vice versa. Otherwise, both arrays would share one list of label names.
+    Data of Y are kept if X has no data of the same name. Face data of X also replace vertex data of Y with
+    the same name, and vice versa. If both arrays were kept, they would share one list of label names.
 
     **Arguments:**
 
     - `data`: the `MeshData` of X. Its `mesh` is `registered.mesh_x`.
     - `registered`: the `RegisteredMesh` of X on Y.
-    - `target`: Y, a `MeshData` whose `mesh` is `registered.mesh_y`, or a `Mesh`. With None (the default), it
-      is `registered.mesh_y`.
+    - `target`: Y, a `MeshData` whose `mesh` is `registered.mesh_y`, or a `Mesh`. If None (the default), Y is
+      `registered.mesh_y`.
 
     **Returns:** The `MeshData` of Y with the vertices and faces of `target`. The `notes` of its `mesh` tell
-    which data of Y were replaced, and how many vertices of Y are farther from the registered mesh than 3 % of
-    the square root of Y's area. These vertices also receive the values at the nearest point.
+    which data of Y were replaced. The notes also count the vertices of Y whose distance to the registered
+    mesh is above 3 % of the square root of Y's area. These vertices receive the values at the nearest point,
+    too.
 
     **Raises:** `InputError` if `data` or `target` do not belong to the registered meshes.
     """
@@ -118,8 +119,9 @@ def registered_data(data: MeshData, registered: RegisteredMesh) -> MeshData:
 
     The vertices, the faces, the texture, the skin, the labels and all other data keep their order and values.
     Blend shapes are rotated and scaled with the neighbourhoods (`RegisteredMesh.similarities`), and normals
-    are rotated. Vertices that only the file's own faces use, such as welded duplicates and the vertices of
-    small components, move with the nearest vertex of the mesh.
+    are rotated. Some vertices are used by faces of the file, but not by faces of the mesh. Examples are
+    welded duplicates and the vertices of small components. These vertices move with the nearest vertex of the
+    mesh.
 
     **Arguments:**
 
@@ -180,7 +182,7 @@ def _face_numbers(data: MeshData, mesh_x: Mesh) -> Int64[np.ndarray, " f"]:
 def _sampled_faces(
     registered: RegisteredMesh, faces: Int64[np.ndarray, "f 3"], numbers: Int64[np.ndarray, " g"]
 ) -> _Corners:
-    """Return the faces of the source's data at four points of each face of the target."""
+    """Return which faces of the source's data lie at four points of each face of the target."""
     samples = np.einsum("sk,fkx->fsx", _SAMPLES, registered.mesh_y.vertices[faces])
     found, _ = nearest_surface_points(samples.reshape(-1, 3), registered.mesh)
     weights = np.full(samples.shape[:2], 1 / len(_SAMPLES))
@@ -190,7 +192,7 @@ def _sampled_faces(
 def _mixed(
     name: str, values: Shaped[np.ndarray, "n ..."], corners: _Corners, votes: np.ndarray | None = None
 ) -> Shaped[np.ndarray, "p ..."]:
-    """Return the interpolated values, or the values with most votes. Types do not change."""
+    """Return the interpolated values, or the values with the most votes. Types do not change."""
     if values.dtype.kind == "f":
         return _interpolated(values, corners).astype(values.dtype)
     if name == COLORS and values.dtype == np.uint8:

@@ -48,13 +48,14 @@ def transfer_landmarks(
 
     **Arguments:**
 
-    - `landmarks`: l `Landmarks` on X, in the unit and the coordinate system of X.
+    - `landmarks`: `Landmarks` with l landmarks on X, in the unit and the coordinate system of X.
     - `registered`: the `RegisteredMesh` of X on Y.
     - `expected_error`: the expected error of each vertex of X (m,), divided by the square root of Y's area;
       see `Correspondence.expected_error`.
 
     **Returns:** `TransferredLandmarks`, whose attribute `landmarks` contains the positions (l, 3) on Y. The
-    coordinate system and the unit are those of the given landmarks, so both meshes should have them.
+    result states the coordinate system and the unit of the given landmarks, so both meshes should have this
+    coordinate system and this unit.
 
     **Raises:** `InputError` if `expected_error` does not contain one number for each vertex of X.
     `InputError` is also raised if the landmarks lie off the surface of X, but would lie on it in the other
@@ -82,11 +83,11 @@ def transfer_landmarks(
 def nearest_vertices(
     landmarks_x: Landmarks, landmarks_y: Landmarks, mesh_x: Mesh, mesh_y: Mesh
 ) -> Int64[np.ndarray, "l 2"]:
-    """Return landmarks with equal names as pairs of vertices, as `match` accepts them as the initial map.
+    """Convert landmarks with equal names to pairs of vertices, which `match` accepts as the initial map.
 
     **Arguments:**
 
-    - `landmarks_x`, `landmarks_y`: l `Landmarks` on X and on Y with the same names in the same order.
+    - `landmarks_x`, `landmarks_y`: the `Landmarks` on X and on Y, with the same l names in the same order.
     - `mesh_x`, `mesh_y`: the source X and the target Y.
 
     **Returns:** A vertex of X and a vertex of Y for each landmark (l, 2), 0-based. Each landmark is projected

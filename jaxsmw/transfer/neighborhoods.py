@@ -25,8 +25,9 @@ _WEIGHT_RANGE = 10.0
 # The scale of a neighbourhood is limited to the range from 1/_SCALE_RANGE to _SCALE_RANGE. Where a map
 # collapses a region to a point, the scale would otherwise be zero.
 _SCALE_RANGE = 5.0
-# The rotations include a reflection only if the determinants of the moments are clearly negative. Their sum
-# must be below minus this fraction of the summed cubes of the largest singular values.
+# The rotations include a reflection only if the determinants of the moments are clearly negative. The sum of
+# the determinants must be negative, and its absolute value must exceed this fraction of the sum of the cubed
+# Frobenius norms of the moments.
 _FLAT = 1e-12
 
 
@@ -49,7 +50,7 @@ class Similarities(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Neighborhoods:
-    """The edges of a mesh, which is scaled by the factor `size`, with positive weights.
+    """The edges of a mesh that is scaled by the factor `size`. The edges have positive weights.
 
     **Attributes:**
 
@@ -101,7 +102,7 @@ class Neighborhoods:
 
     @cached_property
     def squared_lengths(self) -> Float64[np.ndarray, " n"]:
-        """The weighted squared lengths of the edges at each vertex, averaged like the moments."""
+        """The sum of the weighted squared lengths of the edges at each vertex, averaged like the moments."""
         of_edges = self.weights * (self.vectors**2).sum(axis=1)
         return self._averaged(self._matrix(of_edges, of_edges).sum(axis=1))
 
@@ -126,7 +127,7 @@ class Neighborhoods:
         return values
 
     def differences(self, values: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "e ..."]:
-        """Return the value at the first vertex minus the value at the second vertex of each edge."""
+        """Return, for each edge, the value at its first vertex minus the value at its second vertex."""
         return values[self.edges[:, 0]] - values[self.edges[:, 1]]
 
     def similarities(self, positions: Float64[np.ndarray, "n 3"]) -> Similarities:
@@ -165,12 +166,12 @@ class Neighborhoods:
 def nearest_rotations(
     moments: Float64[np.ndarray, "n 3 3"],
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, " n"]]:
-    """Find for each matrix M the rotation R that maximises the trace of Rᵀ M.
+    """Find the rotation R that maximises the trace of Rᵀ M, for each matrix M.
 
     The maximal trace is the largest root of a polynomial of degree four, which Newton's method finds. The
     rotation then has a closed form (Markley, "Attitude determination using vector observations: a fast
-    optimal matrix algorithm", 1993). This takes a tenth of the time of a singular value decomposition, which
-    only replaces it where the rotation is nearly ambiguous.
+    optimal matrix algorithm", 1993). This takes a tenth of the time of a singular value decomposition.
+    The decomposition is computed only where the rotation is nearly ambiguous.
 
     **Returns:** The rotations (n, 3, 3), with determinants 1, and the maximal traces (n,).
     """
@@ -189,8 +190,8 @@ def nearest_rotations(
         value = (square - 2) * square - 8 * determinants * trace + constant
         trace -= value / np.maximum(slope, np.finfo(float).tiny)
     half = 0.5 * (trace**2 - 1)
-    # The divisor is the product of the sums of two singular values, of which the last has the sign of the
-    # determinant.
+    # The divisor is the product of all sums of two singular values. The last singular value has the sign of
+    # the determinant here.
     divisor = half * trace - determinants
     unique = divisor > _AMBIGUOUS
     gram = np.einsum("ian,jan->ijn", m, m)

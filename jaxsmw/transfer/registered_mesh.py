@@ -31,9 +31,9 @@ class _Round(NamedTuple):
 
     **Attributes:**
 
-    - `deformations`: the largest number of deformations. Unless the round pulls, the round ends when no face
+    - `deformations`: the largest number of deformations. A round that does not pull ends earlier if no face
       is flipped.
-    - `factor`: the factor of the weights at flipped faces and at their neighbours.
+    - `factor`: the factor by which weights at flipped faces and at their neighbours are multiplied.
     - `neighbors`: the largest distance to these neighbours, in edges.
     - `pull`: if positive, the round moves regions with reduced weights to their nearest points of the target.
       The number is the weight of these points, relative to the weight of the map elsewhere.
@@ -63,8 +63,8 @@ class RegisteredMesh:
     - `mesh_x`, `mesh_y`: the source X (m vertices, f faces) and the target Y.
     - `vertices`: the positions of X's vertices on Y (m, 3), in Y's unit of length. Together with the faces of
       X, they form the registered mesh.
-    - `similarities`: the rotation and the scale of the neighbourhood of each vertex, from X in X's unit of
-      length to the registered mesh in Y's unit.
+    - `similarities`: the rotation and the scale of each vertex's neighbourhood. They take X, in X's unit of
+      length, to the registered mesh, in Y's unit.
 
     An unreferenced vertex of X has the similarity of the nearest referenced vertex and moves with it. A
     duplicate that welding replaced has exactly the position of its twin.
@@ -85,12 +85,12 @@ class RegisteredMesh:
 
     @cached_property
     def surface_points(self) -> SurfacePoints:
-        """The nearest point of Y for each vertex of the registered mesh: m `SurfacePoints` on Y."""
+        """The nearest point of Y for each vertex of the registered mesh: `SurfacePoints` with m entries."""
         return self._nearest[0]
 
     @cached_property
     def distances(self) -> Float64[np.ndarray, " m"]:
-        """The distance from each vertex of the registered mesh to Y (m,), in Y's unit of length."""
+        """The distance from each vertex of the registered mesh to Y, in Y's unit of length (m,)."""
         return self._nearest[1]
 
     @cached_property
@@ -101,15 +101,15 @@ class RegisteredMesh:
     def flipped_faces(self) -> Bool[np.ndarray, " f"]:
         """A mask (f,), True for faces that are turned over relative to their neighbourhoods.
 
-        The normal of such a face makes an angle of more than 90 degrees with its normal on X, after the
-        normal on X is rotated with the face's neighbourhood.
+        The face's normal on X is first rotated with the face's neighbourhood. The face is turned over if the
+        angle between this rotated normal and the normal of the registered face is above 90 degrees.
         """
         normals = _normals(self.mesh_x.vertices, self.mesh_x)
         return _flipped_faces(self.mesh_x, normals, self.vertices, self.similarities)
 
     @cached_property
     def area_ratios(self) -> Float64[np.ndarray, " f"]:
-        """The area of each registered face divided by its area on X (f,), if both meshes have area 1.
+        """The area of each registered face divided by its area on X (f,), with both meshes scaled to area 1.
 
         The ratio is 1 where the map preserves area up to a common factor. If a face has no area on X, its
         ratio is 1.
@@ -119,7 +119,7 @@ class RegisteredMesh:
 
     @cached_property
     def angle_distortions(self) -> Float64[np.ndarray, " f"]:
-        """The mean change of the angles of each face, from X to the registered mesh (f,), in degrees."""
+        """The mean change of each face's angles from X to the registered mesh, in degrees (f,)."""
         changes = _angles(self.mesh.vertices[self.mesh.faces]) - _angles(
             self.mesh_x.vertices[self.mesh_x.faces]
         )
@@ -130,7 +130,7 @@ class RegisteredMesh:
 
         **Arguments:**
 
-        - `points`: p `SurfacePoints` on X.
+        - `points`: `SurfacePoints` on X with p entries.
 
         **Returns:** The positions (p, 3) of the points on the registered mesh, in Y's unit of length.
 
@@ -140,7 +140,7 @@ class RegisteredMesh:
 
     @cached_property
     def points_of_target(self) -> SurfacePoints:
-        """The point of X for each vertex of Y: n `SurfacePoints` on X, a map Y -> X.
+        """The point of X for each vertex of Y, a map Y -> X: `SurfacePoints` on X with n entries.
 
         Each vertex of Y is projected onto the registered mesh, which has the faces of X.
         """
@@ -148,7 +148,7 @@ class RegisteredMesh:
 
     @cached_property
     def target_distances(self) -> Float64[np.ndarray, " n"]:
-        """The distance from each vertex of Y to the registered mesh (n,), in Y's unit of length."""
+        """The distance from each vertex of Y to the registered mesh, in Y's unit of length (n,)."""
         return self._nearest_of_target[1]
 
     @cached_property
@@ -190,7 +190,7 @@ def register_mesh(
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y, each a `Mesh`.
-    - `points`: the map X -> Y, as m `SurfacePoints` on Y; see `Correspondence.surface_points`.
+    - `points`: the map X -> Y, as `SurfacePoints` on Y with m entries; see `Correspondence.surface_points`.
     - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map is smoothed if
       its wavelength is shorter than the stiffness. The default is 0.003. A stiffness of 0.03 makes the
       registered mesh of a noisy map smooth, but moves it farther away from the target.
@@ -264,8 +264,8 @@ def points_of_map(
 ) -> SurfacePoints:
     """Convert a map to vertices into a map to points between the vertices.
 
-    X is first registered with a stiffness of 0.01 in units of the square root of Y's area. The registration
-    smooths the map, whose matches jump from vertex to vertex.
+    X is first registered with a stiffness of 0.01 in units of the square root of Y's area. The matches
+    of a map to vertices jump from vertex to vertex, and the registration smooths these jumps.
 
     **Arguments:**
 
@@ -273,7 +273,7 @@ def points_of_map(
     - `pointwise_map`: T: X -> Y (m,), as 0-based vertices of Y.
     - `same_unit`: whether X and Y have the same unit of length.
 
-    **Returns:** m `SurfacePoints` on Y, for `register_mesh`.
+    **Returns:** `SurfacePoints` on Y with m entries, for `register_mesh`.
 
     **Raises:** `InputError` if the map does not fit the meshes.
     """
@@ -296,14 +296,14 @@ def _follow(
 
     The edge vectors are those of X, transformed by `similarities`. The linear system is solved for the
     vertices at which the given positions are not accurate, and for their neighbours. All other vertices stay
-    where they are. If they are no longer accurate then, the next deformation moves them.
+    where they are. If their positions are no longer accurate then, the next deformation moves them.
     """
     system = csr_array(diags_array(weights) + stiffness**2 * around.laplacian)
     right = stiffness**2 * around.divergence(similarities) + weights[:, None] * targets
     residual = right - system @ positions
-    # The rows of the system have the sums `weights`, and all entries outside of the diagonal are negative.
-    # Therefore no position has a larger error than the largest quotient of a residual and a weight. The
-    # criterion stays correct where small weights make the system ill-conditioned.
+    # The row sums of the system are `weights`, and all entries off the diagonal are negative. Therefore the
+    # error of every position is at most the largest quotient of a residual and its weight. The criterion
+    # stays correct where small weights make the system ill-conditioned.
     moving = (np.abs(residual).max(axis=1) > _KEPT * stiffness * weights).astype(float)
     rows = np.flatnonzero(around.averaging @ moving)
     if not len(rows):
@@ -348,7 +348,7 @@ def _normals(vertices: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.nda
 
 
 def _angles(corners: Float64[np.ndarray, "f 3 3"]) -> Float64[np.ndarray, "f 3"]:
-    """Return the angles of triangles, given by the positions of their corners, in radians."""
+    """Return the angles of triangles in radians, given the positions of their corners."""
     ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     crossed = np.linalg.norm(np.cross(ahead, behind), axis=2)
     return np.arctan2(crossed, (ahead * behind).sum(axis=2))

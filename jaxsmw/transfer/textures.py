@@ -38,8 +38,8 @@ def transfer_texture(
     - `registered`: the `RegisteredMesh` of X on Y.
     - `faces`: the triangles of Y (f, 3), as vertices of `registered.mesh_y`.
 
-    **Returns:** A `Texture` with corners (f, 3). The texture vertices are in the order of Y's vertices. A
-    face of Y whose nearest face of X has a corner without a texture vertex has no texture vertices.
+    **Returns:** A `Texture` with corners (f, 3). The texture vertices are in the order of Y's vertices. If
+    the nearest face of X has a corner without a texture vertex, the face of Y has no texture vertices.
     """
     mesh, vertices = registered.mesh, registered.mesh_y.vertices
     uv, cut = texture_of_corners(mesh.faces.ravel(), texture_at_corners(texture).reshape(-1, 2))
@@ -86,9 +86,9 @@ def _best_of_sides(
 ) -> Int64[np.ndarray, " c"]:
     """Choose one corner for all corners that have the same vertex and lie on the same side of the seams.
 
-    The chosen corner is the corner whose walk ended nearest to the vertex. The result contains, for each
-    corner, the chosen corner (c = 3 f). Without this choice, walks from different faces on one side of a
-    jagged seam could end at different points.
+    The chosen corner is the corner whose walk ended nearest to the vertex. The result (c,) contains the
+    chosen corner for each of the c = 3 f corners. Without this choice, walks from different faces on one
+    side of a jagged seam could end at different points.
     """
     tail, head = np.arange(3 * len(faces)), np.roll(np.arange(3 * len(faces)).reshape(-1, 3), -1, 1).ravel()
     vertex = faces.ravel()

@@ -25,8 +25,8 @@ from jaxsmw.stage import Stage
 MOST_SAMPLES = 1000
 """The number of samples of each shape in a prepared pair. No method uses more samples.
 
-If a shape has fewer referenced vertices, the number of samples of both shapes is the smaller of their numbers
-of referenced vertices.
+If a shape has fewer referenced vertices, both shapes have the same smaller number of samples. This is the
+number of referenced vertices of the shape with the fewest.
 """
 
 
@@ -67,7 +67,7 @@ class MethodInput:
         names: tuple[str, str],
         reverse_initial_map: Int64[np.ndarray, " n"] | None = None,
     ) -> MethodInput:
-        """Creates the input of all methods from a prepared pair.
+        """Create the input of all methods from a prepared pair.
 
         **Arguments:**
 
@@ -94,21 +94,21 @@ class MethodInput:
         )
 
     def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
-        """Returns both spectra with the eigenvectors and descriptors that a stage uses; see `Stage.view`.
+        """Return both spectra with the eigenvectors and descriptors that a stage uses; see `Stage.view`.
 
         The spectra of a partial pair are also cut to their common range of eigenvalues.
         """
         return stage.view(self.spectrum_x, self.spectrum_y, partial=self.partial)
 
     def truncated(self, k: int) -> tuple[Spectrum, Spectrum]:
-        """Returns both spectra with their first k eigenvectors.
+        """Return both spectra with their first k eigenvectors.
 
         The spectra of a partial pair are also cut to their common range of eigenvalues.
         """
         return self.seen_in(Stage(number_of_eigenvectors=k))
 
     def sampled(self, count: int | None) -> tuple[Int[Array, " s_x"] | None, Int[Array, " s_y"] | None]:
-        """Returns the first `count` samples of X and of Y; (None, None) if `count` is None."""
+        """Return the first `count` samples of X and of Y; (None, None) if `count` is None."""
         samples_x, samples_y = self.samples
         return (None, None) if count is None else (samples_x[:count], samples_y[:count])
 
@@ -138,14 +138,14 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the pointwise map X -> Y (m,), 0-based vertices of Y, and the status code (`RESULTS`).
+        """Return the pointwise map X -> Y (m,), 0-based vertices of Y, and the status code (`RESULTS`).
 
         If the status code is not `RESULTS.successful`, the map is invalid. After a failure, most methods
         return -1 for all vertices.
         """
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """Checks that the method can match all pairs. A benchmark calls `check` before it matches any pair.
+        """Check that the method can match all pairs. A benchmark calls `check` before it matches any pair.
 
         **Raises:** `InputError` if the method cannot match a pair.
         """
@@ -159,13 +159,13 @@ class Method(abc.ABC):
             )
 
     def suits(self, pairs: Sequence[DataPair]) -> bool:
-        """Returns whether the method can match all pairs. Unlike `check`, `suits` does not look for files."""
+        """Return whether the method can match all pairs. Unlike `check`, `suits` does not look for files."""
         partial = [pair.partial for pair in pairs]
         return not (self.full_only and any(partial)) and not (self.partial_only and not all(partial))
 
 
 def check_spectrum(mesh: Mesh, spectrum: Spectrum) -> None:
-    """Checks that a spectrum, padded or not, has a row for every vertex of a mesh.
+    """Check that a spectrum, padded or not, has a row for every vertex of a mesh.
 
     **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
     """

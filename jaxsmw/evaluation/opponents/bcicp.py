@@ -46,8 +46,8 @@ from jaxsmw.evaluation.opponents.base import Method, MethodInput, check_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.runtime.compilation import compiled
 
-# An edge of X is discontinuous if the images of its ends are far apart on Y. The distance between the images
-# then exceeds both 0.1 times the square root of the area of Y and 2 times the mean edge length of Y.
+# An edge of X is discontinuous if the images of its ends are far apart on Y. Images are far apart if their
+# distance exceeds both 0.1 times the square root of the area of Y and 2 times the mean edge length of Y.
 _DISCONTINUOUS, _DISCONTINUOUS_EDGES = 0.1, 2
 # The vertices of a region of X are outliers if the area of the region is less than this share of the area of
 # X.
@@ -68,8 +68,8 @@ class _Surface:
     - `positions`: the positions of these vertices (n, 3), scaled such that the shape has area 1.
     - `edges`: the ends of each edge (e, 2).
     - `component`: the index of the connected component that contains each vertex (n,).
-    - `near`: a sparse Boolean matrix (n, n), True for two vertices that are near each other. Their distance
-      along edges is then at most 0.1, or at most twice the mean edge length.
+    - `near`: a sparse Boolean matrix (n, n), True for two vertices that are near each other. Two vertices are
+      near if their distance along edges is at most 0.1, or at most twice the mean edge length.
     - `areas`: the vertex areas (n,).
     - `eigenvectors`: the eigenvectors (n, k).
     """
@@ -84,7 +84,7 @@ class _Surface:
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> _Surface:
-        """Returns the surface of a mesh, without unreferenced vertices and vertices masked by the spectrum.
+        """Return the surface of a mesh, without unreferenced vertices and vertices masked by the spectrum.
 
         **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """
@@ -109,7 +109,7 @@ class _Surface:
         )
 
     def adjacency(self, kept: Bool[np.ndarray, " e"] | None = None) -> csr_array:
-        """Returns the adjacency matrix (n, n) of the vertices, for all edges or only for the edges `kept`."""
+        """Return the adjacency matrix (n, n) of the vertices, for all edges or only for the edges `kept`."""
         tail, head = (self.edges if kept is None else self.edges[kept]).T
         places = np.concatenate([tail, head]), np.concatenate([head, tail])
         return csr_array((np.ones(len(places[0])), places), shape=(len(self.areas), len(self.areas)))
@@ -126,7 +126,7 @@ def bcicp(
     iterations: int = 10,
     smoothing: int = 50,
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " n"]]:
-    """Refines the maps X -> Y and Y -> X together with BCICP (Ren et al. 2018, section 5).
+    """Refine the maps X -> Y and Y -> X together with BCICP (Ren et al. 2018, section 5).
 
     The result is deterministic and does not depend on the signs of eigenvectors. Searches for nearest
     neighbours run in JAX, with the floating-point type of the spectra. All other computations run in NumPy
@@ -176,7 +176,7 @@ def bcicp(
 
 
 def _schedule(iterations: int, smoothing: int) -> list[int]:
-    """Returns the number of smoothing rounds of each iteration.
+    """Return the number of smoothing rounds of each iteration.
 
     The number of rounds decreases geometrically, and is 1 in the last iteration (our choice). Many rounds in
     the first iterations remove the folds of a poor initial map. Many smoothing rounds in every iteration
@@ -190,7 +190,7 @@ def _schedule(iterations: int, smoothing: int) -> list[int]:
 def _restrict(
     pointwise_map: Int64[np.ndarray, " m"], x: _Surface, y: _Surface, mesh_x: Mesh, mesh_y: Mesh
 ) -> Int64[np.ndarray, " n"]:
-    """Converts a map between the vertices of two meshes to a map between the vertices of two `_Surface`s.
+    """Convert a map between the vertices of two meshes to a map between the vertices of two `_Surface`s.
 
     **Raises:** `InputError` if the map has the wrong type or length, or maps a vertex of `x` to a vertex that
     `y` does not contain.
@@ -212,7 +212,7 @@ def _restrict(
 
 
 def _within(graph: csr_array, radius: float) -> csr_array:
-    """Returns a sparse matrix (n, n), True for two nodes of a graph whose distance is at most `radius`."""
+    """Return a sparse matrix (n, n), True for two nodes of a graph whose distance is at most `radius`."""
     n, rows, columns = graph.shape[0], [], []
     for first in range(0, n, _SOURCES_AT_ONCE):
         sources = np.arange(first, min(first + _SOURCES_AT_ONCE, n))
@@ -224,14 +224,14 @@ def _within(graph: csr_array, radius: float) -> csr_array:
 
 
 def _nearest(queries: Float[np.ndarray, "m d"], database: Float[np.ndarray, "n d"]) -> np.ndarray:
-    """Returns, for each query, the index of the nearest row of the database."""
+    """Return, for each query, the index of the nearest row of the database."""
     dtype = jnp.asarray(database).dtype
     found = compiled(nearest_neighbor)(jnp.asarray(queries, dtype), jnp.asarray(database))
     return np.asarray(found).astype(np.int64)
 
 
 def _rotation(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
-    """Returns the orthogonal matrix nearest to a matrix."""
+    """Return the orthogonal matrix nearest to a matrix."""
     u, _, v = np.linalg.svd(matrix)
     return u @ v
 
@@ -239,7 +239,7 @@ def _rotation(matrix: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
 def _bijective_step(
     x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], t_yx: Int64[np.ndarray, " n"]
 ) -> tuple[Int64[np.ndarray, " m"], Int64[np.ndarray, " n"]]:
-    """Performs one step of bijective ICP: spectral ICP in both directions and along the two cycles of maps.
+    """Perform one step of bijective ICP: spectral ICP in both directions and along the two cycles of maps.
 
     There are four functional maps: one for each direction, and one for each of the cycles X -> Y -> X and
     Y -> X -> Y. Each functional map is replaced by the nearest orthogonal matrix. The step seeks pointwise
@@ -271,7 +271,7 @@ def _bijective_step(
 def _improve_coverage(
     y: _Surface, t_xy: Int64[np.ndarray, " m"], t_yx: Int64[np.ndarray, " n"]
 ) -> Int64[np.ndarray, " m"]:
-    """Changes the map X -> Y such that more vertices of Y have a preimage.
+    """Change the map X -> Y such that more vertices of Y have a preimage.
 
     A vertex y without a preimage becomes the image of x = T_YX(y), if the current image of x has another
     preimage. Covered vertices therefore stay covered. Vertices are visited in the order of their indices (our
@@ -288,7 +288,7 @@ def _improve_coverage(
 
 
 def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int) -> Int64[np.ndarray, " m"]:
-    """Smooths the map X -> Y by averaging the images of adjacent vertices.
+    """Smooth the map X -> Y by averaging the images of adjacent vertices.
 
     In each round, the image of each vertex moves to the mean of this image and the images of all adjacent
     vertices. Images are moved to the nearest vertices of Y only after the last round, because displacements
@@ -305,7 +305,7 @@ def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int
 
 
 def _discontinuous_edges(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " e"]:
-    """Returns the edges of X whose ends are mapped far apart on Y, as a mask (e,).
+    """Return the edges of X whose ends are mapped far apart on Y, as a mask (e,).
 
     Two vertices of Y are far apart if `y.near` is False for them. The thresholds, and the measurement of
     distances along edges, are our choice.
@@ -315,7 +315,7 @@ def _discontinuous_edges(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]
 
 
 def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[np.ndarray, " m"]:
-    """Returns a mask (m,) of the outliers, which are the vertices in small regions of X.
+    """Return a mask (m,) of the outliers, which are the vertices in small regions of X.
 
     A region is a connected component of the graph of continuous edges. A region is small if its area is less
     than 5 % of the area of X (our choice). A mismatched limb forms a larger region, which only
@@ -331,7 +331,7 @@ def _outliers(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Bool[n
 
 
 def _repair(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"]) -> Int64[np.ndarray, " m"]:
-    """Gives outliers new images, which are interpolated from the images of the surrounding vertices.
+    """Give outliers new images, which are interpolated from the images of the surrounding vertices.
 
     The interpolation in the spectral embedding of Y is harmonic (our choice): the interpolated point of each
     outlier is the mean of its neighbours' points. The new image of the outlier is the vertex of Y that is
@@ -362,7 +362,7 @@ class BijectiveContinuousICP(Method):
     full_only: bool = True
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y and the status code; see `Method`."""
+        """Return the map X -> Y and the status code; see `Method`."""
         assert pair.meshes is not None and pair.reverse_initial_map is not None
         initial_maps = (
             np.asarray(initial_map).astype(np.int64)

@@ -100,15 +100,17 @@ def coherent_point_drift(
     iterations: int = 150,
     tolerance: float = 1e-5,
 ) -> Drift:
-    """Moves centroids smoothly until they fit the data (Coherent Point Drift, Myronenko and Song 2010).
+    """Move centroids smoothly until they fit the data (Coherent Point Drift, Myronenko and Song 2010).
 
     Each point set is first shifted to zero mean and scaled to unit variance: the mean squared distance of its
     points from their mean is then 1. The docstring of this module contains the equations. The default values
     are those of Myronenko's program, except for the rank. Myronenko's program uses the exact kernel matrix by
     default, and optionally an approximation of rank sqrt(n). The mean geodesic errors on a real pair with
-    5000 vertices show the effect of the rank. With 30 eigenvectors, the mean geodesic error is 22.4 x 10^-3
-    at rank 70, and 20.8 x 10^-3 at the ranks 300 and 1200. With 100 eigenvectors, the mean geodesic error is
-    17.2 x 10^-3 at rank 150, 11.4 x 10^-3 at rank 600, and 11.3 x 10^-3 at rank 1200.
+    5000 vertices show the effect of the rank:
+
+    - with 30 eigenvectors, 22.4 x 10^-3 at rank 70, and 20.8 x 10^-3 at the ranks 300 and 1200;
+    - with 100 eigenvectors, 17.2 x 10^-3 at rank 150, 11.4 x 10^-3 at rank 600, and 11.3 x 10^-3 at rank
+      1200.
 
     **Arguments:**
 
@@ -143,7 +145,7 @@ def coherent_point_drift(
 def kernel_factor(
     points: Float[Array, "n d"], mask: Bool[Array, " n"], *, width: float | Float[Array, ""], rank: int
 ) -> Float[Array, "n rank"]:
-    """Returns a factor L (n, rank) such that `L L^T` approximates the Gaussian kernel matrix of points.
+    """Return a factor L (n, rank) such that `L L^T` approximates the Gaussian kernel matrix of points.
 
     Entry (i, j) of the kernel matrix is `exp(-||p_i - p_j||^2 / 2 width^2)`. L is computed by a pivoted
     Cholesky factorisation that stops at the given rank. Each step selects the point whose diagonal entry is
@@ -189,7 +191,7 @@ def recover_by_drift(
     rank: int = 300,
     iterations: int = 50,
 ) -> Int32[Array, " m"]:
-    """Recovers a pointwise map from a functional map by Coherent Point Drift, as an alternative to `decode`.
+    """Recover a pointwise map from a functional map by Coherent Point Drift, as an alternative to `decode`.
 
     Coherent Point Drift moves the embedding of Y onto the embedding of X. Each vertex of X is then matched
     with the nearest unmasked vertex of Y.
@@ -251,7 +253,7 @@ class DriftRecovery(WaveletPreservation):
             )
 
     def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
-        """Recovers the pointwise map X -> Y (m,) from the state's functional map; see `recover_by_drift`."""
+        """Recover the pointwise map X -> Y (m,) from the state's functional map; see `recover_by_drift`."""
         return recover_by_drift(
             state.functional_map,
             prepared.spectrum_x,
@@ -275,7 +277,7 @@ def _drift(
     *,
     rank: int,
 ) -> Drift:
-    """Computes `coherent_point_drift`. JAX compiles one program for each combination of sizes and rank."""
+    """Compute `coherent_point_drift`. JAX compiles one program for each combination of sizes and rank."""
     x, mean, scale = _normalized(data, data_mask)
     y, _, _ = _normalized(centroids, centroids_mask)
     factor = kernel_factor(y, centroids_mask, width=width, rank=rank)
@@ -305,8 +307,8 @@ def _drift(
     infinite = jnp.asarray(jnp.inf, x.dtype)
     initial = _State(
         jnp.zeros((rank, d), x.dtype),
-        # The initial variance is the mean squared distance between data and centroids, divided by d. The
-        # initial variance is 2 / d, because both sets have zero mean and a mean squared norm of 1.
+        # The initial variance is the mean squared distance between data and centroids, divided by d. This
+        # value is 2 / d, because both sets have zero mean and a mean squared norm of 1.
         jnp.asarray(2 / d, x.dtype),
         objective=infinite,
         change=infinite,
@@ -346,7 +348,7 @@ class _Expected(NamedTuple):
 def _normalized(
     points: Float[Array, "n d"], mask: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n d"], Float[Array, " d"], Float[Array, ""]]:
-    """Shifts and scales points to zero mean and mean squared norm 1. Masked points become zero.
+    """Shift and scale points to zero mean and mean squared norm 1. Masked points become zero.
 
     **Returns:** The new points, the mean of the given points, and the scale by which they were divided.
     """
@@ -365,7 +367,7 @@ def _expectation(
     variance: Float[Array, ""],
     outliers: Float[Array, ""],
 ) -> _Expected:
-    """Computes the E-step for one block of data points at a time. Shifted logarithms prevent underflow."""
+    """Compute the E-step for one block of data points at a time. Shifted logarithms prevent underflow."""
     (m, d), n = data.shape, centroids.shape[0]
     dtype, blocks = data.dtype, -(-m // _BLOCK)
     density = jnp.sum(centroids_mask).astype(dtype) / jnp.sum(data_mask).astype(dtype)
@@ -402,7 +404,7 @@ def _maximization(
     factor: Float[Array, "n rank"],
     ridge: Float[Array, ""],
 ) -> Float[Array, "rank d"]:
-    """Computes the M-step, and returns the coefficients b (rank, d) of the displacement `L b`."""
+    """Compute the M-step, and return the coefficients b (rank, d) of the displacement `L b`."""
     weights = expected.per_centroid[:, None]
     gram = product(factor.T, weights * factor) + ridge * jnp.eye(factor.shape[1], dtype=factor.dtype)
     wanted = product(factor.T, expected.weighted_data - weights * centroids)
@@ -410,7 +412,7 @@ def _maximization(
 
 
 def _variance(expected: _Expected, data: Float[Array, "m d"], moved: Float[Array, "n d"]) -> Float[Array, ""]:
-    """Returns the mean squared distance between data and centroids, weighted by P and divided by d."""
+    """Return the mean squared distance between data and centroids, weighted by P and divided by d."""
     squares = (
         jnp.sum(expected.per_point[:, None] * data**2)
         + jnp.sum(expected.per_centroid[:, None] * moved**2)

@@ -18,7 +18,7 @@ class Unrefined(Method):
     number_of_eigenvectors: int = 1
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y and the status code; see `Method`."""
+        """Return the map X -> Y and the status code; see `Method`."""
         return pair.initial_map, RESULTS.successful  # type: ignore[return-value]
 
 

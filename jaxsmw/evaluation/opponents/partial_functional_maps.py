@@ -89,7 +89,7 @@ from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.stage import Stage
 
 FIDELITY = 60.0
-"""The factor of the fidelity term in the minimisation over C, in which column norms are averaged."""
+"""The factor of the fidelity term in the minimisation over C. The fidelity term averages column norms."""
 MAP_WEIGHTS = (1.0, 100.0, 1.0)
 """The published weights mu_1, mu_2 and mu_3 of the terms that regularise the functional map."""
 REGION_WEIGHTS = (10.0, 0.01)
@@ -123,7 +123,7 @@ class SurfaceGradient(eqx.Module):
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> SurfaceGradient:
-        """Returns the gradient operator of a mesh. Lengths are in the unit of length of the spectrum.
+        """Return the gradient operator of a mesh. Lengths are in the unit of length of the spectrum.
 
         **Arguments:**
 
@@ -151,7 +151,7 @@ class SurfaceGradient(eqx.Module):
         )
 
     def total_variation(self, function: Float[Array, " n"]) -> Float[Array, ""]:
-        """Returns the total variation of a function, the integral of the gradient's length over the surface.
+        """Return the total variation of a function, the integral of the gradient's length over the surface.
 
         The Mumford-Shah term of the paper is the total variation if xi = 1. The length of the gradient is
         smoothed at zero.
@@ -191,18 +191,18 @@ def partial_functional_map(
     iterations: int = 5,
     icp_steps: int = 5,
 ) -> PartialMap:
-    """Matches a partial shape X with a full shape Y by partial functional maps (Rodolà et al. 2017).
+    """Match a partial shape X with a full shape Y by partial functional maps (Rodolà et al. 2017).
 
     The function is pure and can be compiled. The result does not depend on the signs of eigenvectors or on
     padding. The docstring of this module contains the equations.
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the unit of length in which Y has area 1, cut to
-      their common range of eigenvalues (`jaxsmw.pair.common_range`). After this cut, the number k_X of
-      eigenvectors of X is the rank r of the paper. If k_X is larger than k_Y, only the first k_Y eigenvectors
-      of X are used. Both spectra need the same number of descriptors. The descriptors of X and Y must be
-      comparable, and scaled to mean square 1.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, cut to their common range of eigenvalues
+      (`jaxsmw.pair.common_range`), in the unit of length in which Y has area 1. After this cut, the number
+      k_X of eigenvectors of X is the rank r of the paper. If k_X is larger than k_Y, only the first k_Y
+      eigenvectors of X are used. Both spectra need the same number of descriptors. The descriptors of X and Y
+      must be comparable, and scaled to mean square 1.
     - `gradient_y`: the gradient of functions on Y, in the unit of length in which Y has area 1.
     - `pointwise_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `iterations`: the number of iterations, at least 1. Each iteration minimises the energy over C, then
@@ -281,16 +281,16 @@ class _Energies(eqx.Module):
         return cls(spectrum_x, spectrum_y, gradient_y, dual_y, coefficients_x, _functions(spectrum_y))
 
     def covered(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
-        """Returns the function on Y that corresponds to the constant 1 on X under `c`, clipped to [0, 1]."""
+        """Return the function on Y that corresponds to the constant 1 on X under `c`, clipped to [0, 1]."""
         coefficients = product(c.T, self.coefficients_x[:, -1])
         return jnp.clip(product(self.spectrum_y.eigenvectors, coefficients), 0, 1)
 
     def inside(self, membership: Float[Array, " n"]) -> Float[Array, "k_y functions"]:
-        """Returns B(v), the coefficients of the functions on Y after restriction to the region."""
+        """Return B(v), the coefficients of the functions on Y after restriction to the region."""
         return product(self.dual_y.T, eta(membership)[:, None] * self.functions_y)
 
     def best_map(self, c: Float[Array, "r k_y"], membership: Float[Array, " n"]) -> Float[Array, "r k_y"]:
-        """Minimises the energy over the functional map for a fixed membership function, starting from `c`."""
+        """Minimise the energy over the functional map for a fixed membership function, starting from `c`."""
         coefficients_y = self.inside(membership)
         weights = slanted_weights(*c.shape).astype(self.coefficients_x.dtype)
 
@@ -301,7 +301,7 @@ class _Energies(eqx.Module):
         return _minimum(energy, c, _MAP_TOLERANCE, _MAP_STEPS)
 
     def best_region(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
-        """Minimises the energy over the membership function for a fixed `c`, starting from `covered(c)`."""
+        """Minimise the energy over the membership function for a fixed `c`, starting from `covered(c)`."""
         area_x = jnp.sum(self.spectrum_x.vertex_areas)
         # The solver minimises over u = v sqrt(vertex area), so its convergence is nearly independent of the
         # mesh density.
@@ -316,12 +316,12 @@ class _Energies(eqx.Module):
 
 
 def eta(membership: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Returns eta(v) (n,) for a membership function v (n,): near 0 outside the region and near 1 inside."""
+    """Return eta(v) (n,) for a membership function v (n,): near 0 outside the region and near 1 inside."""
     return (jnp.tanh(6 * (membership - 0.5)) + 1) / 2
 
 
 def slanted_weights(k_x: int, k_y: int) -> Float[Array, "k_x k_y"]:
-    """Returns the weights W of the paper (k_x, k_y), which grow with the distance to a slanted diagonal.
+    """Return the weights W of the paper (k_x, k_y), which grow with the distance to a slanted diagonal.
 
     The slanted diagonal starts at the first entry and moves k_x / k_y rows per column. The weight of an entry
     is its distance to the diagonal, measured in entries, times `exp(-0.03 sqrt(i^2 + j^2))`. Rows i and
@@ -342,7 +342,7 @@ def fidelity(
     coefficients_x: Float[Array, "k_x functions"],
     coefficients_y: Float[Array, "k_y functions"],
 ) -> Float[Array, ""]:
-    """Returns the fidelity term `||C A - B||_{2,1}`, with column norms averaged and smoothed at zero.
+    """Return the fidelity term `||C A - B||_{2,1}`, with column norms averaged and smoothed at zero.
 
     The last column of the matrix `C A - B` belongs to the constant function, and each other column belongs to
     a descriptor. The fidelity term is the norm of the last column plus the mean norm of the other columns.
@@ -357,7 +357,7 @@ def fidelity(
 
 
 def map_energy(functional_map: Float[Array, "k_x k_y"], weights: Float[Array, "k_x k_y"]) -> Float[Array, ""]:
-    """Returns the energy that regularises the functional map: the weighted terms of mu_1, mu_2 and mu_3.
+    """Return the energy that regularises the functional map: the weighted terms of mu_1, mu_2 and mu_3.
 
     These terms keep the large entries of C near the slanted diagonal, and keep the rows of C nearly
     orthonormal.
@@ -383,7 +383,7 @@ def region_energy(
     spectrum_y: Spectrum,
     gradient_y: SurfaceGradient,
 ) -> Float[Array, ""]:
-    """Returns the energy that regularises the region: the weighted terms of mu_4 and mu_5.
+    """Return the energy that regularises the region: the weighted terms of mu_4 and mu_5.
 
     The term with the weight mu_4 keeps the area of the region close to the area of X. The term with the
     weight mu_5 keeps the boundary of the region short.
@@ -401,21 +401,21 @@ def region_energy(
 
 
 def _functions(spectrum: Spectrum) -> Float[Array, "n functions"]:
-    """Returns the descriptors and, in the last column, the constant function 1."""
+    """Return the descriptors and, in the last column, the constant function 1."""
     assert spectrum.descriptors is not None
     constant = spectrum.mask.astype(spectrum.descriptors.dtype)
     return jnp.concatenate([spectrum.descriptors, constant[:, None]], axis=1)
 
 
 def _smoothed_norm(vectors: Float[Array, "a b"], *, axis: int) -> Float[Array, " c"]:
-    """Returns Euclidean norms, smoothed to be differentiable at zero. A zero vector has norm zero."""
+    """Return Euclidean norms, smoothed to be differentiable at zero. A zero vector has norm zero."""
     return jnp.sqrt(jnp.sum(vectors**2, axis=axis) + _SMOOTHING**2) - _SMOOTHING
 
 
 def _spectral_icp(
     functional_map: Float[Array, "k_x k_y"], spectrum_x: Spectrum, spectrum_y: Spectrum, steps: int
 ) -> Float[Array, "k_x k_y"]:
-    """Refines C by `steps` steps of spectral ICP, which is also the final refinement in the paper.
+    """Refine C by `steps` steps of spectral ICP, which is also the final refinement in the paper.
 
     Each step searches for nearest neighbours, encodes the matches as a functional map, and replaces this map
     by the nearest matrix with orthonormal rows.
@@ -436,7 +436,7 @@ def _minimum(
     tolerance: float,
     steps: int,
 ) -> Float[Array, " ..."]:
-    """Minimises an energy by at most `steps` steps of L-BFGS, and returns the final point.
+    """Minimise an energy by at most `steps` steps of L-BFGS, and return the final point.
 
     No error is raised if the minimum is not reached.
     """
@@ -462,7 +462,7 @@ class PartialFunctionalMaps(Method):
     partial_only: bool = True
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y and the status code; see `Method`."""
+        """Return the map X -> Y and the status code; see `Method`."""
         assert pair.meshes is not None
         spectra = pair.seen_in(
             Stage(

@@ -46,7 +46,7 @@ class Peer(Method):
     package: str
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y and the status code; see `Method`."""
+        """Return the map X -> Y and the status code; see `Method`."""
         x, y = (_Shape.of(spectrum) for spectrum in (pair.spectrum_x, pair.spectrum_y))
         initial_map = np.searchsorted(y.vertices, np.asarray(pair.initial_map)[x.vertices])
         found = np.zeros(pair.initial_map.shape, np.int32)
@@ -55,7 +55,7 @@ class Peer(Method):
 
     @abc.abstractmethod
     def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
-        """Returns the refined map X -> Y (u,) between the referenced vertices, which are counted from 0.
+        """Return the refined map X -> Y (u,) between the referenced vertices, which are counted from 0.
 
         **Arguments:**
 
@@ -83,7 +83,7 @@ class _Shape:
 
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Shape:
-        """Returns a spectrum without padding and without unreferenced vertices."""
+        """Return a spectrum without padding and without unreferenced vertices."""
         used = np.flatnonzero(spectrum.mask)
         arrays = spectrum.eigenvalues, spectrum.eigenvectors[used], spectrum.vertex_areas[used]
         return cls(used, *(np.asarray(array, np.float64) for array in arrays))
@@ -141,6 +141,6 @@ _STEPS = (LAST_EIGENVECTORS - FIRST_EIGENVECTORS) // ZOOMOUT_STEP
 
 
 def installed_peers() -> dict[str, Method]:
-    """Returns a dictionary from name to method, with the methods whose packages are installed."""
+    """Return a dictionary from name to method, with the methods whose packages are installed."""
     peers: dict[str, Peer] = {"pyfm-zoomout": PyFM(), "geomfum-zoomout": Geomfum()}
     return {name: peer for name, peer in peers.items() if find_spec(peer.package)}

@@ -42,7 +42,7 @@ class Refined(Method):
     number_of_samples: int | None = None
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y and the status code; see `Method`."""
+        """Return the map X -> Y and the status code; see `Method`."""
         stage = Stage(
             self.refiner,
             number_of_eigenvectors=self.number_of_eigenvectors,
@@ -77,7 +77,7 @@ class Chosen(Method):
         return PRESETS[self.preset].number_of_descriptors
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y and the status code; see `Method`."""
+        """Return the map X -> Y and the status code; see `Method`."""
         assert pair.prepared is not None
         preset = PRESETS[self.preset].fitted(pair.prepared.pair.fewest_vertices())
         outcome = refine_in_stages(pair.prepared, preset.stages, preset.repair)

@@ -39,14 +39,14 @@ class PublishedMaps(Method):
         return f"maps in {self.directory.name}, computed elsewhere"
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y and the status code; see `Method`."""
+        """Return the map X -> Y and the status code; see `Method`."""
         assert pair.meshes is not None
         pointwise_map = read_published_map(self.directory, pair.names, pair.meshes)
         padded = jnp.asarray(pad_rows(pointwise_map, pair.spectrum_x.mask.shape[0]), jnp.int32)
         return padded, RESULTS.successful  # type: ignore[return-value]
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """Checks that the directory has a map for each pair.
+        """Check that the directory has a map for each pair.
 
         **Raises:** `InputError` if a map is missing.
         """
@@ -60,19 +60,19 @@ class PublishedMaps(Method):
 
 
 def published_file(directory: Path, names: tuple[str, str]) -> Path:
-    """Returns the path of the map between two shapes, given the names of the source and the target."""
+    """Return the path of the map between two shapes, given the names of the source and the target."""
     return directory / f"{'_'.join(names)}.map"
 
 
 def read_published_map(
     directory: Path, names: tuple[str, str], meshes: tuple[Mesh, Mesh]
 ) -> Int64[np.ndarray, " m"]:
-    """Reads the map X -> Y from `X_Y.map`, which contains one vertex of Y per line, counted from 1.
+    """Read the map X -> Y from `X_Y.map`, which contains one vertex of Y per line, counted from 1.
 
     **Arguments:**
 
     - `directory`: the directory that contains the file.
-    - `names`: the names of X and Y, from which the file name is formed.
+    - `names`: the names of X and Y, which form the file name.
     - `meshes`: the meshes of X, with m vertices, and of Y.
 
     **Returns:** The map (m,), 0-based vertices of Y.

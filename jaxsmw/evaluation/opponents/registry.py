@@ -39,17 +39,17 @@ MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.valu
 
 
 def known_methods() -> dict[str, Method]:
-    """Returns a dictionary from name to method: `METHODS` and the methods of other installed libraries."""
+    """Return a dictionary from name to method: `METHODS` and the methods of other installed libraries."""
     return METHODS | installed_peers()
 
 
 def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
-    """Returns a dictionary from name to method, with the known methods that can match all pairs."""
+    """Return a dictionary from name to method, with the known methods that can match all pairs."""
     return {name: method for name, method in known_methods().items() if method.suits(pairs)}
 
 
 def find_methods(names: Iterable[str]) -> dict[str, Method]:
-    """Returns methods by name.
+    """Return methods by name.
 
     **Arguments:**
 

@@ -56,7 +56,7 @@ class ZoomOut(Method):
     number_of_samples: int | None = None
 
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Returns the map X -> Y and the status code; see `Method`."""
+        """Return the map X -> Y and the status code; see `Method`."""
         pointwise_map, refiner = pair.initial_map, _UNFILTERED
         samples_x, samples_y = pair.sampled(self.number_of_samples)
         if samples_x is not None:
@@ -77,7 +77,7 @@ def _at(
     samples_x: Int[Array, " s_x"] | None,
     samples_y: Int[Array, " s_y"] | None,
 ) -> tuple[Spectrum, Spectrum]:
-    """Restricts both spectra to the samples. Without samples, returns both spectra unchanged."""
+    """Restrict both spectra to the samples. Without samples, return both spectra unchanged."""
     if samples_x is None or samples_y is None:
         return spectra
     return spectra[0].sample(samples_x), spectra[1].sample(samples_y)

@@ -77,9 +77,9 @@ class MeshData:
 
     **Attributes:**
 
-    - `mesh`: the `Mesh` with n vertices that matching uses.
-    - `faces`: all triangles (f, 3) of the file in the order of the file, before cleaning and welding; 0-based
-      indices of the vertices of `mesh`, int64. Polygons are split into fans of triangles.
+    - `mesh`: the `Mesh` that matching uses, with n vertices.
+    - `faces`: all triangles of the file, in the order of the file, before cleaning and welding. The array
+      (f, 3), int64, contains 0-based vertices of `mesh`. Polygons are split into fans of triangles.
     - `vertex_data`: a dictionary from names to arrays (n,) or (n, c) with numbers for each vertex. Colours
       are called `colors`; they are uint8, or floats from 0 to 1. Normals are called `normals`.
     - `face_data`: a dictionary from names to arrays (f,) or (f, c) with numbers for each triangle.
@@ -229,12 +229,12 @@ class Written(NamedTuple):
 
 
 def always(name: str, values: Any) -> bool:
-    """An argument for `omissions` which says that the format can hold every element of an attribute."""
+    """Return True: the format can hold every element of an attribute (an argument for `omissions`)."""
     return True
 
 
 def never(name: str, values: Any) -> bool:
-    """An argument for `omissions` which says that the format can hold no element of an attribute."""
+    """Return False: the format can hold no element of an attribute (an argument for `omissions`)."""
     return False
 
 
@@ -245,8 +245,8 @@ def omissions(data: MeshData, form: str, **holds: Callable[[str, Any], bool]) ->
 
     - `form`: the name of the format.
     - `holds`: functions, named after attributes of `MeshData`. Each function receives the name and the value
-      of an element of its attribute. It returns whether the format can hold this element. Missing functions
-      mean `never`.
+      of an element of its attribute, and returns whether the format can hold this element. Attributes without
+      a function use `never`.
     """
     skin = dict.fromkeys(data.skin[0]) if data.skin is not None else {}
     kinds: dict[str, tuple[str, Mapping[str, Any]]] = {
@@ -280,7 +280,7 @@ def _unit(values: np.ndarray) -> bool:
 
 
 def texture_at_corners(texture: tuple[np.ndarray, np.ndarray]) -> Float64[np.ndarray, "f 6"]:
-    """Return the texture coordinates (u0, v0, u1, v1, u2, v2) of each triangle, NaN where there are none."""
+    """Return the texture coordinates (u0, v0, u1, v1, u2, v2) of each triangle. Missing ones are NaN."""
     coordinates, corners = texture
     return np.vstack([coordinates, [[np.nan, np.nan]]])[corners].reshape(-1, 6)
 
@@ -288,7 +288,7 @@ def texture_at_corners(texture: tuple[np.ndarray, np.ndarray]) -> Float64[np.nda
 def texture_of_corners(
     corners: np.ndarray, at_corners: Float64[np.ndarray, "c 2"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return texture vertices, and the texture vertex of each corner, from the coordinates of each corner.
+    """Return texture vertices, and the texture vertex of each corner, given the coordinates of all corners.
 
     Corners of one vertex with equal coordinates share a texture vertex. The texture vertices are numbered in
     the order of their vertices. Corners at NaN have no texture vertex.

@@ -14,8 +14,8 @@ from jaxsmw.geometry.mesh import count_of, first_equal_rows
 from jaxsmw.io.formats.data import COLORS, Polygons, Skin, unique_name, unique_names
 from jaxsmw.io.formats.gltf_accessors import COLUMNS, DAMAGED, Document, as_floats
 
-# The largest numbers of vertices, of corners, of displacements of blend shapes (one per vertex and blend
-# shape), and of weights of joints (one per vertex and joint).
+# Limits for the numbers of vertices, of corners, of displacements (one per vertex and blend shape), and of
+# weights (one per vertex and joint).
 LARGEST_VERTICES, LARGEST_CORNERS, LARGEST_SHAPES, LARGEST_WEIGHTS = 10**7, 6 * 10**7, 2**24, 2**25
 RECORD = "jaxsmw"
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -23,7 +23,7 @@ _IGNORED = re.compile(r"POSITION|NORMAL|TANGENT|TEXCOORD_0|(JOINTS|WEIGHTS)_\d+"
 
 
 def parse_gltf(data: bytes, folder: Path) -> Polygons:
-    """Parse a JSON file whose buffers are data URIs, or files in a folder or below."""
+    """Parse a JSON file. Its buffers are data URIs, or files in `folder` or below."""
     return _Scene(Document(data, folder)).polygons()
 
 
@@ -38,7 +38,8 @@ def parse_glb(data: bytes) -> Polygons:
 class _Part:
     """Vertices and their data, from one primitive or from several primitives with the same attributes.
 
-    `joints` contains the numbers of nodes (n, k), and `weights` their weights (n, k).
+    `joints` (n, k) contains the joints of each vertex, as numbers of nodes. `weights` (n, k) contains the
+    weights of these joints.
     """
 
     vertices: np.ndarray

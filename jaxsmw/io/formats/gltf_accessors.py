@@ -23,7 +23,7 @@ DAMAGED = "so the file is damaged: export the mesh again."
 TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
-# Other extensions do not change positions, faces or attributes.
+# Files may require these extensions, which do not change how positions, faces and attributes are read.
 _HARMLESS = re.compile(r"KHR_mesh_quantization|(KHR|EXT)_(materials|texture|lights|animation|xmp).*")
 
 
@@ -87,28 +87,28 @@ class Document:
         return chunks[0][1]
 
     def list_of(self, parent: dict[str, Any], key: str) -> list[Any]:
-        """Return a list in an object; an empty list if it is missing."""
+        """Return the list under a key of an object, or an empty list if the key is missing."""
         value = parent.get(key, [])
         if not isinstance(value, list):
             self.refuse(key)
         return value
 
     def dict_of(self, parent: dict[str, Any], key: str) -> dict[str, Any]:
-        """Return an object in an object; an empty object if it is missing."""
+        """Return the object under a key of another object, or an empty object if the key is missing."""
         value = parent.get(key, {})
         if not isinstance(value, dict):
             self.refuse(key)
         return value
 
     def integer(self, parent: dict[str, Any], key: str, default: int | None = None) -> int:
-        """Return a non-negative integer in an object."""
+        """Return the non-negative integer under a key of an object."""
         value = parent.get(key, default)
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 2**53:
             self.refuse(key)
         return value
 
     def numbers(self, parent: dict[str, Any], key: str, count: int) -> np.ndarray | None:
-        """Return a list of finite numbers in an object, or None if it is missing."""
+        """Return the list of finite numbers under a key of an object, or None if the key is missing."""
         if key not in parent:
             return None
         values = self.list_of(parent, key)
@@ -181,7 +181,7 @@ class Document:
             ) from None
 
     def view(self, index: Any, offset: int, count: int, kind: str, columns: int) -> np.ndarray:
-        """Return `count` rows of numbers of a buffer view (count, columns), beginning at an offset."""
+        """Return `count` rows of a buffer view, from an offset on, as numbers (count, columns)."""
         description = self.item("bufferViews", index)
         if "EXT_meshopt_compression" in self.dict_of(description, "extensions"):
             raise InputError(

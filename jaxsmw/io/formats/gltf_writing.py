@@ -22,7 +22,7 @@ _LARGEST_EXACT = 2**24  # float32 represents all integers up to this number
 
 
 def format_gltf(data: MeshData) -> Written:
-    """Format a JSON file whose buffer is a data URI, so that it needs no other file."""
+    """Format a JSON file that needs no other file, because its buffer is a data URI."""
     file = _File(data)
     uri = b"data:application/octet-stream;base64," + base64.b64encode(file.buffer)
     file.json["buffers"] = [{"byteLength": len(file.buffer), "uri": uri.decode()}]
@@ -190,7 +190,7 @@ def _split(
 ) -> tuple[Int64[np.ndarray, " s"], Int64[np.ndarray, " s"], Int64[np.ndarray, "f 3"]]:
     """Split vertices along texture seams, because glTF has one texture vertex per vertex.
 
-    Return the vertex and the texture vertex (-1 for none) of each new vertex, and the faces of new vertices.
+    Return the vertex and the texture vertex (-1 for none) of each new vertex, and the faces as new vertices.
     Texture vertices without faces belong to vertex 0.
     """
     n = len(data.mesh.vertices)
@@ -208,7 +208,7 @@ def _split(
 
 
 def _semantic(name: str, values: np.ndarray) -> str:
-    """Return the name of the attribute for vertex data. Names of applications begin with an underscore."""
+    """Return the attribute's name for vertex data. Application-specific names begin with an underscore."""
     if is_color(name, values):
         return "COLOR_0"
     columns = values.shape[1] if values.ndim == 2 else 1
@@ -217,9 +217,9 @@ def _semantic(name: str, values: np.ndarray) -> str:
 
 
 def _storable(name: str, values: np.ndarray) -> np.ndarray | None:
-    """Return values in a type of glTF attributes, or None if there is none without loss.
+    """Return values in a type that glTF attributes can have, or None if no such type fits.
 
-    Floats become float32. Long integers become float32 if it represents them exactly.
+    Floats become float32. Long integers become float32 if float32 represents them exactly.
     """
     if values.ndim == 2 and values.shape[1] > 4:
         return None

@@ -71,7 +71,7 @@ def _texture(
 
 
 def _arrays(data: bytes) -> dict[str, np.ndarray]:
-    """Return all arrays of the file, after a check of their sizes."""
+    """Check the sizes of all arrays of the file, and return the arrays."""
     with zipfile.ZipFile(io.BytesIO(data)) as file:
         members = [member for member in file.infolist() if member.filename.endswith(".npy")]
         if sum(member.file_size for member in members) > largest_contents(len(data)):

@@ -13,7 +13,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.io.formats.data import COLORS, MeshData, Polygons, Written, always, is_color, omissions
 from jaxsmw.io.formats.lines import excerpt, numbers, polygon_lines, text
 
-# The statements that apply to all following faces, and the names of the labels that they become.
+# The names of labels, and the statements that become these labels. A statement applies to all faces after it.
 _LABELS = {"group": "g", "object": "o", "material": "usemtl"}
 _NO_NAME = "default"
 
@@ -62,7 +62,7 @@ def _counted_backward(
     face_at: Callable[[], list[int]],
     content: str,
 ) -> np.ndarray:
-    """Replace negative indices, where -1 is the last element that precedes the face."""
+    """Replace negative indices, which count backward: -1 is the last element before the face."""
     if not (corners < 0).any():
         return corners
     element_at = [match.start() for match in pattern.finditer(content)]
@@ -80,7 +80,7 @@ def _vertex_colors(lines: list[str]) -> dict[str, Float64[np.ndarray, "n 3"]]:
 def _texture(
     content: str, lines: Sequence[str], sizes: np.ndarray, face_at: Callable[[], list[int]]
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the texture coordinates, and the texture vertex of each corner, -1 for none."""
+    """Return the texture coordinates, and the texture vertex of each corner (-1 for none)."""
     if not re.search(r"[^/\s]/[^/\s]", "\n".join(lines)):  # no corner vertex/texture, only vertex//normal
         return None
     # A corner begins with the number of its vertex.
@@ -129,7 +129,7 @@ def _labels(
 
 
 def _decoded(name: str) -> str:
-    """Return a name, which was decoded as Latin-1, as UTF-8 text if its bytes are valid UTF-8."""
+    """Decode a name again as UTF-8 if its bytes, which were decoded as Latin-1, are valid UTF-8."""
     try:
         return name.encode("latin-1").decode("utf-8")
     except UnicodeDecodeError:

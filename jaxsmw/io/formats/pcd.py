@@ -14,14 +14,14 @@ from jaxsmw.io.formats.lines import excerpt, numbers, text
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _NORMAL_FIELDS = ("normal_x", "normal_y", "normal_z")
-# Compressed points may take this number of bytes, or four times the size of the file.
+# Compressed points may unpack to this number of bytes, or to four times the size of the file if this is more.
 _LARGEST = 2**28
-# The names of fields with padding, which contain nothing.
+# The name of padding fields, which contain no data.
 _PADDING = "_"
 
 
 class _Header(NamedTuple):
-    """The fields of each point: a record type, the number of points, and the encoding of the points."""
+    """A record type with the fields of a point, the number of points, and the encoding of the points."""
 
     record: np.dtype
     points: int
@@ -154,8 +154,9 @@ def lzf_decompressed(packed: bytes, size: int) -> bytes:
     """Decompress data in the LZF format of Marc Lehmann's LibLZF.
 
     After a control byte c below 32, c + 1 literal bytes follow. Any other control byte means a copy of
-    earlier output. Its upper three bits are the length minus 2; if they are all set, the next byte is added
-    to the length. Its lower five bits and the following byte are the distance minus 1.
+    earlier output. The upper three bits of the control byte are the length minus 2. If these bits are all
+    set, the next byte is added to the length. The lower five bits and the following byte are the distance
+    minus 1.
 
     **Raises:** `InputError` if the data is damaged, or has another size.
     """

@@ -37,7 +37,7 @@ _NAMES = {
     **{"u4": "unsigned_int", "i8": "vtktypeint64", "u8": "vtktypeuint64", "f4": "float", "f8": "double"},
 }
 _KINDS = {"VERTICES": VERTEX, "LINES": LINE, "POLYGONS": POLYGON, "TRIANGLE_STRIPS": STRIP}
-# The numbers of columns of those attributes whose first line does not declare this number.
+# Attributes whose first line does not declare the number of columns, and their numbers of columns.
 _COLUMNS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1}
 _COLUMNS["EDGE_FLAGS"] = 1
 
@@ -184,7 +184,7 @@ class _File:
         return None
 
     def take(self, rows: int, columns: int, name: str) -> np.ndarray:
-        """Return the next rows of numbers (rows, columns) of a type of VTK."""
+        """Return the next numbers as an array (rows, columns). `name` is the name of their type in VTK."""
         kind = _TYPES.get(name.lower())
         if kind is None:
             raise InputError(
@@ -226,7 +226,7 @@ class _File:
         )
 
     def skip_strings(self, count: int) -> None:
-        """Skip strings. In a text file, each string is a line. In a binary file, its length precedes it."""
+        """Skip strings. In text files, strings are lines. In binary files, the length precedes the string."""
         for _ in range(count):
             if not self.binary:
                 if self.raw_line() is None:
@@ -241,7 +241,7 @@ class _File:
                 self.truncated(count)
 
     def take_cells(self, kind: int, count: int, size: int) -> Cells:
-        """Return cells: since version 5 as offsets and corners, before that as sizes with corners."""
+        """Return cells. Since version 5, files store offsets and corners; before, sizes with corners."""
         if self.major >= 5:
             parts = []
             for keyword, length in (("OFFSETS", count), ("CONNECTIVITY", size)):

@@ -257,7 +257,7 @@ class _Stream:
         return found
 
     def take(self, size: int) -> bytes:
-        """Return the next `size` bytes. Base64 is read to the end of its group of four characters."""
+        """Return the next `size` bytes. Base64 text is read to the end of a group of four characters."""
         length = size if self.is_raw else (size + 2) // 3 * 4
         part = self.content[self.position : self.position + length]
         self.position += length

@@ -14,7 +14,7 @@ from jaxsmw.io.formats.lines import numbers, text
 from jaxsmw.io.formats.npz import check_header
 from jaxsmw.io.text import is_number
 
-# Columns 4 to 6 are normals if all their vectors have a length that differs from 1 by at most this number.
+# Columns 4 to 6 are normals if the length of every vector differs from 1 by less than this number.
 # Otherwise the columns contain something else, such as colours.
 _UNIT = 0.01
 
@@ -22,8 +22,8 @@ _UNIT = 0.01
 def parse_xyz(data: bytes) -> Polygons:
     """Parse a text file whose lines begin with x, y and z, separated by spaces, tabs, commas or semicolons.
 
-    A comma between the digits of each number is a decimal comma. A first line without any number is a header.
-    A first line with one whole number is the number of points.
+    Commas are decimal commas in a line of at least three words that are numbers without points. A first line
+    without any number is a header. A first line with one whole number is the number of points.
     """
     if b"\0" in data[:4096]:
         raise InputError("is not a text file in ASCII or UTF-8: save the points as text.")
@@ -71,7 +71,7 @@ def parse_npy(data: bytes) -> Polygons:
 
 
 def points_of_table(table: Shaped[np.ndarray, "n columns"]) -> Polygons:
-    """Return points without faces from their coordinates, with normals if columns 4 to 6 are unit vectors."""
+    """Return points without faces from a table. Columns 4 to 6 become normals if they are unit vectors."""
     with np.errstate(over="ignore"):  # `triangulate_points` reports coordinates that are not finite
         table = table.astype(np.float64)
     found = {NORMALS: table[:, 3:6]} if table.shape[1] >= 6 and _are_unit(table[:, 3:6]) else {}
