@@ -126,7 +126,8 @@ def prepare(
       are computed.
     - `init`: the initial map; see `match`. The argument is `"shot"`, `"wks"`, `"hks"`, `"wavelet"`,
       `"functional"`, `"aligned"`, a pointwise map (m,) of 0-based vertices of Y, a `SurfacePoints` with m
-      points on Y, or an array (l, 2) of landmarks. Each row of landmarks contains a vertex of X and its match on Y.
+      points on Y, or an array (l, 2) of landmarks. Each row of landmarks contains a vertex of X and its
+      match on Y.
     - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. If False, the

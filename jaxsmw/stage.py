@@ -163,8 +163,8 @@ class Stage:
         """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
 
         If the stage uses fewer eigenvectors than a partial pair has, the spectra are then cut at a common
-        limit, the smaller of the two spectra's largest eigenvalues: eigenpairs with eigenvalues above this limit are removed
-        (`jaxsmw.pair.common_range`).
+        limit, the smaller of the two spectra's largest eigenvalues: eigenpairs with eigenvalues above this
+        limit are removed (`jaxsmw.pair.common_range`).
 
         **Arguments:**
 

@@ -2,6 +2,7 @@
 
 import gc
 import os
+import pickle
 import shutil
 import sys
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from typing import Any
 import hypothesis
 import jax
 import jaxtyping
+import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
@@ -113,16 +115,21 @@ def one_thread_each() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session")
+def common_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A temporary directory that all parallel processes of one run of the tests share."""
+    base = tmp_path_factory.getbasetemp()
+    return base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+
 @pytest.fixture(autouse=True, scope="session")
-def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def compile_once(common_directory: Path) -> Iterator[None]:
     """Share one cache of compiled programs among all commands that the tests start.
 
     The commands compile as fast as the tests do.
     """
-    base = tmp_path_factory.getbasetemp()
-    programs = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "programs"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(programs))
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(common_directory / "programs"))
         patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
         patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
         patch.setenv("JAX_INCLUDE_FULL_TRACEBACKS_IN_LOCATIONS", "false")
@@ -130,10 +137,36 @@ def compile_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def private_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep tests from reading or filling the user's cache."""
+def triangulate_creatures_once(common_directory: Path) -> Iterator[None]:
+    """Share the triangulations of creatures among all test processes, because each takes a second or more."""
+    # The type checks apply only to modules that are imported after this file.
+    from jaxsmw.geometry import creature
+    from jaxsmw.runtime.cache import Store
+
+    directory = common_directory / "creatures"
+    directory.mkdir(exist_ok=True)
+    store, triangulated = Store(directory), creature._triangulated
+
+    def stored(
+        body: creature._Body, count: int, random: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        inputs = pickle.dumps(body).hex(), count, str(random.bit_generator.state)
+        arrays = store.load("creature", inputs)
+        if arrays is None:
+            arrays = dict(zip(("vertices", "faces"), triangulated(body, count, random), strict=True))
+            store.save("creature", inputs, arrays)
+        return arrays["vertices"], arrays["faces"]
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAXSMW_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr(creature, "_triangulated", stored)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def private_cache(common_directory: Path) -> Iterator[None]:
+    """Keep tests from reading or filling the user's cache, and share one cache among all test processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAXSMW_CACHE", str(common_directory / "cache"))
         yield
 
 

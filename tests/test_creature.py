@@ -6,6 +6,7 @@ import pytest
 from scipy.sparse.linalg import eigsh
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry import creature as creature_module
 from jaxsmw.geometry.creature import (
     _KINDS,
     _MIRROR,
@@ -20,6 +21,14 @@ from jaxsmw.geometry.creature import (
 
 # The dragon takes the longest time to generate, so its tests are marked slow.
 KINDS = [pytest.param(kind, marks=pytest.mark.slow) if kind == "dragon" else kind for kind in CREATURES]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def triangulate_anew():
+    """Undo `triangulate_creatures_once`, which would hide differences between two triangulations."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(creature_module, "_triangulated", _triangulated)
+        yield
 
 
 @pytest.fixture(scope="module", params=KINDS)
