@@ -75,9 +75,10 @@ _MODULES = (
     "jaxsmw.collection",
     "jaxsmw.evaluation",
 )
-# The documented path of each public name.
+# Maps each public name to its documented path.
 _PUBLIC: dict[str, str] = {}
-# The documented path of each public object, by its other paths.
+# Maps all other paths of public objects to the documented paths. An object has other paths if several public
+# modules export the object, or if a different module defines the object.
 _ORIGINS: dict[str, str] = {}
 for _module in map(import_module, _MODULES):
     for _name in _module.__all__:
@@ -148,13 +149,17 @@ def name_tables(app: Sphinx, document: str, content: list[str]) -> None:
 def resolve_origin(
     app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, content: nodes.Element
 ) -> nodes.Node | None:
-    """Resolves a name by the module that defines it, or by another public path, to its documented path."""
+    """Links a name to the entry of its documented path.
+
+    The name may begin with the module that defines the object, or with another module that exports it.
+    """
     if node.get("refdomain") != "py":
         return None
     target = node["reftarget"]
     public = _ORIGINS.get(target)
     if public is None:
-        # A module or a private helper that a page mentions exists, but has no entry in the reference.
+        # Modules and private helpers have no entry in the reference. If they exist, pages may mention them
+        # without a link.
         named = node.get("reftype") == "obj" and target.startswith("jaxsmw.")
         return content if named and _exists(target.removeprefix("jaxsmw.")) else None
     domain = env.domains.python_domain

@@ -16,8 +16,8 @@ class InputError(ValueError):
 def check_choice(value: object, choices: Any, kind: str) -> None:
     """Raise an error if a value is not one of the choices.
 
-    `choices` is a `Literal` type. `kind` describes a valid value in the message, with an article, such as "an
-    eigensolver".
+    `choices` is a `Literal` type. The message says that the value is not `kind`, so `kind` is a noun with its
+    article, such as "an eigensolver".
 
     **Raises:** `InputError` if the value is not one of the choices; the message lists them.
     """

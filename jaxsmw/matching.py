@@ -428,7 +428,8 @@ def match(
         - `"no"`: match X itself.
         - `"yes"`: match the mirror image of X.
 
-    - `history`: whether to record a `History` of the last stage, as `refinement.history` of the result.
+    - `history`: whether to record a `History` of the last stage. The result contains the record in its
+      attribute `refinement.history`.
 
     **Returns:** A `Correspondence`, whose attribute `pointwise_map` (m,) is an int64 array of 0-based
     vertices of Y. A `Correspondence` also has the attributes `functional_map`, `spectrum_x`, `spectrum_y`,

@@ -35,8 +35,8 @@ def check_outputs(
     - `files`: the files that the command writes, except figures and pages.
     - `figures`: the pictures that the command writes (PNG, PDF or SVG).
     - `pages`: the interactive HTML pages that the command writes.
-    - `directories`: a list of pairs. Each pair contains a directory that the command creates, and the names
-      of the files in this directory. A directory may occur several times.
+    - `directories`: a list of pairs (directory, names). The command creates the directory, and writes files
+      with these names into the directory. A directory may occur in several pairs.
 
     **Raises:** `InputError` that names the first path that cannot be written.
     """

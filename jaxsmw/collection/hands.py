@@ -14,10 +14,11 @@ from jaxsmw.repair.chirality import Decision
 def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.ndarray, " N"]:
     """Divide the shapes of a collection into two hands that agree best with the evidence of all edges.
 
-    The evidence of an edge is positive if the two shapes seem to be of opposite hands. The leading
-    eigenvector of the matrix of the negative evidences gives the hands (synchronisation over the group of two
-    elements; Singer, "Angular synchronization by eigenvectors and semidefinite programming", 2011). Then
-    single shapes change their hand as long as the agreement with the evidence grows.
+    The evidence of an edge is positive if the two shapes seem to be of opposite hands. A symmetric matrix
+    contains the evidence of all edges with the opposite sign. The signs of the leading eigenvector of this
+    matrix give the first hands (synchronisation over the group of two elements; Singer, "Angular
+    synchronization by eigenvectors and semidefinite programming", 2011). The function then reverses the hands
+    of single shapes, one after another, as long as each reversal improves the agreement with the evidence.
 
     **Arguments:**
 

@@ -400,7 +400,8 @@ class _Matcher:
             decisions = self._compare_hands() if mirror else {}
             mirrored = choose_hands(len(self.shapes), decisions)
             asymmetric = any(decision.asymmetric for decision in decisions.values())
-            # Without repair, expected errors do not tell which of two maps is better.
+            # Asymmetric shapes are matched from two initial maps, and expected errors decide between the two
+            # results. Without repair, expected errors do not lead to the correct choice.
             self.aligned = asymmetric and self.preset.repair is not None
             if mirrored.any():
                 self._mirror(mirrored)

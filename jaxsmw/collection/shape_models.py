@@ -444,7 +444,7 @@ def _rotations_and_scales(
     count = len(squared_sizes)
     flat = products.reshape(3 * count, 3 * count)
     size = np.sqrt(squared_sizes).mean()
-    # The mean is sum_i P_i (X_i - centroid_i), and the 3 x 3 matrices P_i are the columns of `combination`.
+    # The mean shape is sum_i P_i (X_i - centroid_i). `combination` holds the 3 x 3 matrices P_i side by side.
     combination = np.zeros((3, 3 * count))
     combination[:, 3 * reference : 3 * reference + 3] = np.eye(3)
     with one_blas_thread():

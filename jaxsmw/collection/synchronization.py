@@ -172,9 +172,10 @@ class Network:
         return carry(points, self.meshes[source], self._images[source, target], limit)
 
     def averaged(self, points: Sequence[SurfacePoints], template: int) -> list[SurfacePoints]:
-        """Move the points on each shape to the robust mean of the points carried from its neighbours.
+        """Move each point on a shape to the robust mean of the corresponding points of the neighbours.
 
-        The points on the template stay.
+        The points of the neighbours are first carried to the shape along the edges of the graph. The points
+        on the template do not move.
         """
 
         def moved(shape: int) -> SurfacePoints:

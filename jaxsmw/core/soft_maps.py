@@ -184,9 +184,9 @@ class Recovery(eqx.Module):
     """A method that computes a soft map from the distances between two point sets.
 
     This class is the abstract base class of recoveries. Pass a recovery to the argument `recovery` of
-    `refine_softly` or `WaveletPreservationLayer`. In `refine_softly`, the points belong to the spectral
-    embedding: the m vertices of X are the queries, and the n vertices of Y are the database rows. Ready
-    subclasses are `Softmax`, `NearestFew` and `Sinkhorn`.
+    `refine_softly` or `WaveletPreservationLayer`. `refine_softly` passes the spectral embeddings of X and Y
+    to the recovery. The m points of X are then the queries, and the n points of Y are the database rows.
+    Ready subclasses are `Softmax`, `NearestFew` and `Sinkhorn`.
 
     A subclass is an equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
     The arguments are query points (m, d), database points (n, d), query areas (m,) and database areas (n,).
@@ -216,8 +216,8 @@ class Softmax(Recovery):
     """A recovery that gives shares to all database rows, and larger shares to nearer rows.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    In `refine_softly`, the points belong to the spectral embedding: the m vertices of X are the queries, and
-    the n vertices of Y are the database rows.
+    `refine_softly` passes the spectral embeddings of X and Y to the recovery. The m points of X are then the
+    queries, and the n points of Y are the database rows.
 
     The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
     `distance` is the distance between the query and the row. The result is a `SoftMap`, whose `pull_back`
@@ -256,8 +256,8 @@ class NearestFew(Recovery):
     """A recovery that gives shares only to the nearest database rows of each query.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    In `refine_softly`, the points belong to the spectral embedding: the m vertices of X are the queries, and
-    the n vertices of Y are the database rows.
+    `refine_softly` passes the spectral embeddings of X and Y to the recovery. The m points of X are then the
+    queries, and the n points of Y are the database rows.
 
     The share of each of the nearest rows is proportional to its area times `exp(-distance² / temperature)`,
     where `distance` is the distance between the query and the row. The shares are differentiable, but
@@ -315,8 +315,8 @@ class Sinkhorn(Recovery):
     """A recovery by entropy-regularised optimal transport, which preserves the areas of database rows.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    In `refine_softly`, the points belong to the spectral embedding: the m vertices of X are the queries, and
-    the n vertices of Y are the database rows.
+    `refine_softly` passes the spectral embeddings of X and Y to the recovery. The m points of X are then the
+    queries, and the n points of Y are the database rows.
 
     The function `sinkhorn` computes the shares. The area that all queries together send to a database row
     equals the area of the row, up to the tolerance. The result is a `SoftMap`, whose `pull_back` transfers

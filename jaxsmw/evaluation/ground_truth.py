@@ -90,8 +90,9 @@ def read_ground_truth(
 
     - Two `.vts` files: the first file belongs to the source, and the second file belongs to the target. Each
       line contains one vertex, counted from 1. The vertices in line i of the two files correspond to each
-      other. Two files with other suffixes are read like `.vts` files, but their vertices are counted from 0
-      (from 1 in `.mat` files).
+      other.
+    - Two files with other suffixes: the lines have the same meaning as in `.vts` files. Vertices are counted
+      from 1 in `.mat` files, and from 0 in all other files.
     - One `.baryc_gt` or `.baryc_gt_sym` file: line i contains the true point of the i-th vertex of the
       source, as a face of the target and three barycentric weights. Faces are counted from 1.
     - One file with two columns: each line contains a vertex of the source and its target vertex, both counted

@@ -98,7 +98,8 @@ class _Sides(NamedTuple):
     # The position of the apex as a complex number, after the side was mapped to the segment from 0 to 1. The
     # apex is never below the real axis.
     shape: Complex128[np.ndarray, " s"]
-    # Lines that leave a triangle by side i enter other triangles by sides across[first[i]:first[i + 1]].
+    # A line that leaves a triangle by side i continues in each other triangle at the same edge. The line
+    # enters these triangles by the sides across[first[i]:first[i + 1]].
     first: Int64[np.ndarray, " s1"]
     across: Int64[np.ndarray, " c"]
 
@@ -177,9 +178,9 @@ def _unfold(
     - `position`: the complex coordinate of the point, in the frame in which `side` leads from 0 to 1 (b,).
     - `depth`: the number of sides to cross.
 
-    **Returns:** An iterator with `depth` pairs. Pair i contains the beams that have crossed i + 1 sides. For
-    each of these beams, pair i also contains the position of the third corner of the triangle that the beam
-    has entered.
+    **Returns:** An iterator with `depth` pairs (beams, corners). The beams of pair i have crossed i + 1
+    sides. Each beam has entered a triangle by the last of these sides. The beam's entry in `corners` is the
+    position of the corner opposite this side.
     """
     right, left = -position * sides.length[side], (1 - position) * sides.length[side]
     beams = _Beams(origin, side, right, left, right, left)

@@ -25,7 +25,11 @@ _FCSV_COLUMNS += ["associatedNodeID"]
 
 
 class _Columns(NamedTuple):
-    """The 0-based columns of x, y, z and the name (None if there are no names), and the number of columns."""
+    """The columns of a table of landmarks.
+
+    `positions` contains the 0-based columns of x, y and z. `name` is the 0-based column of the names, or None
+    if the table has no names. `total` is the number of columns.
+    """
 
     positions: list[int]
     name: int | None

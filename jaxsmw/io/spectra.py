@@ -112,7 +112,7 @@ def make_spectrum(
 
 
 def _parts(shape: SpectrumLike, name: str) -> tuple[Any, Any, Any]:
-    """Return the eigenvalues, eigenvectors and vertex areas of a shape of another library."""
+    """Return the eigenvalues, eigenvectors and vertex areas from a shape object of another library."""
     if hasattr(shape, "eigenvectors") and hasattr(shape, "vertex_areas"):
         if shape.eigenvectors is None:
             raise InputError(f"{name}: the shape has no eigenvectors yet: call its method process first.")

@@ -120,7 +120,7 @@ class Hands:
         better than the other by chance. The method stops as soon as the evidence is clearly too small to
         support the mirror image.
 
-        **Returns:** The evidence for the mirror image, without unit.
+        **Returns:** The evidence, a number without unit. Positive evidence supports the mirror image.
 
         **Raises:** `InputError` if the samples are too sparse for SHOT.
         """

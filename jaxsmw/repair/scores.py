@@ -168,11 +168,13 @@ def area_shape_difference(
     spectrum_y: Spectrum,
     settings: ScoreSettings = _DEFAULT,
 ) -> float:
-    """Measure how much a map changes areas, as the norm of the area-based shape difference minus identity.
+    """Measure how much a map changes areas.
 
-    The area-based shape difference (Rustamov et al. 2013) is an operator on functions on Y. It compares inner
-    products of functions on Y with inner products of the functions that the map pulls back to X. On the first
-    eigenfunctions of Y, it is a symmetric matrix, which is the identity if the map preserves areas.
+    The measure is the norm of the area-based shape difference minus the identity. The area-based shape
+    difference (Rustamov et al. 2013) is an operator on functions on Y. For two functions f and g on Y, the
+    operator compares two inner products: the product of f and g on Y, and the product of their pull-backs
+    f ∘ T and g ∘ T on X. In the basis of the first eigenfunctions of Y, the operator is a symmetric matrix.
+    This matrix is the identity if the map preserves areas.
 
     **Arguments:**
 

@@ -56,9 +56,10 @@ def transfer_attributes(
       the nearest face votes with its barycentric weight. The value of a face is decided by a vote of its four
       points. A row of several integers is one label. Labels are not smoothed, so a region that is thinner
       than a face of Y may break up into single faces.
-    - Texture coordinates: the corners of each face of Y receive coordinates from one side of X's seams. This
-      is the side on which the face's centroid lies. Along seams, vertices of Y have several texture vertices.
-      If the nearest face of X has no texture, the face of Y has no texture either.
+    - Texture coordinates jump at the seams of X. All corners of a face of Y therefore receive coordinates
+      from the same side of a seam: the side on which the face's centroid lies. Along seams, vertices of Y
+      have several texture vertices. If the nearest face of X has no texture, the face of Y has no texture
+      either.
     - Skin weights are interpolated. A vertex of Y has at most as many joints as the vertices of X; the
       smallest weights are left out. Each row sums to 1, unless all weights of the nearest face are 0.
     - Blend shapes are rotated and scaled with the neighbourhoods (`RegisteredMesh.similarities`), and then

@@ -149,10 +149,10 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def _eigenvector_embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """Return the first k_x coordinates of the `embeddings`, which do not depend on descriptors.
+        """Return the coordinates of the `embeddings` that depend only on eigenvectors: the first k_x.
 
-        The search in patches uses only these coordinates, because the vertices of a patch are close together
-        in them.
+        In these coordinates, the vertices of a patch are close together. The search in patches therefore uses
+        only these coordinates.
         """
         k = prepared.spectrum_x.eigenvalues.shape[0]
         queries, database = self.embeddings(prepared, state)
