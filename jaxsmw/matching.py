@@ -315,6 +315,7 @@ class Correspondence:
             self.pointwise_map,
             self.reverse_map(),
             self.spectrum_x,
+            self.spectrum_y,
         )
         return extend_to_unreferenced(self.mesh_x, expected)
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import igl
 import jax
 import numpy as np
@@ -19,7 +21,7 @@ from jaxsmw.repair.scores import (
     orientation_reversal,
     same_map,
 )
-from jaxsmw.repair.settings import ScoreSettings
+from jaxsmw.repair.settings import ExpectedErrorSettings, ScoreSettings
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +162,7 @@ def test_swapped_arms_are_discontinuous_on_dense_meshes(mesh, monkeypatch):
 
 def test_the_expected_error_of_a_perfect_map_is_zero(mesh, spectrum):
     identity = np.arange(len(mesh.vertices))
-    assert expected_error(Pair(mesh, mesh), identity, identity, spectrum).max() == 0
+    assert expected_error(Pair(mesh, mesh), identity, identity, spectrum, spectrum).max() == 0
 
 
 def test_expected_errors_are_large_where_the_map_is_wrong(mesh, spectrum):
@@ -169,7 +171,7 @@ def test_expected_errors_are_large_where_the_map_is_wrong(mesh, spectrum):
     arms = np.abs(mesh.vertices[:, 0]) > 1
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
     swapped = np.where(arms, mirrored, identity)
-    expected = expected_error(Pair(mesh, mesh), swapped, swapped, spectrum)
+    expected = expected_error(Pair(mesh, mesh), swapped, swapped, spectrum, spectrum)
     size = (mesh.vertex_areas[arms].sum() / 2 / mesh.area) ** 0.5
     assert 0.4 * size < expected[arms].min() and np.median(expected[~arms]) < 0.2 * size
 
@@ -178,11 +180,27 @@ def test_expected_errors_are_large_where_the_map_is_wrong(mesh, spectrum):
     moved = mesh.vertices + distance * np.random.default_rng(0).normal(size=mesh.vertices.shape)
     _, scattered = KDTree(mesh.vertices).query(moved)
     found = np.where(top, scattered, identity)
-    expected = expected_error(Pair(mesh, mesh), found, identity, spectrum)
+    expected = expected_error(Pair(mesh, mesh), found, identity, spectrum, spectrum)
     truly = np.linalg.norm(mesh.vertices[found] - mesh.vertices, axis=1) / mesh.area**0.5
     worst = expected >= np.quantile(expected, 0.8)
     assert truly[worst].sum() > 0.8 * truly.sum()
     assert 0.3 < expected[top].mean() / truly[top].mean() < 3
+
+
+def test_expected_errors_are_larger_if_the_map_changes_areas(mesh, spectrum):
+    """The factor applies to full shapes only."""
+    identity = np.arange(len(mesh.vertices))
+    swollen = make_mesh(mesh.vertices * np.where(mesh.vertices[:, 2:] > 0, [1.5, 1.5, 1], 1), mesh.faces)
+    spectra = spectrum, compute_spectrum(swollen, 40)
+    settings = ExpectedErrorSettings()
+    for partial in (False, True):
+        arguments = Pair(mesh, swollen, partial), identity, identity, *spectra
+        expected = expected_error(*arguments)
+        without = expected_error(*arguments, replace(settings, area_weight=0.0))
+        difference = area_shape_difference(Pair(mesh, swollen), identity, *spectra)
+        factor = 1 if partial else 1 + settings.area_weight * (difference - settings.isometric_difference)
+        assert partial or factor > 1.3
+        np.testing.assert_allclose(expected, factor * without, rtol=1e-12)
 
 
 def test_the_distance_of_a_mesh_from_the_origin_does_not_matter():
@@ -224,7 +242,8 @@ def test_lengths_on_a_partial_shape_use_the_unit_of_the_full_shape(mesh):
     assert dirichlet_energy_ratio(Pair(part, mesh), old, spectrum) < 0.95
     assert not orientation_reversal(Pair(part, mesh, True), old, spectrum).any()
     back = KDTree(part.vertices).query(mesh.vertices)[1]
-    assert expected_error(Pair(part, mesh, True), old, back, spectrum).max() == pytest.approx(0, abs=1e-12)
+    expected = expected_error(Pair(part, mesh, True), old, back, spectrum, compute_spectrum(mesh, 40))
+    assert expected.max() == pytest.approx(0, abs=1e-12)
 
 
 def test_errors_on_a_partial_shape_are_in_its_own_unit(mesh, spectrum):
@@ -233,11 +252,12 @@ def test_errors_on_a_partial_shape_are_in_its_own_unit(mesh, spectrum):
     old, faces = np.unique(mesh.faces[kept[mesh.faces].all(axis=1)], return_inverse=True)
     part = make_mesh(mesh.vertices[old], faces.reshape(-1, 3))
     found = KDTree(part.vertices).query(mesh.vertices)[1]
-    expected = expected_error(Pair(mesh, part, True), found, old, spectrum)
+    spectra = spectrum, compute_spectrum(part, 40).scale(part.area / mesh.area)
+    expected = expected_error(Pair(mesh, part, True), found, old, *spectra)
     gone = mesh.vertices[:, 0] > 1.3
     placed = np.linalg.norm(mesh.vertices - part.vertices[found], axis=1)[gone] / part.area**0.5
     assert 0.5 < expected[gone].mean() / placed.mean() < 4
     halved = make_mesh(part.vertices, part.faces[: len(part.faces) // 2])
     assert halved.area < 0.8 * part.area
-    smaller = expected_error(Pair(mesh, halved, True), found, old, spectrum)
+    smaller = expected_error(Pair(mesh, halved, True), found, old, *spectra)
     np.testing.assert_allclose(smaller.max() / expected.max(), (part.area / halved.area) ** 0.5, rtol=0.2)

@@ -8,7 +8,12 @@ from jaxtyping import Float, Int64
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import connected_components
 from jaxsmw.pair import Pair
-from jaxsmw.repair.scores import discontinuous_parts, edge_lengths, orientation_reversal
+from jaxsmw.repair.scores import (
+    area_shape_difference,
+    discontinuous_parts,
+    edge_lengths,
+    orientation_reversal,
+)
 from jaxsmw.repair.settings import ExpectedErrorSettings
 
 
@@ -17,6 +22,7 @@ def expected_error(
     pointwise_map: Int64[np.ndarray, " m"],
     reverse_map: Int64[np.ndarray, " n"],
     spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
     settings: ExpectedErrorSettings = ExpectedErrorSettings(),  # noqa: B008 (immutable)
 ) -> Float[np.ndarray, " m"]:
     """Estimate the geodesic error of every match without ground truth.
@@ -24,6 +30,9 @@ def expected_error(
     The estimate is a weighted sum of two quantities, averaged over the neighbourhood of each vertex of X. The
     first quantity is the detour: the distance between a vertex and the vertex to which the reverse map takes
     its match. The second quantity is the mean change in length of a vertex's edges under the map.
+
+    Maps between non-isometric shapes can be smooth and wrong everywhere. For two full shapes, the weighted
+    sum is therefore multiplied by a factor that grows with the `area_shape_difference` of the map.
 
     Where limbs look swapped (`discontinuous_parts`, `orientation_reversal`), the expected error also grows
     with the size of the limb. `docs/accuracy.md` reports how well the expected errors rank the vertices by
@@ -35,7 +44,7 @@ def expected_error(
     - `pair`: the source X (m vertices) and the target Y (n vertices).
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
     - `reverse_map`: a map Y -> X (n,), 0-based vertices of X.
-    - `spectrum_x`: the spectrum of X, in `Pair.units_of_length` and without padding.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, in `Pair.units_of_length` and without padding.
     - `settings`: the weights of the estimate.
 
     **Returns:** The expected geodesic distance between every match and the true match (m,), divided by the
@@ -60,5 +69,9 @@ def expected_error(
     inside = misplaced[mesh_x.edges].all(axis=1)
     number, component = connected_components(mesh_x.edges[inside], m)
     sizes = np.sqrt(np.bincount(component, areas, number))[component]
-    expected = np.maximum(eigenvectors @ heat, 0) + settings.misplaced_weight * misplaced * sizes
+    expected = np.maximum(eigenvectors @ heat, 0)
+    if not pair.partial:
+        difference = area_shape_difference(pair, pointwise_map, spectrum_x, spectrum_y)
+        expected *= 1 + settings.area_weight * max(difference - settings.isometric_difference, 0)
+    expected += settings.misplaced_weight * misplaced * sizes
     return expected * unit_y / pair.mesh_y.area**0.5

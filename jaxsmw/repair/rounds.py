@@ -78,21 +78,19 @@ def refine_in_stages(
     best = judge.judged(refined or runner.run(0, Outcome([], first)))
     if repair is None or not best.successful:
         return best
-    if not best.suspicious:
-        return _Repairer(runner, judge, repair).refined_further(best)
-    logger.info(
-        "limbs may be swapped (distortion %.3f; correct maps have at most %.2f)",
-        best.distortion,
-        repair.suspicious,
-    )
-    if alternatives is None:
-        alternatives = ()
-        if isinstance(prepared.init, str) and prepared.init == "shot":
+    repairer = _Repairer(runner, judge, repair)
+    if best.suspicious:
+        logger.info(
+            "limbs may be swapped (distortion %.3f; correct maps have at most %.2f)",
+            best.distortion,
+            repair.suspicious,
+        )
+        if alternatives is None and isinstance(prepared.init, str) and prepared.init == "shot":
             proxies = Alternatives(prepared, repair)
             judge = replace(judge, measure_deformation=proxies.deformation)
+            repairer = replace(repairer, judge=judge)
             alternatives = proxies.best(prepared.unpadded_map(best.pointwise_map))
-    repairer = _Repairer(runner, judge, repair)
-    best = repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives))
+        best = repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives or ()))
     return repairer.refined_further(best)
 
 
@@ -162,9 +160,10 @@ class _Repairer:
             return outcome
         further = outcome
         for _ in range(self.settings.passes):
-            further = self._from_repeated(further)
+            further = self._repeated(further)
             if not further.successful:
                 return outcome
+        further = self.judge.judged(further)
         # A map that looked right before stays near that map, so it does not become suspicious.
         return further._replace(suspicious=outcome.suspicious and not self.judge.looks_right(further))
 
@@ -206,7 +205,13 @@ class _Repairer:
     def _from_repeated(
         self, outcome: Outcome, stage: Stage | None = None, weights: Float[Array, " m"] | None = None
     ) -> Outcome:
-        """Run the repeated stage and all later stages from the map of an outcome, and judge the result.
+        """Run the repeated stage and all later stages from the map of an outcome, and judge the result."""
+        return self.judge.judged(self._repeated(outcome, stage, weights))
+
+    def _repeated(
+        self, outcome: Outcome, stage: Stage | None = None, weights: Float[Array, " m"] | None = None
+    ) -> Outcome:
+        """Run the repeated stage and all later stages from the map of an outcome.
 
         **Arguments:**
 
@@ -222,4 +227,4 @@ class _Repairer:
         repeated = self.runner.run_one((spectrum_x, spectrum_y), stage or usual, before)
         finished = self.runner.run(position + 1, repeated)
         kept = outcome.refinements[:position] if len(outcome.refinements) == len(self.runner.steps) else []
-        return self.judge.judged(Outcome([*kept, *finished.refinements], outcome.initial_map))
+        return Outcome([*kept, *finished.refinements], outcome.initial_map)

@@ -58,12 +58,16 @@ class ExpectedErrorSettings:
       square root of the limb's area.
     - `heat_time`: the time of the heat flow that averages over neighbouring vertices. The default value
       averages over a disk of radius 0.06.
+    - `area_weight`, `isometric_difference` (Table R30): the expected error of two full shapes is multiplied
+      by 1 + `area_weight` times the excess of the area-based shape difference over `isometric_difference`.
     """
 
     detour_weight: float = 0.5
     distortion_weight: float = 2.0
     misplaced_weight: float = 0.5
     heat_time: float = 1e-3
+    area_weight: float = 5.0
+    isometric_difference: float = 0.08
 
 
 @dataclass(frozen=True)
