@@ -103,7 +103,9 @@ def test_layouts_are_recognised_and_their_ground_truth_is_read(tmp_path, layout)
     data_set = open_data_set(tmp_path / "set")
     assert (data_set.layout, data_set.name) == (layout, "set")
     assert names(data_set)[: len(first)] == first
-    assert set(data_set.shapes) == {name for pair in names(data_set) for name in pair}
+    known = (*data_set.pairs, *data_set.others)
+    assert set(data_set.shapes) == {name for pair in known for name in pair.names}
+    assert all(len(set(pair.names)) == 2 for pair in data_set.others)
     for pair in data_set.pairs:
         assert all(file.is_file() for file in (*pair.meshes, *pair.truth))
         meshes = [read_mesh(file) for file in (pair.source_file, pair.target_file)]
@@ -131,9 +133,10 @@ def test_lists_of_pairs_replace_the_pairs_of_the_layout(tmp_path):
     put(tmp_path / "test_pairs.txt", "dog0\tcat1\n\ncat2 dog0\r\n")
     data_set = open_data_set(tmp_path)
     assert names(data_set) == [("dog0", "cat1"), ("cat2", "dog0")]
-    # The unlisted pairs within a class also have ground truth.
+    # The unlisted pairs within a class also have ground truth, and other unlisted pairs in some sets.
     others = {pair.names for pair in data_set.others}
-    assert len(others) == 6 and ("cat10", "cat2") in others and len(data_set.shapes) == 4
+    assert len(others) == 10 and {("cat10", "cat2"), ("dog0", "cat2")} < others
+    assert ("dog0", "cat1") not in others and len(data_set.shapes) == 4
     shrec19(tmp_path / "other")
     put(tmp_path / "other" / "PAIRS_list_SHREC19_connectivity.txt", "2,10\n")
     assert names(open_data_set(tmp_path / "other")) == [("2", "10")]

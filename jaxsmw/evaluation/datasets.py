@@ -112,7 +112,8 @@ class DataSet:
       `"SHREC'16 partial"`, `"SHREC'16 topology"`, `"FAUST registrations"`, `"SCAPE"` or `"TOSCA"`.
     - `pairs`: the pairs to match, as a tuple of `DataPair`. If the data set contains a list of pairs, the
       tuple contains the listed pairs in the order of the list.
-    - `others`: a tuple of `DataPair`, with all pairs that have ground truth but are not in `pairs`.
+    - `others`: a tuple of `DataPair`, with all pairs that have ground truth but are not in `pairs`. In a
+      remeshed set, also the pairs of different classes, which have ground truth in some sets.
     """
 
     directory: Path
@@ -395,7 +396,10 @@ def _remeshed(directory: Path) -> _Pairs | None:
             mirrored = (files[f"{x}.sym"], plain[y])
         return DataPair(x, y, shapes[x], shapes[y], (plain[x], plain[y]), mirrored)
 
-    return _listed_first(pair, _listed_pairs(directory, shapes), _within_classes(shapes))
+    pairs, others = _listed_first(pair, _listed_pairs(directory, shapes), _within_classes(shapes))
+    # In some sets, such as SMAL, the rows of all shapes correspond. The files do not show in which sets.
+    present = {one.names for one in (*pairs, *others)}
+    return pairs, others + [pair(*names) for names in permutations(shapes, 2) if names not in present]
 
 
 def _shrec19(directory: Path) -> _Pairs | None:
