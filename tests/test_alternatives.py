@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -135,3 +136,13 @@ def test_known_maps_are_refined_as_well(pair):
     alone = Alternatives(prepared(mesh_x, mesh_y), REPAIR)
     alone._initial_maps = lambda: iter(())
     assert mean_error(mesh_y, next(alone.best(truth)), truth) < 0.05
+
+
+def test_further_alternatives_differ_from_all_maps_before_them(unchecked):
+    """The maps 0, 1 and 2 are variants of one map, and so are 3 and 4. Map 5 differs from 0 by too little."""
+    places = np.array([0.0, 0.05, 0.11, 0.5, 0.53, 0.02])
+    judge = SimpleNamespace(difference=lambda one, other: abs(places[one] - places[other]))
+    for areas, expected in (((0.03, 0.03, 0.2), [0, 1, 2, 3]), ((0.03, 0.2), [0, 1, 3]), ((0.4,), [0, 3])):
+        settings = replace(REPAIR, alternatives=replace(REPAIR.alternatives, different_areas=areas))
+        alternatives = SimpleNamespace(settings=settings, judge=judge)
+        assert list(Alternatives._distinct(alternatives, range(6))) == expected

@@ -18,8 +18,8 @@ from jaxsmw.repair.scores import (
     dirichlet_energy_ratio,
     discontinuous_parts,
     distortion,
+    map_difference,
     orientation_reversal,
-    same_map,
 )
 from jaxsmw.repair.settings import ExpectedErrorSettings, ScoreSettings
 
@@ -215,21 +215,22 @@ def test_the_distance_of_a_mesh_from_the_origin_does_not_matter():
         assert dirichlet_energy_ratio(Pair(x, y), identity, spectrum) == pytest.approx(1, abs=1e-4)
 
 
-def test_same_map_ignores_a_few_different_matches(mesh):
+def test_the_difference_of_two_maps_is_a_share_of_the_area(mesh):
     identity = np.arange(len(mesh.vertices))
     _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
-    assert same_map(Pair(mesh, mesh), identity, identity) and not same_map(
-        Pair(mesh, mesh), identity, mirrored
-    )
-    few = np.arange(len(mesh.vertices)) < 5
-    assert same_map(Pair(mesh, mesh), identity, np.where(few, mirrored, identity))
+    assert map_difference(Pair(mesh, mesh), identity, identity) == 0
+    few = np.arange(len(mesh.vertices)) < 50
+    far = np.linalg.norm(mesh.vertices[mirrored] - mesh.vertices, axis=1) > 0.1 * mesh.area**0.5
+    some = np.where(few, mirrored, identity)
+    expected = mesh.vertex_areas[few & far].sum() / mesh.area
+    assert 0 < expected < 0.1
+    assert map_difference(Pair(mesh, mesh), identity, some) == pytest.approx(expected)
     # Distances on the small piece of a partial pair are small, because their unit comes from the full shape.
     piece, shift = make_mesh(mesh.vertices / 10, mesh.faces), np.argsort(mesh.vertices[:, 0])
     moved = np.empty_like(identity)
     moved[shift] = np.roll(shift, 40)
-    assert not same_map(Pair(mesh, piece), identity, moved) and same_map(
-        Pair(mesh, piece, True), identity, moved
-    )
+    assert map_difference(Pair(mesh, piece), identity, moved) > 0.03
+    assert map_difference(Pair(mesh, piece, True), identity, moved) < 0.03
 
 
 def test_lengths_on_a_partial_shape_use_the_unit_of_the_full_shape(mesh):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import islice
+from itertools import count, islice
 
 import equinox as eqx
 import jax
@@ -22,7 +22,6 @@ from jaxsmw.preparation import PreparedPair
 from jaxsmw.repair.extremities import extremities, plausible_pairings
 from jaxsmw.repair.outcome import Judge, Outcome
 from jaxsmw.repair.proxies import Proxy, deformation
-from jaxsmw.repair.scores import distinct
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import side_by_side
@@ -81,8 +80,8 @@ class Alternatives:
 
     def _proxy(self, side: tuple[Mesh, Spectrum, float]) -> Proxy:
         mesh, spectrum, unit = side
-        count = min(self.settings.alternatives.samples, int(mesh.referenced_vertices.sum()))
-        samples = SurfaceSamples.along_surface(mesh, farthest_point_samples(mesh, count))
+        number = min(self.settings.alternatives.samples, int(mesh.referenced_vertices.sum()))
+        samples = SurfaceSamples.along_surface(mesh, farthest_point_samples(mesh, number))
         return Proxy(mesh, spectrum, samples, unit)
 
     def deformation(self, pointwise_map: Int64[np.ndarray, " m"]) -> float:
@@ -91,7 +90,7 @@ class Alternatives:
         return deformation(self.x, self.y, self._reduced(pointwise_map), radius)
 
     def best(self, *known: Int64[np.ndarray, " m"]) -> Iterator[Int64[np.ndarray, " m"]]:
-        """Yield maps that differ from each other, those of the best score first.
+        """Yield maps that differ from each other, mostly in the order of their scores.
 
         Of the refined maps, the best are repaired: a refinement without the vertices of a fault gives a
         further map.
@@ -103,15 +102,30 @@ class Alternatives:
         **Returns:** An iterator over maps T: X -> Y (m,), 0-based vertices of Y.
         """
         outcomes = self._refined([*self._initial_maps(), *map(self._reduced, known)])
-        outcomes = self._sorted(outcomes + self._without_faults(self._first(outcomes)))
-        for outcome in distinct(outcomes, self.judge.same):
-            if self.judge.score(outcome) > self.judge.score(outcomes[0]) + self.settings.alternatives.margin:
-                break
+        repaired = islice(self._distinct(outcomes), self.settings.alternatives.repaired)
+        outcomes = self._sorted(outcomes + self._without_faults(list(repaired)))
+        score, margin = self.judge.score, self.settings.alternatives.margin
+        close = [outcome for outcome in outcomes if score(outcome) <= score(outcomes[0]) + margin]
+        for outcome in self._distinct(close):
             yield self.prepared.unpadded_map(outcome.pointwise_map)
 
-    def _first(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
-        """Return the first outcomes that differ from each other."""
-        return list(islice(distinct(outcomes, self.judge.same), self.settings.alternatives.repaired))
+    def _distinct(self, outcomes: Sequence[Outcome]) -> Iterator[Outcome]:
+        """Yield outcomes that differ from each other, from outcomes that are sorted by their scores.
+
+        `different_areas` contains the least difference of each outcome from all earlier outcomes.
+        """
+        areas = self.settings.alternatives.different_areas
+        # Each outcome with its smallest difference from the outcomes that were yielded.
+        differences = [(outcome, 1.0) for outcome in outcomes]
+        for number in count():
+            least = areas[min(max(number - 1, 0), len(areas) - 1)]
+            chosen = next((outcome for outcome, area in differences if area >= least), None)
+            if chosen is None:
+                return
+            yield chosen
+            differences = [
+                (other, min(area, self.judge.difference(other, chosen))) for other, area in differences
+            ]
 
     def _without_faults(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Refine each outcome without each of its faults."""

@@ -17,8 +17,8 @@ from jaxsmw.repair.scores import (
     area_shape_difference,
     discontinuous_parts,
     distortion,
+    map_difference,
     orientation_reversal,
-    same_map,
 )
 from jaxsmw.repair.settings import RepairSettings
 
@@ -159,9 +159,9 @@ class Judge:
         )
         return difference < self.settings.non_isometric
 
-    def same(self, first: Outcome, second: Outcome) -> bool:
-        """Return whether the maps of two outcomes agree on nearly all of X; see `same_map`."""
-        return same_map(self.pair, self._matches(first), self._matches(second), self.settings.scores)
+    def difference(self, first: Outcome, second: Outcome) -> float:
+        """Return the share of X's area on which the maps of two outcomes differ; see `map_difference`."""
+        return map_difference(self.pair, self._matches(first), self._matches(second), self.settings.scores)
 
     def _matches(self, outcome: Outcome) -> Int64[np.ndarray, " m"]:
         return np.asarray(outcome.pointwise_map)[: len(self.pair.mesh_x.vertices)].astype(np.int64)

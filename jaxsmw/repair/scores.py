@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from typing import TypeVar
-
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
@@ -14,7 +11,6 @@ from jaxsmw.geometry.sampling import coarse_edges
 from jaxsmw.pair import Pair
 from jaxsmw.repair.settings import ScoreSettings
 
-_Item = TypeVar("_Item")
 _DEFAULT = ScoreSettings()
 
 
@@ -193,16 +189,16 @@ def area_shape_difference(
     return float(np.sqrt(np.mean((eigenvalues - 1) ** 2)))
 
 
-def same_map(
+def map_difference(
     pair: Pair,
     first: Int64[np.ndarray, " m"],
     second: Int64[np.ndarray, " m"],
     settings: ScoreSettings = _DEFAULT,
-) -> bool:
-    """Return whether two maps agree on nearly all of X.
+) -> float:
+    """Return the share of X's area, from 0 to 1, on which two maps differ.
 
-    The two matches of a vertex differ if their Euclidean distance exceeds `settings.same_map_distance`. Two
-    maps agree if the matches differ on less than the share `settings.same_map_area` of X's area.
+    Two maps differ at a vertex if the Euclidean distance between its two matches exceeds
+    `settings.different_distance`.
 
     **Arguments:**
 
@@ -212,23 +208,8 @@ def same_map(
     """
     _, unit_y = pair.units_of_length
     distances = np.linalg.norm(pair.mesh_y.vertices[first] - pair.mesh_y.vertices[second], axis=1)
-    apart = distances > settings.same_map_distance * unit_y
-    return bool(pair.mesh_x.vertex_areas[apart].sum() < settings.same_map_area * pair.mesh_x.area)
-
-
-def distinct(items: Iterable[_Item], same: Callable[[_Item, _Item], bool]) -> Iterator[_Item]:
-    """Yield the items that differ from all items that were yielded earlier.
-
-    **Arguments:**
-
-    - `items`: the items, which are consumed one by one.
-    - `same`: a function that returns whether two items are the same.
-    """
-    found: list[_Item] = []
-    for item in items:
-        if not any(same(item, other) for other in found):
-            found.append(item)
-            yield item
+    apart = distances > settings.different_distance * unit_y
+    return float(pair.mesh_x.vertex_areas[apart].sum() / pair.mesh_x.area)
 
 
 def edge_lengths(

@@ -27,8 +27,7 @@ class ScoreSettings:
     - `orientation_weight` (Table R6): the weight of orientation reversal in the distortion. This weight
       multiplies the share of X's area in which the orientation is reversed.
     - `area_eigenvectors`: the number of eigenvectors on which the area-based shape difference is computed.
-    - `same_map_distance`: two maps differ at a vertex if its two matches are more than this distance apart.
-    - `same_map_area`: two maps are treated as the same if they differ on less than this share of X's area.
+    - `different_distance`: two maps differ at a vertex if its two matches are more than this distance apart.
     """
 
     vertices_per_eigenvector: int = 10
@@ -38,8 +37,7 @@ class ScoreSettings:
     orientation_threshold: float = -0.2
     orientation_weight: float = 4.0
     area_eigenvectors: int = 20
-    same_map_distance: float = 0.1
-    same_map_area: float = 0.03
+    different_distance: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -68,6 +66,22 @@ class ExpectedErrorSettings:
     heat_time: float = 1e-3
     area_weight: float = 5.0
     isometric_difference: float = 0.08
+
+
+@dataclass(frozen=True)
+class WrongProbabilitySettings:
+    """The coefficients of `jaxsmw.repair.wrong_probability`, a logistic regression. (Table R31)
+
+    **Attributes:**
+
+    - `intercept`: the logarithm of the odds of a map whose distortion and mean expected error are both 1.
+    - `distortion_weight`: the weight of the logarithm of the distortion.
+    - `expected_error_weight`: the weight of the logarithm of the mean expected error.
+    """
+
+    intercept: float = 2.0
+    distortion_weight: float = 2.0
+    expected_error_weight: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -107,6 +121,8 @@ class AlternativeSettings:
     - `repaired`: the number of refined maps that are refined again without their faults.
     - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
     - `patch_radius` (Table R28): the radius of the patches of the deformation.
+    - `different_areas` (Table R27): the least shares of X's area, above 0, on which the second, the third and
+      each further alternative map differ from all maps before them.
     - `margin` (Table R28): the largest difference of scores between the best map and a returned map. If a
       wrong map has the best score, the scores of the right map and of the wrong map differ less.
     """
@@ -123,6 +139,7 @@ class AlternativeSettings:
     repaired: int = 3
     eigenvectors: int = 50
     patch_radius: float = 0.2
+    different_areas: tuple[float, ...] = (0.03, 0.03, 0.2)
     margin: float = 1.0
 
 
@@ -187,7 +204,7 @@ class RepairSettings:
     negligible_area: float = 0.002
     excessive_area: float = 0.5
     rounds: int = 4
-    finalists: int = 3
+    finalists: int = 4
     uncertainty_weight: float = 30.0
     deformation_weight: float = 5.0
     score_tolerance: float = 0.25
