@@ -46,6 +46,7 @@ from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.repair.settings import WITHOUT_REPAIR, RepairSettings
+from jaxsmw.repair.wrong_probability import wrong_probability
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.progress import timed
@@ -60,8 +61,9 @@ logger = logging.getLogger("jaxsmw")
 class Correspondence:
     """The result of `match`: a map from X to Y, the spectra, and statistics of the map.
 
-    The methods `surface_points`, `one_to_one`, `soft_map` and `expected_error` compute further results. The
-    results of `surface_points` and `expected_error` are kept, so further calls cost no time.
+    The methods `surface_points`, `one_to_one`, `soft_map`, `expected_error`, `wrong_probability` and others
+    compute further results. The results of `surface_points` and `expected_error` are kept, so further calls
+    cost no time.
 
     **Attributes:**
 
@@ -307,6 +309,19 @@ class Correspondence:
         the square root of Y's area.
         """
         return self._expected_error.copy()
+
+    def wrong_probability(self) -> float | None:
+        """Estimate the probability that the map is wrong on a part of the body, without ground truth.
+
+        A map is called wrong if at least 2 % of X's area have errors above 0.25 times the square root of Y's
+        area, for example because limbs are swapped. `jaxsmw.repair.wrong_probability` explains the estimate.
+
+        **Returns:** A probability, from 0 to 1; None if `distortion` is None.
+        """
+        if self.distortion is None:
+            return None
+        areas = self.mesh_x.vertex_areas
+        return wrong_probability(self.distortion, float(areas @ self._expected_error / areas.sum()))
 
     @functools.cached_property
     def _expected_error(self) -> Float[np.ndarray, " m"]:

@@ -1,17 +1,21 @@
 """Compares expected errors and scores, which need no ground truth, with true errors.
 
-    python scripts/calibrate_scores.py DATA_SET_DIRECTORY ... [--pairs N] [--seed SEED] [--preset NAME]
-        [--output FILE.md]
+    python scripts/calibrate_scores.py DATA_SET_DIRECTORY ... [--pairs N | FILE] [--seed SEED]
+        [--preset NAME ...] [--output FILE.md]
 
-The script draws pairs at random from each data set (see `docs/datasets.md`) and prints three tables:
+The script draws pairs at random from each data set (see `docs/datasets.md`), matches them with each preset,
+and prints four tables:
 
-- The first table compares `Correspondence.expected_error` with the true errors of a preset's results. The
-  table states the rank correlation of expected and true errors, and the share of gross errors. A gross error
-  exceeds 0.1 times the square root of the area. The last column states the share of the gross errors that
-  belong to the 10 % of the vertices with the largest expected errors.
+- The first table compares `Correspondence.expected_error` with the true errors. The table states the rank
+  correlation of expected and true errors, and the share of gross errors. A gross error exceeds 0.1 times the
+  square root of the area. The last column states the share of the gross errors that belong to the 10 % of the
+  vertices with the largest expected errors.
 - For the second table, the script sorts the vertices of all pairs by expected error, and divides them into
   ten groups of equal size. The table states the true errors of each group.
-- The third table states on how many pairs each score prefers the result to a mirrored map. The script prints
+- The third table compares `Correspondence.wrong_probability` with the share of wrong maps. At least 2 % of
+  the errors of a wrong map exceed 0.25 times the square root of the area. The note below the table states the
+  coefficients that a logistic regression on these maps gives.
+- The fourth table states on how many pairs each score prefers the result to a mirrored map. The script prints
   this table only for the preset `accurate`. The table covers only pairs of full shapes with a mirrored ground
   truth that maps vertices to vertices. To compute the mirrored map, the script starts from the mirrored
   ground truth, and skips the first stage and the repair. To compute the uncertainty of a map, the script runs
@@ -22,14 +26,15 @@ from __future__ import annotations
 
 import argparse
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.optimize import minimize
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
@@ -38,11 +43,18 @@ from jaxsmw.evaluation.datasets import DataPair, DataSet, choose_pairs, open_dat
 from jaxsmw.matching import Correspondence
 from jaxsmw.presets import PRESETS, PresetName
 from jaxsmw.repair.scores import dirichlet_energy_ratio, distortion
+from jaxsmw.repair.settings import WrongProbabilitySettings
+from jaxsmw.repair.wrong_probability import wrong_probability
 from jaxsmw.report.tables import markdown
+from jaxsmw.runtime.compilation import release_programs
 from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
+# A map is wrong if at least this share of its errors exceeds this error.
+WRONG_SHARE, WRONG_ERROR = 0.02, 0.25
+# The limits of the groups of probabilities.
+PROBABILITIES = (0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 1)
 # If stages are given instead of a preset, `match` does not repair maps.
 WITHOUT_REPAIR = PRESETS["accurate"].stages[1:]
 
@@ -53,13 +65,22 @@ class Measured(NamedTuple):
     **Attributes:**
 
     - `true`, `expected`: the true and the expected errors of the evaluated vertices (p,).
+    - `distortion`: the distortion of the map.
+    - `mean_expected`: the mean expected error of all vertices.
     - `scores`: a dictionary from the name of each score to its values for the result and for the mirrored
       map. The dictionary is empty if there is no mirrored map.
     """
 
     true: Float64[np.ndarray, " p"]
     expected: Float64[np.ndarray, " p"]
+    distortion: float
+    mean_expected: float
     scores: dict[str, tuple[float, float]]
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the map is wrong."""
+        return bool(np.mean(self.true > WRONG_ERROR) >= WRONG_SHARE)
 
 
 def measure(
@@ -80,8 +101,15 @@ def measure(
         reflected = match(mesh_x, mesh_y, init=mirrored.everywhere(mesh_x), preset=WITHOUT_REPAIR)
         direct, other = (scores_of(result) for result in (found, reflected))
         scores = {name: (direct[name], other[name]) for name in direct}
-    expected = found.expected_error()[error.source_vertices]
-    return Measured(error.errors[known], expected[known], scores)
+    expected, areas = found.expected_error(), mesh_x.vertex_areas
+    assert found.distortion is not None
+    return Measured(
+        error.errors[known],
+        expected[error.source_vertices][known],
+        found.distortion,
+        float(areas @ expected / areas.sum()),
+        scores,
+    )
 
 
 def scores_of(found: Correspondence) -> dict[str, float]:
@@ -97,8 +125,33 @@ def scores_of(found: Correspondence) -> dict[str, float]:
     }
 
 
+def fitted(maps: Sequence[Measured]) -> WrongProbabilitySettings:
+    """Fit the coefficients of `jaxsmw.repair.wrong_probability` to maps by logistic regression."""
+    features = np.array([[1, np.log(one.distortion), np.log(one.mean_expected)] for one in maps])
+    signs = np.where([one.wrong for one in maps], 1, -1)
+
+    def loss(weights: Float64[np.ndarray, " 3"]) -> float:
+        # Without the small penalty, the weights grow without limit if a plane separates the two kinds of map.
+        return float(np.logaddexp(0, -signs * (features @ weights)).mean() + 1e-3 * weights[1:] @ weights[1:])
+
+    return WrongProbabilitySettings(*minimize(loss, np.zeros(3)).x.round(2).tolist())
+
+
+def calibration(maps: Sequence[Measured], settings: WrongProbabilitySettings) -> str:
+    """Return a table that compares predicted probabilities with the shares of wrong maps."""
+    predicted = np.array([wrong_probability(one.distortion, one.mean_expected, settings) for one in maps])
+    wrong = np.array([one.wrong for one in maps])
+    rows = [["probability", "maps", "mean probability", "wrong"]]
+    for low, high in pairwise(PROBABILITIES):
+        own = (low <= predicted) & ((predicted < high) | (high == 1))
+        if own.any():
+            figures = f"{predicted[own].mean():.1%}", f"{wrong[own].mean():.1%}"
+            rows.append([f"{low:.0%} to {high:.0%}", str(own.sum()), *figures])
+    return markdown(rows)
+
+
 def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
-    """Yields the three tables as Markdown."""
+    """Yields the four tables as Markdown."""
     rows = [
         ["", "pairs", "mean error", "mean expected", "rank correlation", "gross errors", "in the worst tenth"]
     ]
@@ -128,7 +181,7 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
 
     everything = [pair for pairs in measured.values() for pair in pairs]
     true, expected = (
-        np.concatenate([getattr(pair, name) for pair in everything]) for name in Measured._fields[:2]
+        np.concatenate([getattr(pair, name) for pair in everything]) for name in ("true", "expected")
     )
     ends = np.quantile(expected, np.linspace(0, 1, 11))
     rows = [["expected, x 10⁻³", "mean error", "median", "gross"]]
@@ -138,6 +191,14 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
         rows.append([f"{1e3 * low:.1f} to {1e3 * high:.1f}", *(f"{1e3 * figure:.1f}" for figure in figures)])
         rows[-1].append(f"{np.mean(own > GROSS):.1%}")
     yield "Vertices of all pairs, in ten groups of equal size by expected error:\n\n" + markdown(rows)
+
+    chosen = WrongProbabilitySettings()
+    yield (
+        "Probability that a map is wrong:\n\n"
+        + calibration(everything, chosen)
+        + f"\nThe chosen coefficients are {chosen}. Logistic regression on these maps gives "
+        f"{fitted(everything)}.\n"
+    )
 
     names = list(dict.fromkeys(name for pair in everything for name in pair.scores))
     if names:
@@ -155,14 +216,18 @@ def main() -> None:
     )
     parser.add_argument("data_sets", metavar="DATA_SET_DIRECTORY", nargs="+", type=Path)
     parser.add_argument(
-        "--pairs", metavar="N", default="20", help="number of pairs from each data set (default: 20)"
+        "--pairs",
+        metavar="N | FILE",
+        default="20",
+        help="number of pairs from each data set, or a list of pairs (default: 20)",
     )
     parser.add_argument("--seed", type=int, default=0, help="seed of the random draws (default: 0)")
     parser.add_argument(
         "--preset",
+        nargs="+",
         choices=PRESETS,
-        default="accurate",
-        help="preset that matches the pairs (default: accurate)",
+        default=["accurate"],
+        help="presets that match the pairs (default: accurate)",
     )
     parser.add_argument("--output", metavar="FILE.md", type=Path, help="also write the tables to this file")
     options = parser.parse_args()
@@ -173,8 +238,10 @@ def main() -> None:
         data_set = open_data_set(directory)
         chosen += [(data_set, pair) for pair in choose_pairs(data_set, options.pairs, options.seed)]
     measured: dict[str, list[Measured]] = {}
-    for data_set, pair in tqdm(chosen, unit="pair"):
-        measured.setdefault(data_set.name, []).append(measure(pair, options.seed, options.preset))
+    for preset, (data_set, pair) in tqdm(list(product(options.preset, chosen)), unit="map"):
+        name = data_set.name if len(options.preset) == 1 else f"{data_set.name}, {preset}"
+        measured.setdefault(name, []).append(measure(pair, options.seed, preset))
+        release_programs()
     page = "\n".join((*tables(measured), made_with() + "\n"))
     print(page)
     if options.output:

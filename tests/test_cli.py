@@ -38,6 +38,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.matching import match
+from jaxsmw.repair.wrong_probability import percentage
 from jaxsmw.report.texture import TEXTURE_FILES
 from jaxsmw.stage import Stage
 
@@ -512,9 +513,10 @@ def test_the_quality_of_the_map_is_printed(run, pair, tmp_path, monkeypatch):
     assert re.fullmatch(r"distortion 1\.0\d\d \(1 for isometries\)", quality) and not computed
     output = run(*call, "--report", tmp_path / "r", "--expected-error", tmp_path / "e.txt", *SMALL).output
     mean = f"mean expected error {1e3 * computed[0].mean():.2f} x 10^-3 sqrt(area)"
-    assert QUALITY.search(output)[1] == f"{quality}, {mean}"
-    assert len(computed) == 1
     summary = json.loads((tmp_path / "r" / "summary.json").read_text())
+    wrong = f"wrong on a part of the body with probability {percentage(summary['wrong_probability'])}"
+    assert QUALITY.search(output)[1] == f"{quality}, {mean}, {wrong}"
+    assert len(computed) == 1
     assert summary["result"]["expected error, mean"] == f"{np.loadtxt(tmp_path / 'e.txt').mean():.4f} √area"
 
     match = jaxsmw.matching.match

@@ -15,6 +15,7 @@ from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import GeodesicError, geodesic_error
 from jaxsmw.matching import Correspondence, match
 from jaxsmw.presets import PRESETS
+from jaxsmw.repair.wrong_probability import percentage, wrong_probability
 from jaxsmw.report.summary import REPORT_FILES, summarize, write_comparison, write_report
 from jaxsmw.stage import Stage
 
@@ -79,7 +80,8 @@ def _check_results(
 ) -> None:
     """Check that the summary and the page state the results of the match."""
     assert list(summary) == [
-        "settings", "result", "distortion", "suspicious", "errors", "seconds", "provenance",
+        "settings", "result", "distortion", "suspicious", "wrong_probability", "errors", "seconds",
+        "provenance",
     ]  # fmt: skip
     assert summary["settings"] == {"seed": 3}
     assert summary["distortion"] == pytest.approx(1, abs=1e-3) and summary["suspicious"] is False
@@ -92,6 +94,10 @@ def _check_results(
     assert facts["mean error, refined map"] == f"{errors['refined'].mean:.4f} √area"
     assert facts["error at most 0.05, initial map"] == "100.0%"
     assert facts["expected error, mean"] == f"{expected.mean():.4f} √area"
+    mean = np.average(expected, weights=found.mesh_x.vertex_areas)
+    assert summary["wrong_probability"] == pytest.approx(wrong_probability(found.distortion, mean))
+    assert facts["probability of a wrong part"] == percentage(summary["wrong_probability"])
+    assert replace(found, distortion=None).wrong_probability() is None
     assert facts["time, total"] == f"{sum(found.seconds.values()):.2f} s"
     judged = summarize(
         replace(found, preset=PRESETS["accurate"], distortion=1.3, suspicious=True), {}, expected

@@ -22,6 +22,7 @@ from jaxsmw.repair.scores import (
     orientation_reversal,
 )
 from jaxsmw.repair.settings import ExpectedErrorSettings, ScoreSettings
+from jaxsmw.repair.wrong_probability import percentage, wrong_probability
 
 
 @pytest.fixture(scope="module")
@@ -198,8 +199,9 @@ def test_expected_errors_are_larger_if_the_map_changes_areas(mesh, spectrum):
         expected = expected_error(*arguments)
         without = expected_error(*arguments, replace(settings, area_weight=0.0))
         difference = area_shape_difference(Pair(mesh, swollen), identity, *spectra)
-        factor = 1 if partial else 1 + settings.area_weight * (difference - settings.isometric_difference)
-        assert partial or factor > 1.3
+        growth = settings.area_weight * np.log(difference / settings.isometric_difference)
+        factor = 1 if partial else 1 + growth
+        assert growth > 0.3
         np.testing.assert_allclose(expected, factor * without, rtol=1e-12)
 
 
@@ -262,3 +264,13 @@ def test_errors_on_a_partial_shape_are_in_its_own_unit(mesh, spectrum):
     assert halved.area < 0.8 * part.area
     smaller = expected_error(Pair(mesh, halved, True), found, old, *spectra)
     np.testing.assert_allclose(smaller.max() / expected.max(), (part.area / halved.area) ** 0.5, rtol=0.2)
+
+
+def test_the_probability_of_a_wrong_map_grows_with_both_scores():
+    good, distorted, uncertain = (
+        wrong_probability(*scores) for scores in ((1.02, 0.01), (3.0, 0.01), (1.02, 0.2))
+    )
+    assert good < 0.05 and good < min(distorted, uncertain)
+    assert wrong_probability(8.0, 0.3) > 0.95
+    assert 0 <= wrong_probability(1.0, 0.0) < good and wrong_probability(np.inf, np.inf) <= 1
+    assert [percentage(p) for p in (0.004, 0.03, 0.5, 0.994)] == ["below 1 %", "3 %", "50 %", "above 99 %"]

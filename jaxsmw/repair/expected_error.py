@@ -72,6 +72,6 @@ def expected_error(
     expected = np.maximum(eigenvectors @ heat, 0)
     if not pair.partial:
         difference = area_shape_difference(pair, pointwise_map, spectrum_x, spectrum_y)
-        expected *= 1 + settings.area_weight * max(difference - settings.isometric_difference, 0)
+        expected *= 1 + settings.area_weight * np.log(max(difference / settings.isometric_difference, 1))
     expected += settings.misplaced_weight * misplaced * sizes
     return expected * unit_y / pair.mesh_y.area**0.5

@@ -57,15 +57,16 @@ class ExpectedErrorSettings:
     - `heat_time`: the time of the heat flow that averages over neighbouring vertices. The default value
       averages over a disk of radius 0.06.
     - `area_weight`, `isometric_difference` (Table R30): the expected error of two full shapes is multiplied
-      by 1 + `area_weight` times the excess of the area-based shape difference over `isometric_difference`.
+      by 1 + `area_weight` times the logarithm of the area-based shape difference divided by
+      `isometric_difference`. For smaller shape differences, the factor is 1.
     """
 
     detour_weight: float = 0.5
     distortion_weight: float = 2.0
     misplaced_weight: float = 0.5
     heat_time: float = 1e-3
-    area_weight: float = 5.0
-    isometric_difference: float = 0.08
+    area_weight: float = 0.7
+    isometric_difference: float = 0.09
 
 
 @dataclass(frozen=True)
@@ -79,9 +80,9 @@ class WrongProbabilitySettings:
     - `expected_error_weight`: the weight of the logarithm of the mean expected error.
     """
 
-    intercept: float = 2.0
-    distortion_weight: float = 2.0
-    expected_error_weight: float = 2.0
+    intercept: float = 4.9
+    distortion_weight: float = 2.5
+    expected_error_weight: float = 2.1
 
 
 @dataclass(frozen=True)
