@@ -23,7 +23,8 @@ def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.nda
     **Arguments:**
 
     - `number`: the number N of shapes.
-    - `decisions`: for each compared edge (i, j), the `Decision`. Decisions without evidence are ignored.
+    - `decisions`: for each compared edge (i, j), the `Decision`. Decisions without
+      evidence, and decisions on symmetric shapes, are ignored.
 
     **Returns:** An array (N,), True for shapes whose mirror image is matched. At most half are True.
     """

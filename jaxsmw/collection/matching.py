@@ -65,7 +65,8 @@ class MatchedEdge:
     - `distortion`: the distortion of the map; infinite if the match failed.
     - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The
       estimate is the error that the cycles of the graph show (`edge_errors`), but at least half of the
-      expected error. A term that grows with the distortion is added (`CollectionSettings.distortion_weight`).
+      prior. The prior is the expected error plus a term that grows with the distortion
+      (`CollectionSettings.distortion_weight`). The same term is then added to the estimate.
     - `residual`: the mean distance between the map and the map through the template.
     - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. A replaced map was matched again from the
       consistent map, because the first map contradicted the other maps. A contradicted map still contradicts

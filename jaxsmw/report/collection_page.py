@@ -27,7 +27,7 @@ from jaxsmw.report.template import fill_template
 from jaxsmw.runtime.files import atomic_write
 
 MOST_VERTICES = 20_000
-"""The largest number of vertices of each shape on a page. Larger triangulations are simplified."""
+"""The largest number of vertices of each shape on a page. Larger manifold triangulations are simplified."""
 
 # The page has sliders and scores for at most `_MODES` modes. Modes whose share of the variance is smaller
 # than `_SMALLEST_SHARE` are left out, because their effect is not visible. The first two modes are always
@@ -96,9 +96,9 @@ def write_collection_page(
     - `up`: the axis of the template's coordinates that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis from several shapes.
 
-    A page shows at most 20 000 vertices per shape (`MOST_VERTICES`). If the template has more vertices, its
-    triangulation is simplified, and all shapes are shown with the same vertices. The positions on the page
-    are rounded to 16 bits per coordinate.
+    A page shows at most 20 000 vertices per shape (`MOST_VERTICES`). If a manifold template has more
+    vertices, its triangulation is simplified, and all shapes are shown with the same vertices. The positions
+    on the page are rounded to 16 bits per coordinate.
 
     **Raises:** `InputError` if there is no shape, or if names, faces, edges or the model do not fit the
     shapes. `InputError` is also raised if a coordinate is not finite, the template has no area, `up` is not

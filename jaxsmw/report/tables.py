@@ -31,8 +31,8 @@ class MethodSummary(NamedTuple):
       geodesic error, in thousandths of the square root of the target's area.
     - `difference`: an `Interval` with the attributes `mean`, `low` and `high`. For each pair, the error of
       the method `REFERENCE` is subtracted from the error of this method. `difference` contains the mean of
-      these differences over all pairs and the confidence interval of this mean, in the unit of the attribute
-      `mean`. `difference` is NaN for `REFERENCE` itself.
+      these differences and the confidence interval of this mean, in the unit of the attribute `mean`. Pairs
+      on which `REFERENCE` failed are left out. `difference` is NaN for `REFERENCE` itself.
     - `within`: the share of points with an error of at most 0.05 times the square root of the target's area.
       The value is the mean over all pairs.
     - `area_under_curve`: the mean area under the correspondence quality curves of all pairs, at most 1.

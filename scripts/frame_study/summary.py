@@ -29,7 +29,8 @@ class Comparison(NamedTuple):
 
     - `mean`, `median`: the mean and the median error of the variant over the pairs on which it did not fail.
     - `difference`: the mean paired difference with its confidence interval. A paired difference is the
-      variant's error minus the default's error on the same pair.
+      variant's error minus the default's error on the same pair. Pairs on which the variant or the default
+      failed are left out.
     - `better`: the share of all pairs on which the variant has a smaller error than the default.
     - `failures`: the number of pairs on which the variant failed.
     """
