@@ -72,7 +72,7 @@ def show_quality(correspondence: Correspondence, expected_error: Float[np.ndarra
         parts.append(f"distortion {correspondence.distortion:.3f} (1 for isometries)")
     if expected_error is not None:
         parts.append(f"mean expected error {1e3 * expected_error.mean():.2f} x 10^-3 sqrt(area)")
-        if (probability := correspondence.wrong_probability()) is not None:
+        if (probability := correspondence.wrong_probability(expected_error)) is not None:
             from jaxsmw.repair.wrong_probability import percentage
 
             parts.append(f"wrong on a part of the body with probability {percentage(probability)}")

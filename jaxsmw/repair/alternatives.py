@@ -210,7 +210,7 @@ class Alternatives:
         **Returns:** The successful outcomes with maps of vertices, those of the best score first.
         """
         x, y = self._spectra
-        size, count = len(x.mask), len(self.x.areas)
+        size, used = len(x.mask), len(self.x.areas)
         outcomes = []
         for number, start in enumerate(initial):
             weighted = x
@@ -220,7 +220,7 @@ class Alternatives:
             padded = jax.device_put(pad_rows(start, size).astype(np.int32))
             found = self._stage.run(weighted, y, padded, partial=self.pair.partial)
             if found.result == RESULTS.successful:
-                of_samples = np.asarray(found.pointwise_map)[:count].astype(np.int64)
+                of_samples = np.asarray(found.pointwise_map)[:used].astype(np.int64)
                 everywhere = jax.device_put(self._extended(of_samples))
                 found = eqx.tree_at(lambda tree: tree.pointwise_map, found, everywhere)
                 outcomes.append(self.judge.judged(Outcome([found], everywhere)))

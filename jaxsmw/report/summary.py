@@ -27,7 +27,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching import Correspondence
 from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.repair.settings import WITHOUT_REPAIR
-from jaxsmw.repair.wrong_probability import percentage, wrong_probability
+from jaxsmw.repair.wrong_probability import percentage
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
@@ -148,7 +148,7 @@ def write_report(
         "result": summarize(correspondence, errors, expected, steps),
         "distortion": correspondence.distortion,
         "suspicious": correspondence.suspicious,
-        "wrong_probability": _wrong_probability(correspondence, expected),
+        "wrong_probability": correspondence.wrong_probability(expected),
         "errors": {name: error.as_dictionary() for name, error in errors.items()},
         "seconds": {**steps, "total": sum(steps.values())},
         "provenance": provenance(),
@@ -411,21 +411,11 @@ def summarize(
             suspicion = f"; above {settings.suspicious} limbs may be swapped"
         facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
     facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
-    if (probability := _wrong_probability(correspondence, expected_error)) is not None:
+    if (probability := correspondence.wrong_probability(expected_error)) is not None:
         facts["probability of a wrong part"] = percentage(probability)
     steps = correspondence.seconds if seconds is None else seconds
     times = {**steps, "total": sum(steps.values())}
     return facts | {f"time, {step}": f"{time:.2f} s" for step, time in times.items()}
-
-
-def _wrong_probability(
-    correspondence: Correspondence, expected_error: Float[np.ndarray, " m"]
-) -> float | None:
-    """Return `Correspondence.wrong_probability` for expected errors that are already computed (m,)."""
-    if correspondence.distortion is None:
-        return None
-    mean = float(np.average(expected_error, weights=correspondence.mesh_x.vertex_areas))
-    return wrong_probability(correspondence.distortion, mean)
 
 
 def provenance() -> dict[str, str]:
