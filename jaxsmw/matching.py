@@ -220,7 +220,8 @@ class Correspondence:
         **Returns:** A `RegisteredMesh`, whose attribute `vertices` (m, 3) contains positions on Y, in the
         unit of Y. `jaxsmw.transfer` transfers landmarks and attributes with a registered mesh.
 
-        **Raises:** `InputError` if the stiffness is not positive and finite.
+        **Raises:** `InputError` if the stiffness is not positive and finite; `ArithmeticError` if the
+        deformation does not converge.
         """
         return register_mesh(
             self.mesh_x,
@@ -326,8 +327,7 @@ class Correspondence:
         if self.distortion is None:
             return None
         expected = self._expected_error if expected_error is None else expected_error
-        mean = float(np.average(expected, weights=self.mesh_x.vertex_areas))
-        return wrong_probability(self.distortion, mean)
+        return wrong_probability(self.distortion, float(self.mesh_x.average(expected)))
 
     @functools.cached_property
     def _expected_error(self) -> Float[np.ndarray, " m"]:
@@ -337,6 +337,7 @@ class Correspondence:
             self.reverse_map(),
             self.spectrum_x,
             self.spectrum_y,
+            scores=(self.preset.repair or WITHOUT_REPAIR).scores,
         )
         return extend_to_unreferenced(self.mesh_x, expected)
 
@@ -592,7 +593,9 @@ def match_prepared(
         return found[0]
     assert preset.repair is not None
     with _step("expected error", seconds):
-        from_shot, from_aligned = (float(one.correspondence.expected_error().mean()) for one in found)
+        from_shot, from_aligned = (
+            float(pair.mesh_x.average(one.correspondence.expected_error())) for one in found
+        )
     return found[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
 
 

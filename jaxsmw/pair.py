@@ -137,6 +137,12 @@ def paired_spectra(
     pair, `InputError` is also raised if all eigenvalues of a mesh are zero, or if the area of one mesh is
     less than a thousandth of the other area.
     """
+    areas = pair.mesh_x.area, pair.mesh_y.area
+    if pair.partial and min(areas) < _SMALLEST_PART * max(areas):
+        raise InputError(
+            f"{pair.mesh_x.name} has area {areas[0]:.3g} and {pair.mesh_y.name} has area {areas[1]:.3g}, so "
+            "their units of length probably differ: scale one of the meshes."
+        )
     if eigensolver == "auto":  # both shapes need the same eigensolver, because the spectra are compared
         eigensolver = choose_eigensolver(*pair.meshes)
     eigenpairs_x, eigenpairs_y = side_by_side(
@@ -147,12 +153,6 @@ def paired_spectra(
     spectrum_x, spectrum_y = as_spectrum(pair.mesh_x, *eigenpairs_x), as_spectrum(pair.mesh_y, *eigenpairs_y)
     if not pair.partial:
         return spectrum_x, spectrum_y
-    areas = pair.mesh_x.area, pair.mesh_y.area
-    if min(areas) < _SMALLEST_PART * max(areas):
-        raise InputError(
-            f"{pair.mesh_x.name} has area {areas[0]:.3g} and {pair.mesh_y.name} has area {areas[1]:.3g}, so "
-            "their units of length probably differ: scale one of the meshes."
-        )
     # If all eigenvalues of one mesh are zero, the common range contains only zero eigenvalues of the other
     # mesh, too.
     for mesh, spectrum in zip(pair.meshes, (spectrum_x, spectrum_y), strict=True):

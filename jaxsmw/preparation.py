@@ -19,7 +19,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
-from jaxsmw.initial_maps import InitialMap, initial_map
+from jaxsmw.initial_maps import InitialMap, check_initial_map, initial_map
 from jaxsmw.pair import Pair, check_eigenvalues, paired_spectra
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
@@ -141,6 +141,7 @@ def prepare(
     zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required
     descriptors. `ArithmeticError` if the initial map cannot be computed.
     """
+    check_initial_map(pair, init)  # before the eigenbases, which take longer
     seconds: dict[str, float] = {}
     with timed("eigenbases", seconds):
         spectra = paired_spectra(pair, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)

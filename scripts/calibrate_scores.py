@@ -101,13 +101,13 @@ def measure(
         reflected = match(mesh_x, mesh_y, init=mirrored.everywhere(mesh_x), preset=WITHOUT_REPAIR)
         direct, other = (scores_of(result) for result in (found, reflected))
         scores = {name: (direct[name], other[name]) for name in direct}
-    expected, areas = found.expected_error(), mesh_x.vertex_areas
+    expected = found.expected_error()
     assert found.distortion is not None
     return Measured(
         error.errors[known],
         expected[error.source_vertices][known],
         found.distortion,
-        float(areas @ expected / areas.sum()),
+        float(mesh_x.average(expected)),
         scores,
     )
 

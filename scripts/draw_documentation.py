@@ -157,7 +157,7 @@ def draw_case(case: Case) -> str:
             print(f"{case.name}, {settings}: {warning.message}")
         error = jaxsmw.geodesic_error(case.target, result.pointwise_map, case.truth)
         expected = result.expected_error()
-        cells += [f"{error.mean:.3f}", f"{expected.mean():.3f}"]
+        cells += [f"{error.mean:.3f}", f"{case.source.average(expected):.3f}"]
         if settings is case.failing:
             # A vertex without ground truth is drawn with the error of the nearest vertex with ground truth.
             known = KDTree(case.source.vertices[error.source_vertices])

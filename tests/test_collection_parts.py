@@ -24,12 +24,17 @@ from jaxsmw.collection import (
     synchronize,
 )
 from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, find_outliers, triangles
-from jaxsmw.collection.shapes import prepare_pair, prepare_shapes
+from jaxsmw.collection.matching import _preset_key
+from jaxsmw.collection.shapes import prepare_pair, prepare_shape, prepare_shapes
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
+from jaxsmw.core.banks import LowPass
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.results import RESULTS
 from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.presets import PRESETS, Preset
+from jaxsmw.repair.batches import refine_batch
 from jaxsmw.repair.chirality import Decision
 from jaxsmw.stage import Stage
 
@@ -364,6 +369,23 @@ def test_batches_are_not_refined_a_second_time(three, monkeypatch):
     monkeypatch.setattr(Stage, "run", refuse)
     found = match_pairs(three, PAIRS, preset="paper", batch_size=3)
     assert len(dict(found)) == len(PAIRS)
+
+
+def test_the_first_failure_of_a_batch_is_reported(three, monkeypatch):
+    """Later stages start from the map of the failure, and must not hide its reason."""
+    shape = prepare_shape(three[0], PRESETS["paper"])
+    prepared = prepare_pair(shape, shape)
+    broken = replace(prepared.spectrum_y, eigenvectors=prepared.spectrum_y.eigenvectors.at[0, 0].set(jnp.nan))
+    (outcome,) = refine_batch([replace(prepared, spectrum_y=broken)], [Stage(), Stage()])
+    assert [found.result == RESULTS.nonfinite_spectrum for found in outcome.refinements] == [True]
+
+
+def test_presets_of_different_arrays_have_different_keys():
+    """The text of a bank abbreviates its arrays."""
+    low, high = (Preset((Stage(WaveletPreservation(LowPass(cutoff))),)) for cutoff in (0.25, 0.5))
+    same = Preset((Stage(WaveletPreservation(LowPass(0.25))),))
+    assert repr(low) == repr(high)
+    assert _preset_key(low) == _preset_key(same) != _preset_key(high)
 
 
 def test_pairs_may_come_from_an_iterator(three, one_by_one):

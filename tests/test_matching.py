@@ -66,6 +66,27 @@ def mean_error(mesh_y: Mesh, t: np.ndarray, truth: np.ndarray) -> float:
     )
 
 
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [
+        ({"init": "shout"}, "'shout' is not an initial map"),
+        ({"init": np.array([[0, 10**6]])}, "landmark 1000000 is not a vertex"),
+        ({"init": np.zeros(3, int)}, "the initial map has 3 entries"),
+        ({"partial": True}, "units of length probably differ"),
+    ],
+)
+def test_invalid_arguments_are_refused_before_eigenbases_are_computed(pair, options, fault, monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("eigenpairs were computed")
+
+    monkeypatch.setattr("jaxsmw.pair.eigenpairs", refuse)
+    mesh_x, mesh_y, _ = pair
+    if options == {"partial": True}:
+        mesh_y = make_mesh(1000 * mesh_y.vertices, mesh_y.faces)
+    with pytest.raises(InputError, match=fault):
+        match(mesh_x, mesh_y, **options)
+
+
 def test_matches_a_noisy_copy(pair):
     mesh_x, mesh_y, truth = pair
     result = match(mesh_x, mesh_y, **OPTIONS, init="shot")

@@ -406,6 +406,16 @@ def test_the_loop_accepts_new_refiners(pair):
     assert np.mean(np.asarray(refined.pointwise_map) == truth) > 0.95
 
 
+def test_default_embeddings_follow_the_convention_of_the_refiner(pair):
+    x, y, _, _ = pair
+    refiner = WaveletPreservation(convention="pushforward")
+    prepared = refiner.prepare(Problem(x, y))
+    state = State(jnp.asarray(np.random.default_rng(0).normal(size=(K, K))))
+    queries, database = Refiner.embeddings(refiner, prepared, state)
+    np.testing.assert_allclose(queries, x.eigenvectors @ state.functional_map.T)
+    np.testing.assert_array_equal(database, y.eigenvectors)
+
+
 def test_an_undetermined_functional_map_is_reported(pair):
     class Nothing(FilterBank):
         def __call__(self, points, eigenvalues):

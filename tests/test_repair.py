@@ -183,9 +183,13 @@ def test_default_repair_settings_are_those_of_the_preset_and_documented():
         (lambda: Stage(FeatureRegression(LEVELS), number_of_eigenvectors=60), "require 40: leave .* out"),
         (lambda: Stage(FeatureRegression(LEVELS), iterations=3), "require 4: leave iterations out"),
         (lambda: Stage(WaveletPreservation()).with_levels((3,)), "has no levels"),
+        (lambda: RepairSettings(rounds=-1), "rounds is -1: give a whole number of at least 0"),
+        (lambda: RepairSettings(suspicious_area=3.0), "suspicious_area is 3.0: give a number from 0 to 1"),
+        (lambda: RepairSettings(suspicious=float("nan")), "suspicious is nan"),
+        (lambda: RepairSettings(uncertainty_weight=-1.0), "uncertainty_weight is -1.0"),
     ],
 )
-def test_invalid_presets_are_refused(make, fault):
+def test_invalid_presets_and_settings_are_refused(make, fault):
     with pytest.raises(InputError, match=fault):
         make()
 

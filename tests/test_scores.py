@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import igl
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
@@ -9,7 +10,7 @@ from synthetic import body_with_arms, bumpy_mesh
 
 from jaxsmw.geometry import sampling
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.sampling import coarse_edges
 from jaxsmw.pair import Pair
 from jaxsmw.repair.expected_error import expected_error
@@ -129,9 +130,32 @@ def test_a_map_that_collapses_is_distorted(spectrum, mesh):
     shrunk = part[KDTree(mesh.vertices[part]).query(mesh.vertices)[1]]
     assert dirichlet_energy_ratio(Pair(mesh, mesh), shrunk, spectrum) < 0.8
     assert distortion(Pair(mesh, mesh), shrunk, spectrum) > 1.25
-    # For a partial pair, shrinking is no distortion, because large parts of the full shape have no match.
-    assert distortion(Pair(mesh, mesh, True), shrunk, spectrum) < distortion(
-        Pair(mesh, mesh), shrunk, spectrum
+    # If Y is a part of X, shrinking is no distortion, because large parts of X have no match.
+    row = np.full(len(mesh.vertices), -1)
+    row[part] = np.arange(len(part))
+    faces = row[mesh.faces]
+    piece = Mesh(mesh.vertices[part], faces[(faces >= 0).all(axis=1)])
+    assert distortion(Pair(mesh, piece, True), row[shrunk], spectrum) < 1.12
+    # A collapse is a distortion of partial pairs as well, whichever shape is the part.
+    assert distortion(Pair(mesh, piece, True), np.zeros_like(shrunk), spectrum) > 1e3
+    assert distortion(Pair(mesh, mesh, True), np.zeros_like(shrunk), spectrum) > 1e3
+
+
+def test_averages_weight_vertices_with_their_areas(mesh):
+    values = mesh.vertices[:, :2]
+    np.testing.assert_allclose(
+        mesh.average(values), (mesh.vertex_areas[:, None] * values).sum(axis=0) / mesh.area, atol=1e-12
+    )
+    assert mesh.average(np.full(len(mesh.vertices), 3.0)) == pytest.approx(3)
+
+
+def test_excluded_vertices_have_no_area_and_the_shape_keeps_its_area(spectrum, mesh):
+    left_out = mesh.vertices[:, 0] > 0
+    kept = spectrum.excluding(jnp.asarray(left_out))
+    assert not kept.vertex_areas[left_out].any()
+    ratio = kept.vertex_areas[~left_out] / spectrum.vertex_areas[~left_out]
+    np.testing.assert_allclose(
+        ratio, spectrum.vertex_areas.sum() / spectrum.vertex_areas[~left_out].sum(), rtol=1e-5
     )
 
 

@@ -108,6 +108,24 @@ def test_vmap_equals_a_loop(generator):
         np.testing.assert_allclose(together[1][pair], alone[1], atol=1e-12)
 
 
+@pytest.mark.parametrize("search", ["all", "candidates"])
+def test_weights_are_never_negative(search, generator):
+    """Without clipping, the weight of the first corner is negative for many points on the opposite edge."""
+    points = generator.normal(size=(300, 3)).astype(np.float32)
+    faces = np.arange(300).reshape(-1, 3)
+    shares = generator.uniform(size=(100, 1)).astype(np.float32)
+    corners = points[faces]
+    queries = shares * corners[:, 1] + (1 - shares) * corners[:, 2]
+    queries += (queries - corners[:, 0]) * np.float32(0.01)
+    if search == "all":
+        _, weights = compiled_search(queries, points, faces)
+    else:
+        rows = np.arange(100)
+        _, weights = nearest_point_on_candidates(*map(jnp.asarray, (queries, points, faces, rows, rows)))
+    assert (np.asarray(weights) >= 0).all()
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=3e-7)
+
+
 def test_no_array_of_all_queries_and_triangles_is_stored():
     m, n, f, d = 4000, 3000, 6000, 40
     shapes = (

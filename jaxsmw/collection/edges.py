@@ -66,7 +66,7 @@ class EdgeMap:
         return cls(
             found.surface_points(),
             found.reverse_surface_points(),
-            float(found.expected_error().mean()),
+            float(found.mesh_x.average(found.expected_error())),
             found.distortion,
             found.suspicious,
         )

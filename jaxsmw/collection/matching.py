@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -528,7 +529,7 @@ class _Matcher:
                 "axes": axes.principal.axes,
             }
 
-        arrays = self._stored("descriptor-axes", (repr(self.preset),), compute)
+        arrays = self._stored("descriptor-axes", _preset_key(self.preset), compute)
         self.axes = DescriptorAxes(
             tuple(arrays["radii"].tolist()), PrincipalAxes(arrays["mean"], arrays["axes"])
         )
@@ -576,7 +577,7 @@ class _Matcher:
         axes = () if self.axes is None else (self.axes.principal.axes,)
         first = "shot" if init is None else init
         keys = (*self._key(edge[0]), *self._key(edge[1]))
-        return (*keys, *axes, repr(self.preset), str(self.aligned), first)
+        return (*keys, *axes, *_preset_key(self.preset), str(self.aligned), first)
 
     def _match(
         self, inits: Mapping[Edge, Int64[np.ndarray, " m"] | None], step: str
@@ -751,6 +752,12 @@ class _Matcher:
         error = network.error(*edge)
         doubtful = wrong or error >= self.settings.outlier_from
         return MatchedEdge(*edge, found.expected_error, found.distortion, error, residual, decision, doubtful)
+
+
+def _preset_key(preset: Preset) -> tuple[Any, ...]:
+    """Return a preset as a part of a key of `Store`: its text, and the arrays that its text abbreviates."""
+    refiners = [stage.refiner for stage in preset.stages]
+    return repr(preset), *(np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(refiners, eqx.is_array)))
 
 
 def _both_directions(maps: Mapping[Edge, EdgeMap]) -> dict[tuple[int, int], SurfacePoints]:

@@ -167,4 +167,4 @@ def fitted_preset(preset: Preset, *meshes: Mesh) -> Preset:
 
     **Raises:** `InputError` if a mesh has too few vertices.
     """
-    return preset.fitted(Pair(meshes[0], meshes[-1]).fewest_vertices())
+    return preset.fitted(min(Pair(mesh, mesh).fewest_vertices() for mesh in meshes))

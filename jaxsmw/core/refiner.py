@@ -171,13 +171,16 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         """Return two point sets in which each vertex of X is close to its match on Y.
 
         For each vertex of X, `jaxsmw.Correspondence.surface_points` searches the triangles around its match.
-        The result is the point of these triangles that is nearest in the embeddings.
+        The result is the point of these triangles that is nearest in the embeddings. By default, the
+        embeddings are the `spectral_embeddings` of the functional map in the refiner's `convention`.
 
         **Returns:** Two arrays: one point for each vertex of X to be matched (m, d), and one point for each
         vertex of Y (n, d). Each refiner chooses the dimension d and the unit, which is the same for both
         point sets.
         """
-        return spectral_embeddings(state.functional_map, prepared.spectrum_x, prepared.spectrum_y)
+        return spectral_embeddings(
+            state.functional_map, prepared.spectrum_x, prepared.spectrum_y, convention=self.convention
+        )
 
     def objective(
         self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]

@@ -132,6 +132,14 @@ class Spectrum(eqx.Module):
         sampled = self._map_vertex_arrays(lambda field: field[vertices])
         return dataclasses.replace(sampled, vertex_areas=jnp.full(vertices.shape, share))
 
+    def excluding(self, vertices: Bool[Array, " n"]) -> Spectrum:
+        """Return the spectrum with area zero at the vertices for which the mask (n,) is True.
+
+        The areas of the other vertices grow by one factor, so that the area of the shape stays the same.
+        """
+        areas = jnp.where(vertices, 0, self.vertex_areas)
+        return dataclasses.replace(self, vertex_areas=areas * (jnp.sum(self.vertex_areas) / jnp.sum(areas)))
+
     def _check_rows(self, name: str, rows: Array | None, columns: int | None = None) -> None:
         if rows is None:
             return

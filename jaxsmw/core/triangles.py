@@ -66,7 +66,7 @@ def nearest_point_on_triangles(
     away = queries - corners[found, 0]
     along_u, along_v = (jnp.sum(away * edges[found, edge], axis=1) for edge in (0, 1))
     _, s, t = _closest(jnp.sum(away**2, axis=1), along_u, along_v, *(gram[found] for gram in grams))
-    return found, jnp.stack([1 - s - t, s, t], axis=1)
+    return found, _weights(s, t)
 
 
 def nearest_point_on_candidates(
@@ -87,23 +87,30 @@ def nearest_point_on_candidates(
     - `candidates`: (p,), for each candidate the index of its triangle in `faces`.
 
     **Returns:** Two arrays with one row per query. The first array (m,), int32, contains the index of the
-    triangle with the nearest point. The second array (m, 3) contains the barycentric weights of this point.
+    triangle with the nearest point. The second array (m, 3) contains the barycentric weights of this point,
+    which are not negative and sum to 1.
     """
 
     def compare(pair: tuple[Int[Array, ""], Int[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, " 2"]]:
         row, face = pair
         corners = points[faces[face]]
         edges, away = corners[1:] - corners[:1], queries[row] - corners[0]
-        along, gram = edges @ away, edges @ edges.T
-        squared, s, t = _closest(away @ away, along[0], along[1], gram[0, 0], gram[0, 1], gram[1, 1])
+        along, gram = product(edges, away), product(edges, edges.T)
+        squared, s, t = _closest(product(away, away), along[0], along[1], gram[0, 0], gram[0, 1], gram[1, 1])
         return squared, jnp.stack([s, t])
 
     squared, inside = lax.map(compare, (rows, candidates), batch_size=_PAIRS)
     m, p = queries.shape[0], rows.shape[0]
     least = jax.ops.segment_min(squared, rows, m)
     best = jax.ops.segment_min(jnp.where(squared == least[rows], jnp.arange(p), p), rows, m)
-    weights = jnp.stack([1 - inside[best, 0] - inside[best, 1], inside[best, 0], inside[best, 1]], axis=1)
-    return candidates[best].astype(jnp.int32), weights
+    return candidates[best].astype(jnp.int32), _weights(*inside[best].T)
+
+
+def _weights(s: Float[Array, " m"], t: Float[Array, " m"]) -> Float[Array, "m 3"]:
+    """Return the barycentric weights of the points `a + s u + t v` of triangles with edges u, v from a."""
+    # Rounding errors can make 1 - s - t slightly negative.
+    weights = jnp.stack([jnp.maximum(1 - s - t, 0), s, t], axis=1)
+    return weights / jnp.sum(weights, axis=1, keepdims=True)
 
 
 def _closest(

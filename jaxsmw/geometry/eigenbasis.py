@@ -107,7 +107,7 @@ def as_spectrum(
     referenced = mesh.referenced_vertices
     # Positions are relative to the centroid. In single precision, absolute positions of a mesh far from the
     # origin would be inaccurate.
-    centered = mesh.vertices - np.average(mesh.vertices, axis=0, weights=mesh.vertex_areas)
+    centered = mesh.vertices - mesh.average(mesh.vertices)
     positions = np.where(referenced[:, None], centered / np.sqrt(mesh.area), 0)
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
     # Unlike `device_put`, `jnp.asarray` would compile a program anew for each array size.

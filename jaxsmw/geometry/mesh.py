@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import igl
 import numpy as np
-from jaxtyping import Bool, Float64, Int32, Int64, Shaped
+from jaxtyping import Bool, Float, Float64, Int32, Int64, Shaped
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial import KDTree
@@ -107,6 +107,13 @@ class Mesh:
         vertices have area 0.
         """
         return self._sum_at_vertices(self.face_areas / 3)
+
+    def average(self, values: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, ...] | np.floating:
+        """Return the mean of values at the vertices (n, ...) over the surface, in the unit of the values.
+
+        Each vertex is weighted with its area.
+        """
+        return np.average(values, axis=0, weights=self.vertex_areas)
 
     @cached_property
     def vertex_normals(self) -> Float64[np.ndarray, "n 3"]:

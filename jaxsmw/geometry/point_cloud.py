@@ -8,6 +8,7 @@ orients the surface consistently.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -274,7 +275,13 @@ def _inside(
     scale = 1 / np.sqrt(diagonal[:count])
     scaled = sp.diags_array(scale) @ matrix[:count, :count] @ sp.diags_array(scale)
     right_hand_side = -scale * matrix[:count, [count]].toarray()[:, 0]
-    labels, _ = cg(scaled, right_hand_side, rtol=_TOLERANCE, maxiter=_ITERATIONS)
+    labels, unfinished = cg(scaled, right_hand_side, rtol=_TOLERANCE, maxiter=_ITERATIONS)
+    if unfinished:
+        warnings.warn(
+            f"the inside of the point cloud was not determined exactly in {_ITERATIONS} iterations: look at "
+            "the surface, or give the points with normals.",
+            stacklevel=2,
+        )
     return np.append(labels, 1.0)[unknown] < 0
 
 

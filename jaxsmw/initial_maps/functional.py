@@ -37,12 +37,16 @@ def functional_features(
     spectrum_x, spectrum_y = sampled.x.spectrum, sampled.y.spectrum
     dtype = spectrum_x.eigenvectors.dtype
     shot_x, shot_y = (jnp.asarray(descriptors, dtype) for descriptors in sampled.shot)
+    on_samples = any(shape.samples is not None for shape in sampled.sides)
+    projected = DescriptorPair.project(
+        shot_x, shot_y, spectrum_x, spectrum_y, pseudo_inverse="least_squares" if on_samples else "area"
+    )
     solution = RegularizedLeastSquares(
         wavelet_preservation=None,
         orthogonality=None,
         descriptor_preservation=jnp.asarray(1.0, dtype),
         laplacian_commutativity=jnp.asarray(_COMMUTATIVITY, dtype),
-        descriptors=DescriptorPair.project(shot_x, shot_y, spectrum_x, spectrum_y),
+        descriptors=projected,
     )
     functional_map, result = solution.minimize(None, spectrum_x.eigenvalues, spectrum_y.eigenvalues)
     if result != RESULTS.successful:

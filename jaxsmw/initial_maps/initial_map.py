@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import get_args
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int, Int64
 from numpy.typing import ArrayLike
 
 from jaxsmw.choices import InitialMap
@@ -16,7 +16,7 @@ from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surfac
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.initial_maps.alignment import aligned_features
 from jaxsmw.initial_maps.functional import functional_features
-from jaxsmw.initial_maps.landmarks import landmark_features
+from jaxsmw.initial_maps.landmarks import check_landmarks, landmark_features
 from jaxsmw.initial_maps.nearest import nearest_map
 from jaxsmw.initial_maps.signatures import SIGNATURES, signature_features
 from jaxsmw.pair import Pair
@@ -66,11 +66,37 @@ def initial_map(
     another mesh, a mesh that is too coarse for SHOT, or signatures that are not finite. `ArithmeticError` if
     the functional map of `"functional"` cannot be computed.
     """
+    given = check_initial_map(pair, init)
+    if isinstance(given, np.ndarray) and given.ndim == 1:
+        return extend_to_unreferenced(pair.mesh_x, given)
+    sampled = sampled or sample_pair(pair, spectrum_x, spectrum_y)
+    if isinstance(given, str):
+        return extend_to_unreferenced(pair.mesh_x, nearest_map(sampled, *_features(sampled, given)))
+    found = nearest_map(sampled, *_finite(sampled, "landmark", landmark_features(sampled, given)))
+    found[given[:, 0]] = given[:, 1]
+    return extend_to_unreferenced(pair.mesh_x, found)
+
+
+def check_initial_map(
+    pair: Pair, init: InitialMap | ArrayLike | SurfacePoints
+) -> InitialMap | Int64[np.ndarray, " m"] | Int[np.ndarray, "l 2"]:
+    """Check the argument `init` of `initial_map` without computing anything on the meshes.
+
+    **Returns:** The name of a method, a map (m,) of 0-based vertices of Y, or landmarks (l, 2). A
+    `SurfacePoints` becomes a map to the nearest corners.
+
+    **Raises:** `InputError` for an unknown name, an array that is neither a map nor landmarks, or indices
+    that are out of range or belong to unreferenced vertices.
+    """
     if isinstance(init, SurfacePoints):
         init = check_surface_points(init, pair.mesh_y, "initial map").nearest_corners(pair.mesh_y)
     if isinstance(init, str):
-        sampled = sampled or sample_pair(pair, spectrum_x, spectrum_y)
-        return extend_to_unreferenced(pair.mesh_x, nearest_map(sampled, *_features(sampled, init)))
+        if init not in INITIAL_MAPS:
+            raise InputError(
+                f"{init!r} is not an initial map: choose {', '.join(INITIAL_MAPS)}, or give landmarks or a "
+                "map."
+            )
+        return init
     given = np.asarray(init)
     if not np.issubdtype(given.dtype, np.integer):
         raise InputError(
@@ -78,17 +104,15 @@ def initial_map(
             "integers."
         )
     if given.ndim == 1:
-        return extend_to_unreferenced(pair.mesh_x, _checked_map(pair, init))
-    sampled = sampled or sample_pair(pair, spectrum_x, spectrum_y)
-    found = nearest_map(sampled, *_finite(sampled, "landmark", landmark_features(sampled, given)))
-    found[given[:, 0]] = given[:, 1]
-    return extend_to_unreferenced(pair.mesh_x, found)
+        return _checked_map(pair, init)
+    check_landmarks(pair, given)
+    return given
 
 
 _Features = tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]
 
 
-def _features(sampled: SampledPair, init: str) -> _Features:
+def _features(sampled: SampledPair, init: InitialMap) -> _Features:
     """Compute the features of both shapes for the initial map of the given name."""
     if init == "shot":
         features = sampled.shot
@@ -96,12 +120,8 @@ def _features(sampled: SampledPair, init: str) -> _Features:
         features = signature_features(sampled, init)
     elif init == "functional":
         features = functional_features(sampled)
-    elif init == "aligned":
-        features = aligned_features(sampled)
     else:
-        raise InputError(
-            f"{init!r} is not an initial map: choose {', '.join(INITIAL_MAPS)}, or give landmarks or a map."
-        )
+        features = aligned_features(sampled)
     return _finite(sampled, init, features)
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int64
 from jaxsmw.descriptors import SampledPair, SampledShape
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import geodesic_distances
+from jaxsmw.pair import Pair
 
 # Distances to landmarks, in units of the square root of the area, are multiplied by this weight. A distance
 # of half a unit becomes 1, which is the norm of a SHOT descriptor. On pairs of real bodies, weights from 1 to
@@ -26,14 +27,26 @@ def landmark_features(
     **Arguments:**
 
     - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
-    - `landmarks`: integers (l, 2), with a vertex of X and its match on Y in each row.
+    - `landmarks`: landmarks (l, 2) that `check_landmarks` has checked.
 
     **Returns:** The features of X (m, d) and of Y (n, d), where m and n are the numbers of compared vertices.
     The first 352 columns are SHOT, and the other l columns are distances.
 
+    **Raises:** `InputError` if a mesh is too coarse for SHOT.
+    """
+    sides = zip(sampled.sides, landmarks.T, sampled.pair.units_of_length, sampled.shot, strict=True)
+    of_x, of_y = (
+        np.hstack([described, distance_features(side, vertices.astype(np.int64), unit)])
+        for side, vertices, unit, described in sides
+    )
+    return of_x, of_y
+
+
+def check_landmarks(pair: Pair, landmarks: np.ndarray) -> None:
+    """Check that integers are landmarks of a pair: a vertex of X and its match on Y in each row.
+
     **Raises:** `InputError` if `landmarks` does not have the shape (l, 2), or gives two matches to one vertex
-    of X. `InputError` is also raised if a number in `landmarks` is not a referenced vertex, or if a mesh is
-    too coarse for SHOT.
+    of X. `InputError` is also raised if a number in `landmarks` is not a referenced vertex.
     """
     if landmarks.shape[1:] != (2,) or not len(landmarks):
         raise InputError(
@@ -43,13 +56,10 @@ def landmark_features(
     for vertex in landmarks[:, 0]:
         if len(matches := np.unique(landmarks[landmarks[:, 0] == vertex, 1])) > 1:
             raise InputError(
-                f"landmark {vertex} of {sampled.x.mesh.name} has two matches, {matches[0]} and {matches[1]} "
-                f"of {sampled.y.mesh.name}: remove one of them."
+                f"landmark {vertex} of {pair.mesh_x.name} has two matches, {matches[0]} and {matches[1]} of "
+                f"{pair.mesh_y.name}: remove one of them."
             )
-    features = []
-    zipped = zip(sampled.sides, landmarks.T, sampled.pair.units_of_length, sampled.shot, strict=True)
-    for side, vertices, unit, described in zipped:
-        mesh = side.mesh
+    for mesh, vertices in zip(pair.meshes, landmarks.T, strict=True):
         outside = (vertices < 0) | (vertices >= len(mesh.vertices))
         if outside.any() or not mesh.referenced_vertices[vertices].all():
             wrong = vertices[outside] if outside.any() else vertices[~mesh.referenced_vertices[vertices]]
@@ -57,8 +67,6 @@ def landmark_features(
                 f"landmark {wrong[0]} is not a vertex in a face of {mesh.name}: choose a vertex in a face, "
                 f"from 0 to {len(mesh.vertices) - 1}."
             )
-        features.append(np.hstack([described, distance_features(side, vertices.astype(np.int64), unit)]))
-    return features[0], features[1]
 
 
 def distance_features(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import count, islice
 
 import equinox as eqx
@@ -129,9 +128,9 @@ class Alternatives:
 
     def _without_faults(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Refine each outcome without each of its faults."""
-        sound = [(outcome, ~fault) for outcome in outcomes for fault in self.judge.faults(outcome)]
-        maps = [self._reduced(self.prepared.unpadded_map(one.pointwise_map)) for one, _ in sound]
-        return self._refined(maps, [mask[self.x.samples.vertices] for _, mask in sound])
+        faulty = [(outcome, fault) for outcome in outcomes for fault in self.judge.faults(outcome)]
+        maps = [self._reduced(self.prepared.unpadded_map(one.pointwise_map)) for one, _ in faulty]
+        return self._refined(maps, [fault[self.x.samples.vertices] for _, fault in faulty])
 
     def _initial_maps(self) -> Iterator[SampleMap]:
         """Yield the initial maps of samples."""
@@ -197,15 +196,15 @@ class Alternatives:
         return side_by_side(of_one, *zip((self.x, self.y), self.pair.units_of_length, strict=True))
 
     def _refined(
-        self, initial: Sequence[SampleMap], sound: Sequence[Bool[np.ndarray, " s"]] | None = None
+        self, initial: Sequence[SampleMap], faults: Sequence[Bool[np.ndarray, " s"]] | None = None
     ) -> list[Outcome]:
         """Refine maps of samples.
 
         **Arguments:**
 
         - `initial`: the maps.
-        - `sound`: for each map, a mask of samples of X (s,). The other samples have weight zero. The default
-          is all samples.
+        - `faults`: for each map, a mask of the samples of X (s,) that are left out. The default is to use all
+          samples.
 
         **Returns:** The successful outcomes with maps of vertices, those of the best score first.
         """
@@ -213,10 +212,7 @@ class Alternatives:
         size, used = len(x.mask), len(self.x.areas)
         outcomes = []
         for number, start in enumerate(initial):
-            weighted = x
-            if sound is not None:
-                areas = jnp.where(pad_rows(sound[number], size), x.vertex_areas, 0)
-                weighted = replace(x, vertex_areas=areas)
+            weighted = x if faults is None else x.excluding(jnp.asarray(pad_rows(faults[number], size)))
             padded = jax.device_put(pad_rows(start, size).astype(np.int32))
             found = self._stage.run(weighted, y, padded, partial=self.pair.partial)
             if found.result == RESULTS.successful:

@@ -34,8 +34,8 @@ def refine_batch(
     - `stages`: the stages, in the order in which they run.
     - `batch_size`, `devices`: see `jaxsmw.refine_pairs`.
 
-    **Returns:** One `Outcome` with padded maps per pair, in the order of `prepared`. If a stage fails for a
-    pair, the later stages still run for this pair, and `Outcome.successful` is False.
+    **Returns:** One `Outcome` with padded maps per pair, in the order of `prepared`. The outcome of a pair
+    contains no stages after the first stage that failed for this pair.
     """
     spectra: dict[int, Spectrum] = {}
     samples: dict[int, jax.Array | None] = {}
@@ -51,7 +51,7 @@ def refine_batch(
         chosen = None
         if stage.number_of_samples is not None:
             chosen = [of_shape[: stage.number_of_samples] for of_shape in samples.values()]  # type: ignore[index]
-        refinements = refine_pairs(
+        found_pairs = refine_pairs(
             [stage.view(spectrum, spectrum)[0] for spectrum in spectra.values()],
             pairs,
             maps,
@@ -60,9 +60,11 @@ def refine_batch(
             devices=devices,
             **stage.settings,
         )
-        for number, found in refinements:
+        for number, found in found_pairs:
             maps[number] = np.asarray(found.pointwise_map)
             padded = prepared[number].padded_map(maps[number].astype(np.int64))
             found = eqx.tree_at(lambda tree: tree.pointwise_map, found, padded)
-            outcomes[number] = outcomes[number]._replace(refinements=[*outcomes[number].refinements, found])
+            if outcomes[number].successful:  # if not, the stage ran from the map of a failure
+                refinements = [*outcomes[number].refinements, found]
+                outcomes[number] = outcomes[number]._replace(refinements=refinements)
     return outcomes

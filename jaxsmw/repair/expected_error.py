@@ -14,7 +14,7 @@ from jaxsmw.repair.scores import (
     edge_lengths,
     orientation_reversal,
 )
-from jaxsmw.repair.settings import ExpectedErrorSettings
+from jaxsmw.repair.settings import ExpectedErrorSettings, ScoreSettings
 
 
 def expected_error(
@@ -24,6 +24,7 @@ def expected_error(
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     settings: ExpectedErrorSettings = ExpectedErrorSettings(),  # noqa: B008 (immutable)
+    scores: ScoreSettings = ScoreSettings(),  # noqa: B008 (immutable)
 ) -> Float[np.ndarray, " m"]:
     """Estimate the geodesic error of every match without ground truth.
 
@@ -46,6 +47,7 @@ def expected_error(
     - `reverse_map`: a map Y -> X (n,), 0-based vertices of X.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, in `Pair.units_of_length` and without padding.
     - `settings`: the weights of the estimate.
+    - `scores`: the settings of the faults and of the area-based shape difference.
 
     **Returns:** The expected geodesic distance between every match and the true match (m,), divided by the
     square root of Y's area.
@@ -63,15 +65,15 @@ def expected_error(
     )
     signs = settings.detour_weight * detour + settings.distortion_weight * length_change
     heat = np.exp(-settings.heat_time * eigenvalues) * (eigenvectors.T @ (areas * signs))
-    misplaced = discontinuous_parts(pair, pointwise_map)
-    misplaced |= orientation_reversal(pair, pointwise_map, spectrum_x)
+    misplaced = discontinuous_parts(pair, pointwise_map, scores)
+    misplaced |= orientation_reversal(pair, pointwise_map, spectrum_x, scores)
     # On a swapped limb, the error of a match grows with the size of the limb.
     inside = misplaced[mesh_x.edges].all(axis=1)
     number, component = connected_components(mesh_x.edges[inside], m)
     sizes = np.sqrt(np.bincount(component, areas, number))[component]
     expected = np.maximum(eigenvectors @ heat, 0)
     if not pair.partial:
-        difference = area_shape_difference(pair, pointwise_map, spectrum_x, spectrum_y)
+        difference = area_shape_difference(pair, pointwise_map, spectrum_x, spectrum_y, scores)
         expected *= 1 + settings.area_weight * np.log(max(difference / settings.isometric_difference, 1))
     expected += settings.misplaced_weight * misplaced * sizes
     return expected * unit_y / pair.mesh_y.area**0.5

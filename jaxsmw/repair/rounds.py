@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
-import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int64
+from jaxtyping import Array, Bool, Int, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.preparation import PreparedPair
@@ -41,11 +41,11 @@ def refine_in_stages(
     1. Alternatives: `jaxsmw.repair.alternatives` refines many initial maps on a thousand samples. From each
        of the best maps, at most `finalists`, the repeated stage and all later stages run. Of these outcomes
        and the first outcome, the outcome with the best score is kept. If it looks right, repair ends.
-    2. Rounds: each round runs the repeated stage and all later stages again. In the repeated stage, vertices
-       with a fault in the previous map have weight zero. If a map has both orientation reversal and
-       discontinuous parts, successive rounds leave out these two faults alternately. If the outcome of the
-       second-best score has faults, it is repaired in the same way. It is used if all its faults disappear
-       and its score is the best.
+    2. Rounds: each round runs the repeated stage and all later stages again. The first functional map of the
+       repeated stage is computed without the vertices that have a fault in the previous map. If a map has
+       both orientation reversal and discontinuous parts, successive rounds leave out these two faults
+       alternately. If the outcome of the second-best score has faults, it is repaired in the same way. It is
+       used if all its faults disappear and its score is the best.
     3. Fallback: the repeated stage and all later stages run once more, from the best outcome of the rounds.
        The repeated stage then uses the numbers of eigenvectors in `fallback_levels`. The map of the fallback
        is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
@@ -187,29 +187,25 @@ class _Repairer:
     def _without_faults(self, outcome: Outcome) -> Outcome:
         """Run rounds of repair and return the best outcome.
 
-        Each round chooses one kind of fault of the previous map. Vertices with this fault have weight zero in
-        the repeated stage.
+        Each round chooses one kind of fault of the previous map. The first functional map of the repeated
+        stage is computed without the vertices with this fault. Later iterations match all samples again.
         """
-        (spectrum_x, _), _ = self.runner.steps[self.settings.stage]
-        areas = np.asarray(spectrum_x.vertex_areas)
         best = last = outcome
         for done in range(self.settings.rounds):
             if not (last.successful and best.suspicious and (faults := self.judge.faults(last))):
                 break
-            fault = faults[done % len(faults)]
-            sound = np.where(pad_rows(fault, len(areas)), 0, areas)
-            last = self._from_repeated(last, weights=jax.device_put(sound))
+            last = self._from_repeated(last, excluded=faults[done % len(faults)])
             best = min(best, last, key=self.judge.score)
         return best
 
     def _from_repeated(
-        self, outcome: Outcome, stage: Stage | None = None, weights: Float[Array, " m"] | None = None
+        self, outcome: Outcome, stage: Stage | None = None, excluded: Bool[np.ndarray, " m"] | None = None
     ) -> Outcome:
         """Run the repeated stage and all later stages from the map of an outcome, and judge the result."""
-        return self.judge.judged(self._repeated(outcome, stage, weights))
+        return self.judge.judged(self._repeated(outcome, stage, excluded))
 
     def _repeated(
-        self, outcome: Outcome, stage: Stage | None = None, weights: Float[Array, " m"] | None = None
+        self, outcome: Outcome, stage: Stage | None = None, excluded: Bool[np.ndarray, " m"] | None = None
     ) -> Outcome:
         """Run the repeated stage and all later stages from the map of an outcome.
 
@@ -217,12 +213,13 @@ class _Repairer:
 
         - `outcome`: the outcome. The refinements of its stages before the repeated stage are kept.
         - `stage`: a stage that runs instead of the repeated stage.
-        - `weights`: the weights of the vertices of X in the repeated stage (m,), instead of their areas.
+        - `excluded`: a mask of the vertices of X (m,) that the repeated stage leaves out. If the stage uses
+          samples, the vertices are left out only in its first functional map.
         """
         position = self.settings.stage
         (spectrum_x, spectrum_y), usual = self.runner.steps[position]
-        if weights is not None:
-            spectrum_x = replace(spectrum_x, vertex_areas=weights)
+        if excluded is not None:
+            spectrum_x = spectrum_x.excluding(jnp.asarray(pad_rows(excluded, len(spectrum_x.mask))))
         before = Outcome([], outcome.pointwise_map)
         repeated = self.runner.run_one((spectrum_x, spectrum_y), stage or usual, before)
         finished = self.runner.run(position + 1, repeated)

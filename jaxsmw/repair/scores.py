@@ -46,7 +46,7 @@ def dirichlet_energy_ratio(
 
     def energy(positions: Float[np.ndarray, "m 3"]) -> float:
         # A constant offset of the positions has no energy but would cause rounding errors.
-        centered = positions - np.average(positions, axis=0, weights=pair.mesh_x.vertex_areas)
+        centered = positions - pair.mesh_x.average(positions)
         # The product uses the type of the eigenvectors, because a converted copy of the eigenvectors of a
         # large mesh takes too much memory.
         weighted = (areas[:m] * centered.T).astype(eigenvectors.dtype)
@@ -67,9 +67,10 @@ def distortion(
 
     The distortion is the `dirichlet_energy_ratio` times `1 + orientation_weight * share`, where `share` is
     the share of X's area with `orientation_reversal`. Without the factor for orientation reversal, a map that
-    mirrors the body would have a smaller distortion than a map with swapped legs. For two full shapes, an
-    energy ratio below 1 is replaced by its inverse. The ratio of a partial pair is not inverted, because
-    large parts of the full shape have no match.
+    mirrors the body would have a smaller distortion than a map with swapped legs. An energy ratio below 1 is
+    replaced by its inverse, because a map that collapses a part of X is as wrong as a map that stretches it.
+    If Y is a partial shape, large parts of X have no match, so the energy of a correct map can fall to the
+    share of X's area that Y covers. This share then replaces the numerator 1 of the inverse.
 
     Correct maps from `Registration` have a distortion of at most 1.12 between poses of one body, and at most
     1.2 between non-isometric shapes. Most maps with swapped limbs have a distortion above 1.3.
@@ -86,8 +87,8 @@ def distortion(
     reversed_ = orientation_reversal(pair, pointwise_map, spectrum_x, settings)
     share = float(pair.mesh_x.vertex_areas[reversed_].sum() / pair.mesh_x.area)
     ratio = dirichlet_energy_ratio(pair, pointwise_map, spectrum_x, settings)
-    if not pair.partial:
-        ratio = max(ratio, 1 / max(ratio, 1e-6))
+    least = min(1.0, pair.mesh_y.area / pair.mesh_x.area) if pair.partial else 1.0
+    ratio = max(ratio, least / max(ratio, 1e-6))
     return ratio * (1 + settings.orientation_weight * share)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from jaxsmw.errors import check_number, check_whole_number
+
 
 @dataclass(frozen=True)
 class ScoreSettings:
@@ -165,7 +167,7 @@ class RepairSettings:
     - `suspicious_area` (Table R28): a number from 0 to 1. A map with a fault of at least this share of X's
       area is suspicious as well.
     - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
-      value, which should be at least `suspicious`. Between non-isometric shapes, some correct maps have
+      value. A value below `suspicious` has no effect. Between non-isometric shapes, some correct maps have
       distortions up to this value.
     - `negligible_area`: a fault with at most this share of X's area, from 0 to 1, is not repaired. Small
       faults, such as at fingertips, appear and disappear by chance.
@@ -193,8 +195,8 @@ class RepairSettings:
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 
-    The constructor checks nothing. `Preset` raises `InputError` if the stage at position `stage` does not
-    exist or has a refiner without levels.
+    **Raises:** `InputError` if a number is out of its range. `Preset` raises `InputError` if the stage at
+    position `stage` does not exist or has a refiner without levels.
     """
 
     stage: int = 1
@@ -215,8 +217,18 @@ class RepairSettings:
     alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
 
+    def __post_init__(self) -> None:
+        for name in ("stage", "rounds", "finalists", "passes"):
+            check_whole_number(name, getattr(self, name), 0)
+        for name in ("suspicious_area", "negligible_area", "excessive_area"):
+            check_number(name, getattr(self, name), most=1.0)
+        for name in ("uncertainty_weight", "deformation_weight", "score_tolerance", "non_isometric"):
+            check_number(name, getattr(self, name))
+        for name in ("suspicious", "doubtful", "aligned_preference"):
+            check_number(name, getattr(self, name), positive=True)
 
-WITHOUT_REPAIR = RepairSettings(suspicious=1.25, suspicious_area=1.0)
+
+WITHOUT_REPAIR = RepairSettings(suspicious=1.25, suspicious_area=1.0, doubtful=1.25)
 """The settings by which `match` judges the map of a preset that has no repair. (Entry R25)"""
 
 

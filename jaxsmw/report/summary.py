@@ -406,11 +406,11 @@ def summarize(
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     if correspondence.distortion is not None:
-        settings, suspicion = correspondence.preset.repair or WITHOUT_REPAIR, ""
-        if correspondence.suspicious:
-            suspicion = f"; above {settings.suspicious} limbs may be swapped"
+        limit, suspicion = (correspondence.preset.repair or WITHOUT_REPAIR).suspicious, ""
+        if correspondence.distortion >= limit:
+            suspicion = f"; above {limit} limbs may be swapped"
         facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
-    facts["expected error, mean"] = f"{expected_error.mean():.4f} √area"
+    facts["expected error, mean"] = f"{correspondence.mesh_x.average(expected_error):.4f} √area"
     if (probability := correspondence.wrong_probability(expected_error)) is not None:
         facts["probability of a wrong part"] = percentage(probability)
     steps = correspondence.seconds if seconds is None else seconds

@@ -15,6 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, Int32
 
+from jaxsmw.choices import ITERATIONS
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -66,7 +67,7 @@ def refine_pairs(
     pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     *,
     refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
-    iterations: int = 3,
+    iterations: int = ITERATIONS,
     samples: Sequence[Int[Array, " _"]] | None = None,
     partial: bool = False,
     stop_when_unchanged: bool = False,

@@ -12,7 +12,18 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-_PACKAGES = ("jaxsmw", "jax", "jaxlib", "numpy", "scipy", "libigl")
+_PACKAGES = (
+    "jaxsmw",
+    "jax",
+    "jaxlib",
+    "numpy",
+    "scipy",
+    "equinox",
+    "lineax",
+    "optimistix",
+    "libigl",
+    "robust-laplacian",
+)
 _LIBRARY = Path(__file__).parents[1]
 
 

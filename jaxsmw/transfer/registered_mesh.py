@@ -200,6 +200,7 @@ def register_mesh(
     **Returns:** A `RegisteredMesh` with positions `vertices` (m, 3) in the unit of Y.
 
     **Raises:** `InputError` if the points do not fit the meshes, or the stiffness is not positive and finite.
+    `ArithmeticError` if the deformation does not converge.
     """
     if not 0 < stiffness < np.inf:
         raise InputError(
@@ -316,9 +317,13 @@ def _follow(
     with one_blas_thread():
         for axis, tolerance in enumerate(tolerances):
             # An absolute tolerance stops at the same accuracy if few vertices move.
-            found, _ = cg(
+            found, unfinished = cg(
                 system, residual[:, axis], rtol=0, atol=tolerance, M=preconditioner, maxiter=10 * len(weights)
             )
+            if unfinished:
+                raise ArithmeticError(
+                    "the deformation onto the target did not converge: give another stiffness."
+                )
             moved[rows, axis] += found
     return moved
 

@@ -13,7 +13,7 @@ from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.banks.base import sample_bank
 from jaxsmw.core.checks import check_choice, check_kind
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.core.pointwise_map import chosen_patches, spectral_embeddings
+from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import Patches, nearest_vertices
@@ -139,11 +139,3 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     ) -> Float[Array, ""]:
         """Return the energy of equation (5) of the MWP paper, with the vertex areas as weights."""
         return prepared.wavelets.energy(pointwise_map)(state.functional_map)
-
-    def embeddings(
-        self, prepared: PreparedWavelets, state: State
-    ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Return the `spectral_embeddings` of the functional map."""
-        return spectral_embeddings(
-            state.functional_map, prepared.spectrum_x, prepared.spectrum_y, convention=self.convention
-        )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from jaxsmw.core.functional_map import dual_eigenvectors
+from jaxsmw.core.functional_map import PseudoInverse, dual_eigenvectors
 from jaxsmw.core.products import product
 from jaxsmw.core.spectrum import Spectrum
 
@@ -16,7 +18,7 @@ class ProjectedDescriptors(eqx.Module):
 
     **Attributes:**
 
-    - `coefficients`: (k, d), the coefficients `Phi^+ f` of each function f, with `Phi^+ = Phi^T A`.
+    - `coefficients`: (k, d), the coefficients `Phi^+ f` of each function f, with the pseudo-inverse `Phi^+`.
     - `operators`: (d, k, k), one matrix `Phi^+ diag(f) Phi` per function f. This matrix multiplies other
       functions by f (Nogneng and Ovsjanikov 2017). The attribute is None if no operators were computed.
     """
@@ -26,14 +28,18 @@ class ProjectedDescriptors(eqx.Module):
 
     @classmethod
     def project(
-        cls, descriptors: Float[Array, "n d"], spectrum: Spectrum, *, operators: bool
+        cls,
+        descriptors: Float[Array, "n d"],
+        spectrum: Spectrum,
+        *,
+        operators: bool,
+        pseudo_inverse: PseudoInverse,
     ) -> ProjectedDescriptors:
         """Project the values (n, d) of d functions at the vertices of one shape onto its eigenbasis.
 
-        If `operators` is True, the method also computes the multiplication operators. Only
-        `DescriptorPair.project` checks the shapes of the arrays.
+        The arguments are those of `DescriptorPair.project`, which also checks the shapes of the arrays.
         """
-        dual = dual_eigenvectors(spectrum, "area")
+        dual = dual_eigenvectors(spectrum, pseudo_inverse)
 
         def multiply(f: Float[Array, " n"]) -> Float[Array, "k k"]:
             return product((dual * f[:, None]).T, spectrum.eigenvectors)
@@ -86,6 +92,7 @@ class DescriptorPair(eqx.Module):
         spectrum_y: Spectrum,
         *,
         operators: bool = False,
+        pseudo_inverse: PseudoInverse = "area",
     ) -> DescriptorPair:
         """Return a `DescriptorPair` from the values of corresponding functions at the vertices of X and Y.
 
@@ -97,15 +104,15 @@ class DescriptorPair(eqx.Module):
         - `operators`: whether to compute the multiplication operators of both shapes as well. Each shape has
           d operators, which are matrices of size k x k. Descriptor commutativity needs these operators. The
           default is False.
+        - `pseudo_inverse`: the form of the pseudo-inverse `Phi^+`; see `jaxsmw.functional_maps.encode`. Use
+          `"least_squares"` for spectra of samples, whose eigenvectors are not orthonormal.
 
-        **Raises:** `ValueError` if the values do not have one row per vertex and one column per function, or
-        if X and Y have different numbers of functions.
+        **Raises:** `ValueError` if the pseudo-inverse is unknown, if the values do not have one row per
+        vertex and one column per function, or if X and Y have different numbers of functions.
         """
         for name, values, spectrum in (("X", descriptors_x, spectrum_x), ("Y", descriptors_y, spectrum_y)):
             n = spectrum.mask.shape[0]
             if values.ndim != 2 or values.shape[0] != n:
                 raise ValueError(f"descriptors of {name} have shape {values.shape}, but ({n}, d) is needed")
-        return cls(
-            ProjectedDescriptors.project(descriptors_x, spectrum_x, operators=operators),
-            ProjectedDescriptors.project(descriptors_y, spectrum_y, operators=operators),
-        )
+        project = partial(ProjectedDescriptors.project, operators=operators, pseudo_inverse=pseudo_inverse)
+        return cls(project(descriptors_x, spectrum_x), project(descriptors_y, spectrum_y))
