@@ -37,7 +37,8 @@ from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unreferenced
-from jaxsmw.pair import Pair
+from jaxsmw.initial_maps import check_initial_map
+from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision, Hands
@@ -470,30 +471,32 @@ def match(
     if adapts:
         chosen = chosen.fitted(fewest)
 
-    of_one_hand = pair.mirrored() if mirror == "yes" else pair
-    compiling = _compile_ahead(pair, chosen, history)
     automatic = isinstance(init, str) and init == "auto"
     first_init = DEFAULT_INITIAL_MAP if automatic else init
-    prepare_hand = functools.partial(
-        prepare,
-        laplacian=laplacian,
-        eigensolver=eigensolver,
-        number_of_eigenvectors=chosen.number_of_eigenvectors,
-        number_of_descriptors=chosen.number_of_descriptors,
-        number_of_samples=chosen.number_of_samples,
-        descriptors_required=not adapts,
-    )
-    prepared = prepare_hand(of_one_hand, init=first_init)
-    seconds = dict(prepared.seconds)
+    check_initial_map(pair, first_init)  # before the eigenbases, which take longer
+    compiling = _compile_ahead(pair, chosen, history)
+    seconds: dict[str, float] = {}
+    with timed("eigenbases", seconds):
+        spectra = paired_spectra(
+            pair, chosen.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
+        )
     decision = Decision(mirror == "yes")
     aligns = automatic and chosen.repair is not None  # if the shapes are asymmetric
     if (mirror == "auto" or aligns) and not partial:
         with timed("mirror test", seconds):
-            decision = Hands(pair, prepared.spectrum_x, prepared.spectrum_y).decide(mirror)
+            decision = Hands(pair, *spectra).decide(mirror)
         if decision.mirrored and mirror == "auto":
             logger.info("%s: the mirror image of the source is matched", pair.name)
-            prepared = prepare_hand(pair.mirrored(), init=first_init)
-            _add_seconds(prepared, seconds)
+    prepared = prepare(
+        pair.mirrored() if decision.mirrored else pair,
+        number_of_eigenvectors=chosen.number_of_eigenvectors,
+        number_of_descriptors=chosen.number_of_descriptors,
+        number_of_samples=chosen.number_of_samples,
+        init=first_init,
+        descriptors_required=not adapts,
+        spectra=(spectra[0].reflect(), spectra[1]) if decision.mirrored else spectra,
+    )
+    seconds |= prepared.seconds
     starts = [prepared]
     if aligns and decision.asymmetric:
         starts.append(prepared.started_from("aligned"))

@@ -133,8 +133,8 @@ def paired_spectra(
     spectrum of X has m vertices and k_X eigenvectors. The spectrum of Y has n vertices and k_Y eigenvectors.
     For two full shapes, k_X = k_Y = k.
 
-    **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`). For a partial
-    pair, `InputError` is also raised if all eigenvalues of a mesh are zero, or if the area of one mesh is
+    **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if all
+    eigenvalues of a mesh are zero. For a partial pair, `InputError` is also raised if the area of one mesh is
     less than a thousandth of the other area.
     """
     areas = pair.mesh_x.area, pair.mesh_y.area
@@ -151,12 +151,10 @@ def paired_spectra(
     )
     # `as_spectrum` runs outside of the threads, because threads do not inherit `jax.enable_x64`.
     spectrum_x, spectrum_y = as_spectrum(pair.mesh_x, *eigenpairs_x), as_spectrum(pair.mesh_y, *eigenpairs_y)
-    if not pair.partial:
-        return spectrum_x, spectrum_y
-    # If all eigenvalues of one mesh are zero, the common range contains only zero eigenvalues of the other
-    # mesh, too.
     for mesh, spectrum in zip(pair.meshes, (spectrum_x, spectrum_y), strict=True):
         check_eigenvalues(mesh, spectrum)
+    if not pair.partial:
+        return spectrum_x, spectrum_y
     scales = (area / max(areas) for area in areas)
     return common_range(
         *(s.scale(factor) for s, factor in zip((spectrum_x, spectrum_y), scales, strict=True))

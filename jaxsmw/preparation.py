@@ -20,7 +20,7 @@ from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.initial_maps import InitialMap, check_initial_map, initial_map
-from jaxsmw.pair import Pair, check_eigenvalues, paired_spectra
+from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.progress import timed
@@ -113,6 +113,7 @@ def prepare(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
     descriptors_required: bool = False,
+    spectra: tuple[Spectrum, Spectrum] | None = None,
 ) -> PreparedPair:
     """Compute the spectra, the initial map, the descriptors and the samples of a pair.
 
@@ -132,6 +133,7 @@ def prepare(
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. If False, the
       function issues a `UserWarning` instead, and the spectra contain no descriptors.
+    - `spectra`: the result of `jaxsmw.pair.paired_spectra` for this pair, if it was already computed.
 
     **Returns:** A `PreparedPair` with the attributes `spectrum_x`, `spectrum_y`, `initial_map` (m,) and
     `samples`. The initial map contains 0-based vertices of Y. The samples are a pair of arrays of vertices of
@@ -143,10 +145,11 @@ def prepare(
     """
     check_initial_map(pair, init)  # before the eigenbases, which take longer
     seconds: dict[str, float] = {}
-    with timed("eigenbases", seconds):
-        spectra = paired_spectra(pair, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
-    for mesh, spectrum in zip(pair.meshes, spectra, strict=True):
-        check_eigenvalues(mesh, spectrum)
+    if spectra is None:
+        with timed("eigenbases", seconds):
+            spectra = paired_spectra(
+                pair, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
+            )
     sampled = None
     with timed("initial map", seconds):
         if isinstance(init, str) or number_of_descriptors:

@@ -16,6 +16,7 @@ LIBRARY = Path(jaxsmw.__file__).parent
 LAYERS = (
     "errors",
     "choices",
+    "wording",
     "core",
     "runtime",
     "geometry",

@@ -38,9 +38,9 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.matching import match
-from jaxsmw.repair.wrong_probability import percentage
 from jaxsmw.report.texture import TEXTURE_FILES
 from jaxsmw.stage import Stage
+from jaxsmw.wording import percentage
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
 

@@ -331,6 +331,22 @@ def test_repeated_eigenvalues_have_equal_responses():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: HalfCosine(overlap=3.5), "overlap of HalfCosine must be an integer, not 3.5"),
+        (lambda: Itersine(overlap=2.0), "overlap of Itersine must be an integer, not 2.0"),
+        (lambda: Regular(1.5), "degree of Regular must be an integer, not 1.5"),
+        (lambda: Meyer(2.5), "Meyer needs a whole number of filters, not 2.5"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_numbers_that_must_be_integers(make, message):
+    """A half-integer overlap would make a bank that is not tight."""
+    with pytest.raises(TypeError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
         (lambda: Meyer(1), "Meyer needs at least 2 filters, not 1"),
         (lambda: SimpleTight(0), "SimpleTight needs at least 2"),
         (lambda: Itersine(1), "Itersine needs at least 2"),

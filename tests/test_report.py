@@ -15,9 +15,10 @@ from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import GeodesicError, geodesic_error
 from jaxsmw.matching import Correspondence, match
 from jaxsmw.presets import PRESETS
-from jaxsmw.repair.wrong_probability import percentage, wrong_probability
+from jaxsmw.repair.wrong_probability import wrong_probability
 from jaxsmw.report.summary import REPORT_FILES, summarize, write_comparison, write_report
 from jaxsmw.stage import Stage
+from jaxsmw.wording import percentage
 
 SOURCE = replace(TALL, vertices=TALL.vertices * (1 + 0.2 * np.sin(4 * TALL.vertices[:, [1]])), name="X.off")
 TARGET, NUMBER = renumbered(replace(SOURCE, name="Y.off"), seed=1)

@@ -23,7 +23,8 @@ from jaxsmw.repair.scores import (
     orientation_reversal,
 )
 from jaxsmw.repair.settings import ExpectedErrorSettings, ScoreSettings
-from jaxsmw.repair.wrong_probability import percentage, wrong_probability
+from jaxsmw.repair.wrong_probability import wrong_probability
+from jaxsmw.wording import percentage
 
 
 @pytest.fixture(scope="module")

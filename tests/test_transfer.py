@@ -10,6 +10,7 @@ from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
 from jaxsmw import Mesh, creature_pair, make_mesh, read_ground_truth, read_mesh
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import SurfacePoints
+from jaxsmw.geometry.rotations import nearest_rotations
 from jaxsmw.geometry.surface_distance import nearest_points_of_triangles, nearest_surface_points
 from jaxsmw.io import Landmarks, MeshData, Skin, Texture, read_mesh_data, write_mesh_data
 from jaxsmw.transfer import (
@@ -19,7 +20,7 @@ from jaxsmw.transfer import (
     transfer_attributes,
     transfer_landmarks,
 )
-from jaxsmw.transfer.neighborhoods import Neighborhoods, nearest_rotations
+from jaxsmw.transfer.neighborhoods import Neighborhoods
 from jaxsmw.transfer.registered_mesh import _follow
 
 TURN = Rotation.from_euler("zyx", [40, -70, 110], degrees=True).as_matrix()

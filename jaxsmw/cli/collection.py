@@ -190,8 +190,8 @@ def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
     **Raises:** `InputError` if the directory cannot be read, contains fewer than two mesh files, or does not
     contain an excluded file.
     """
-    from jaxsmw.geometry.mesh import count_of
     from jaxsmw.io.mesh_data import MESH_SUFFIXES
+    from jaxsmw.wording import count_of
 
     directory = options.directory
     try:
@@ -544,7 +544,7 @@ def _number(collection: Collection, name: str, file: str) -> int:
 
 
 def _show(collection: Collection, measures: Mapping[str, Any], *, scale: bool) -> None:
-    from jaxsmw.geometry.mesh import count_of
+    from jaxsmw.wording import count_of
 
     for sentence in collection.sentences():
         show(sentence)

@@ -74,7 +74,7 @@ def show_quality(correspondence: Correspondence, expected_error: Float[np.ndarra
         mean = correspondence.mesh_x.average(expected_error)
         parts.append(f"mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)")
         if (probability := correspondence.wrong_probability(expected_error)) is not None:
-            from jaxsmw.repair.wrong_probability import percentage
+            from jaxsmw.wording import percentage
 
             parts.append(f"wrong on a part of the body with probability {percentage(probability)}")
     if correspondence.suspicious:

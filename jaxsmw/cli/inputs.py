@@ -159,10 +159,10 @@ def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int
     **Returns:** An array (l, 2) with one row for each name that is in both files. A row contains the vertex
     of X nearest to the source landmark, and the vertex of Y nearest to the target landmark.
     """
-    from jaxsmw.geometry.mesh import count_of
     from jaxsmw.io.landmark_files import read_landmark_file
     from jaxsmw.io.landmarks import match_landmarks
     from jaxsmw.transfer.landmarks import nearest_vertices
+    from jaxsmw.wording import count_of
 
     both = [read_landmark_file(file) for file in files]
     matched = match_landmarks(*both)

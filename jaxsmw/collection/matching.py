@@ -38,7 +38,7 @@ from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes
 from jaxsmw.errors import InputError, check_number, check_whole_number
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components, count_of
+from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision
@@ -46,6 +46,7 @@ from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.workers import run_tasks
 from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, register_mesh
+from jaxsmw.wording import count_of
 
 logger = logging.getLogger("jaxsmw")
 

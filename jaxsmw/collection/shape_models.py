@@ -18,6 +18,7 @@ from scipy.spatial.distance import cdist
 
 from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.mesh import numeric_rows
+from jaxsmw.geometry.rotations import nearest_rotations
 from jaxsmw.runtime.threads import one_blas_thread
 
 # The alignment ends when the mean changes by less than this multiple of its size, or after `_MOST_ROUNDS`.
@@ -218,7 +219,7 @@ class ShapeModel:
         if _is_point(squared_size, centroid):
             raise InputError("the shape is a single point; give a shape with distinct vertices.")
         weighted = self.weights[:, None] * mean
-        rotations, fit = _nearest_rotations((weighted.T @ centered)[None])
+        rotations, fit = nearest_rotations((weighted.T @ centered)[None])
         factor = fit[0] / squared_size * self._common_factor(mean) if self.alignment.scaled else 1.0
         displacements = factor * (centered @ rotations[0].T) - mean
         return np.einsum("v,vc,kvc->k", self.weights, displacements, self.modes, optimize=True)
@@ -450,7 +451,7 @@ def _rotations_and_scales(
     with one_blas_thread():
         for _ in range(_MOST_ROUNDS):
             covariances = (combination @ flat).reshape(3, count, 3).transpose(1, 0, 2)
-            rotations, fit = _nearest_rotations(covariances)
+            rotations, fit = nearest_rotations(covariances)
             scales = fit / squared_sizes if scale else np.ones(count)
             updated = (scales[:, None, None] * rotations / count).transpose(1, 0, 2).reshape(3, 3 * count)
             if scale:
@@ -466,20 +467,6 @@ def _rotations_and_scales(
 def _squared_norm(combination: Float64[np.ndarray, "3 q"], products: Float64[np.ndarray, "q q"]) -> float:
     """Return the squared norm of a combination of the coordinates of shapes, given their inner products."""
     return max(float(np.sum((combination @ products) * combination)), 0.0)
-
-
-def _nearest_rotations(
-    covariances: Float64[np.ndarray, "N 3 3"],
-) -> tuple[Float64[np.ndarray, "N 3 3"], Float64[np.ndarray, " N"]]:
-    """Return the rotations R without reflection that maximise trace(R^T C), and the maxima.
-
-    C is the sum of target times moved point^T (Kabsch, "A solution for the best rotation to relate two sets
-    of vectors", 1976).
-    """
-    left, values, right = np.linalg.svd(covariances)
-    signs = np.ones_like(values)
-    signs[:, 2] = np.where(np.linalg.det(left @ right) < 0, -1, 1)
-    return (left * signs[:, None]) @ right, (values * signs).sum(axis=1)
 
 
 def _blocks(n: int) -> Iterator[slice]:

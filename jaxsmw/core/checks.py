@@ -33,7 +33,13 @@ def all_finite(tree: PyTree) -> Bool[Array, ""]:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in inexact]))
 
 
-def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+def check_integer(name: str, value: object) -> None:
+    """Raise `TypeError` if the value of an option is not an integer."""
+    if not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} must be an integer, not {value!r}")
+
+
+def check_option(name: str, value: str, choices: tuple[str, ...]) -> None:
     """Raise `ValueError` if the value of an option is not one of the choices."""
     if value not in choices:
         raise ValueError(f"{name}={value!r} is unknown: choose one of {', '.join(choices)}")

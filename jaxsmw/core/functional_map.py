@@ -56,7 +56,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxsmw.core.banks import frame_function
-from jaxsmw.core.checks import check_choice
+from jaxsmw.core.checks import check_option
 from jaxsmw.core.products import product
 from jaxsmw.core.soft_maps import PointwiseMap, pull_back
 from jaxsmw.core.spectrum import Spectrum
@@ -77,7 +77,7 @@ def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Si
 
     **Raises:** `ValueError` for an unknown convention.
     """
-    check_choice("convention", convention, get_args(Convention))
+    check_option("convention", convention, get_args(Convention))
     return (of_x, of_y) if convention == "pullback" else (of_y, of_x)
 
 
@@ -96,7 +96,7 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
 
     **Raises:** `ValueError` for an unknown pseudo-inverse.
     """
-    check_choice("pseudo_inverse", pseudo_inverse, get_args(PseudoInverse))
+    check_option("pseudo_inverse", pseudo_inverse, get_args(PseudoInverse))
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
     gram = product(spectrum.eigenvectors.T, spectrum.eigenvectors)

@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.checks import check_choice, check_kind, counts_iterations
+from jaxsmw.core.checks import check_kind, check_option, counts_iterations
 from jaxsmw.core.refinement import check_spectra, checked, diagnose
 from jaxsmw.core.refiner import Problem, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -106,7 +106,7 @@ def refine_softly(
     GMRES does not reach its tolerance. Reverse-mode derivatives then raise equinox's runtime error, and
     forward-mode derivatives are NaN.
     """
-    check_choice("differentiation", differentiation, get_args(Differentiation))
+    check_option("differentiation", differentiation, get_args(Differentiation))
     check_kind("refiner", refiner, WaveletPreservation)
     check_kind("recovery", recovery, Recovery)
     check_spectra(spectrum_x, spectrum_y)

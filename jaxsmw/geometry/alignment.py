@@ -9,6 +9,8 @@ from jaxtyping import Float64
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from jaxsmw.geometry.rotations import nearest_rotations
+
 # `_FIRST` iterations run from every rotation. `_FURTHER` iterations then run from the `_BEST` best results.
 _FIRST, _FURTHER = 10, 30
 _BEST = 5
@@ -129,6 +131,5 @@ def _principal_axes(points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "
 def _rigid_fit(x: Float64[np.ndarray, "p 3"], targets: Float64[np.ndarray, "p 3"]) -> Alignment:
     """Return the rigid motion that brings the points of x closest to their targets in least squares."""
     middle, middle_of_targets = x.mean(axis=0), targets.mean(axis=0)
-    left, _, right = np.linalg.svd((targets - middle_of_targets).T @ (x - middle))
-    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    (rotation,), _ = nearest_rotations(((targets - middle_of_targets).T @ (x - middle))[None])
     return Alignment(rotation, middle_of_targets - rotation @ middle)

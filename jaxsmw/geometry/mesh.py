@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.scans import between_neighbors, in_small_components, lost_vertices
+from jaxsmw.wording import count_of
 
 # A mesh of another library, in one of the forms that `make_mesh` lists. Such meshes are recognised by their
 # attributes, because the other libraries are not imported.
@@ -373,13 +374,6 @@ def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -
     extended = matches.copy()
     extended[~referenced] = matches[referenced][nearest]
     return extended
-
-
-def count_of(number: int, noun: str) -> str:
-    """Return a number with its noun in the singular or the plural."""
-    if number != 1:
-        noun = noun.removesuffix("ex") + "ices" if noun.endswith("ex") else noun + "s"
-    return f"{number} {noun}"
 
 
 def make_mesh(

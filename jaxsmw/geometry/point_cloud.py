@@ -20,8 +20,9 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, check_extent, count_of, first_equal_rows, make_mesh, numeric_rows
+from jaxsmw.geometry.mesh import Mesh, check_extent, first_equal_rows, make_mesh, numeric_rows
 from jaxsmw.geometry.scans import usable_positions
+from jaxsmw.wording import count_of
 
 FEWEST_POINTS = 20
 """The smallest number of different points that `triangulate_points` accepts."""

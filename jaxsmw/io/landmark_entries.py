@@ -11,9 +11,9 @@ from jaxtyping import Float64
 
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.landmarks import Landmarks, first_faulty_name, usable
 from jaxsmw.io.text import is_number
+from jaxsmw.wording import count_of
 
 MOST_LANDMARKS = 2**20
 """The largest number of landmarks in a file, so that no file can use gigabytes of memory."""

@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.landmark_entries import SYSTEMS, Entries, check_count, left_out, parse_positions
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.text import is_number
+from jaxsmw.wording import count_of
 
 _NAME_COLUMNS = ("name", "label", "landmark", "id", "point", "")
 _LONGEST_LINE = 2**16

@@ -13,9 +13,9 @@ import numpy as np
 
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.landmark_entries import SYSTEMS, Entries, left_out
 from jaxsmw.io.landmarks import Landmarks
+from jaxsmw.wording import count_of
 
 _SCHEMA = (
     "https://raw.githubusercontent.com/slicer/slicer/master/Modules/Loadable/Markups/Resources/Schema/"

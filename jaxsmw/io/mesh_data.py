@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of, make_mesh
+from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.point_cloud import triangulate_points
 from jaxsmw.io.formats.data import NORMALS, MeshData, Polygons, Skin, Texture, Written
 from jaxsmw.io.formats.gltf import parse_glb, parse_gltf
@@ -34,6 +34,7 @@ from jaxsmw.io.formats.vtk import format_vtk, parse_vtk
 from jaxsmw.io.formats.vtp import format_vtp, parse_vtp
 from jaxsmw.io.formats.xyz import parse_npy, parse_xyz
 from jaxsmw.runtime.files import atomic_write, read_bytes
+from jaxsmw.wording import count_of
 
 __all__ = ["MESH_SUFFIXES", "MeshData", "Skin", "Texture", "read_mesh_data", "write_mesh_data"]
 

@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.rotations import nearest_rotations
 from jaxsmw.geometry.sampling import SurfaceSamples
 
 
@@ -112,7 +113,6 @@ def deformation(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"], radius: floa
     mean_x, mean_y = columns[:, :3], columns[:, 3:6]
     covariance = columns[:, 6:15].reshape(-1, 3, 3) - np.einsum("sa,sb->sab", mean_x, mean_y)
     size = columns[:, 15] - np.sum(mean_x**2 + mean_y**2, axis=1)
-    left, values, right = np.linalg.svd(covariance)
-    values[:, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))
-    residual = size - 2 * values.sum(axis=1)
+    _, traces = nearest_rotations(covariance)
+    residual = size - 2 * traces
     return float(x.areas @ np.clip(residual / np.maximum(size, np.finfo(float).tiny), 0, 1))

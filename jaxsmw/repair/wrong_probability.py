@@ -35,10 +35,3 @@ def wrong_probability(
         + settings.expected_error_weight * math.log(max(mean_expected_error, tiny))
     )
     return 1 / (1 + math.exp(-min(max(evidence, -500), 500)))
-
-
-def percentage(probability: float) -> str:
-    """Return a probability as text: a whole number of per cent, or a bound near 0 and 1."""
-    if probability < 0.01:
-        return "below 1 %"
-    return "above 99 %" if probability > 0.99 else f"{100 * probability:.0f} %"

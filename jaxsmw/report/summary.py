@@ -27,7 +27,6 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching import Correspondence
 from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.repair.settings import WITHOUT_REPAIR
-from jaxsmw.repair.wrong_probability import percentage
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
@@ -43,6 +42,7 @@ from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.provenance import machine, versions
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
+from jaxsmw.wording import percentage
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

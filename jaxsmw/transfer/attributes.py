@@ -11,12 +11,13 @@ from jaxtyping import Float64, Int64, Shaped
 from scipy.sparse import csr_array
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, count_of
+from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.io.formats.data import COLORS, NORMALS
 from jaxsmw.io.mesh_data import MeshData, Skin, Texture
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
 from jaxsmw.transfer.textures import transfer_texture
+from jaxsmw.wording import count_of
 
 # A vertex of the target is far from the registered mesh if its distance exceeds this number times the square
 # root of the target's area. The vertex then probably belongs to a part that the source lacks.

@@ -12,13 +12,11 @@ from jaxtyping import Float64, Int64
 from scipy.sparse import csr_array, diags_array
 
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.rotations import nearest_rotations
 
 # The number of averagings of moments. More averagings enlarge the neighbourhood of each vertex. With fewer
 # averagings, the similarity transformations follow the noise of the map. (Entry R22 of docs/research_log.md)
 _AVERAGINGS = 8
-# Newton's method for the trace converges in 4 to 14 steps if the divisor exceeds `_AMBIGUOUS`. The error of a
-# rotation is then below 1e-10.
-_NEWTON_STEPS, _AMBIGUOUS = 16, 1e-3
 # Cotangent weights of very obtuse triangles are negative, and those of slivers are huge. Weights are limited
 # to the range from 1/_WEIGHT_RANGE to _WEIGHT_RANGE times the median weight.
 _WEIGHT_RANGE = 10.0
@@ -161,52 +159,3 @@ class Neighborhoods:
             columns = np.ascontiguousarray(matrices[:, :, axis])
             sums += total[:, None] * columns + matrix @ columns
         return 0.5 * sums
-
-
-def nearest_rotations(
-    moments: Float64[np.ndarray, "n 3 3"],
-) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, " n"]]:
-    """Find the rotation R that maximises the trace of Rᵀ M, for each matrix M.
-
-    The maximal trace is the largest root of a polynomial of degree four, which Newton's method finds. The
-    rotation then has a closed form (Markley, "Attitude determination using vector observations: a fast
-    optimal matrix algorithm", 1993). This takes a tenth of the time of a singular value decomposition.
-    The decomposition is computed only where the rotation is nearly ambiguous.
-
-    **Returns:** The rotations (n, 3, 3), with determinants 1, and the maximal traces (n,).
-    """
-    norms = np.sqrt((moments**2).sum(axis=(1, 2)))
-    scaled = moments / np.where(norms > 0, norms, 1)[:, None, None]
-    # The vertices are the last axis, along which NumPy computes fastest.
-    m = np.ascontiguousarray(scaled.transpose(1, 2, 0))
-    cofactors = np.stack([_cross(m[1], m[2]), _cross(m[2], m[0]), _cross(m[0], m[1])])
-    determinants = (m[0] * cofactors[0]).sum(axis=0)
-    constant = 1 - 4 * (cofactors**2).sum(axis=(0, 1))
-    # Newton's method starts from an upper bound of the trace, and descends to the largest root.
-    trace = np.full(len(moments), np.sqrt(3.0))
-    for _ in range(_NEWTON_STEPS):
-        square = trace**2
-        slope = 4 * trace * (square - 1) - 8 * determinants
-        value = (square - 2) * square - 8 * determinants * trace + constant
-        trace -= value / np.maximum(slope, np.finfo(float).tiny)
-    half = 0.5 * (trace**2 - 1)
-    # The divisor is the product of all sums of two singular values. The last singular value has the sign of
-    # the determinant here.
-    divisor = half * trace - determinants
-    unique = divisor > _AMBIGUOUS
-    gram = np.einsum("ian,jan->ijn", m, m)
-    rotations = (half + 1) * m + trace * cofactors - np.einsum("ijn,jkn->ikn", gram, m)
-    rotations = np.ascontiguousarray((rotations / np.where(unique, divisor, 1)).transpose(2, 0, 1))
-    traces = trace * norms
-    if not unique.all():
-        left, singular, right = np.linalg.svd(moments[~unique])
-        signs = np.sign(np.linalg.det(left @ right))
-        left[:, :, 2] *= signs[:, None]
-        singular[:, 2] *= signs
-        rotations[~unique], traces[~unique] = left @ right, singular.sum(axis=1)
-    return rotations, traces
-
-
-def _cross(u: Float64[np.ndarray, "3 n"], v: Float64[np.ndarray, "3 n"]) -> Float64[np.ndarray, "3 n"]:
-    """Return the cross products of the columns."""
-    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])

@@ -14,10 +14,11 @@ from scipy.sparse.linalg import cg
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
-from jaxsmw.geometry.mesh import Mesh, count_of, extend_to_unreferenced
+from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced
 from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_surface_points
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
+from jaxsmw.wording import count_of
 
 DEFAULT_STIFFNESS = 0.003
 """The default stiffness of a registered mesh, a length in units of the square root of the target's area."""

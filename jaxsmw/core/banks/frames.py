@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsmw.core.banks.base import FilterBank, sample_bank
-from jaxsmw.core.checks import check_choice
+from jaxsmw.core.checks import check_option
 
 
 def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
@@ -74,7 +74,7 @@ def frame_bounds(
     **Raises:** `ValueError` if `over` is unknown, if `resolution` is below 2 with `over="interval"`, or if
     the bank returns responses that are not of shape (filters, points).
     """
-    check_choice("over", over, ("eigenvalues", "interval"))
+    check_option("over", over, ("eigenvalues", "interval"))
     points = eigenvalues
     if over == "interval":
         if resolution < 2:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsmw.core.banks.base import FilterBank, check_number_of_filters
-from jaxsmw.core.checks import as_parameter, check_between
+from jaxsmw.core.checks import as_parameter, check_between, check_integer
 
 
 class _Transitions(FilterBank):
@@ -237,12 +237,13 @@ class Regular(_Transitions):
     - `degree`: the number of times that the sine is applied, an integer of at least 0, by default 3. A higher
       degree makes the transition steeper.
 
-    **Raises:** `ValueError` if the degree is negative.
+    **Raises:** `TypeError` if the degree is not an integer; `ValueError` if it is negative.
     """
 
     degree: int = eqx.field(static=True, default=3)
 
     def __check_init__(self) -> None:
+        check_integer("the degree of Regular", self.degree)
         if self.degree < 0:
             raise ValueError(f"the degree of Regular cannot be negative, but is {self.degree}")
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsmw.core.banks.base import FilterBank, check_number_of_filters
-from jaxsmw.core.checks import as_parameter, check_between
+from jaxsmw.core.checks import as_parameter, check_between, check_integer
 
 
 class _UniformTranslates(FilterBank):
@@ -23,6 +23,7 @@ class _UniformTranslates(FilterBank):
     overlap: int = eqx.field(static=True, default=2)
 
     def __check_init__(self) -> None:
+        check_integer(f"the overlap of {type(self).__name__}", self.overlap)
         check_number_of_filters(self, self.filters, self.overlap)
 
     @abc.abstractmethod
@@ -57,8 +58,8 @@ class Itersine(_UniformTranslates):
     - `overlap`: the number of windows that overlap at each eigenvalue, an even number of at least 2. The
       default is 2.
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `overlap`, or
-    if `overlap` is odd or below 2.
+    **Raises:** `TypeError` if `filters` or `overlap` is not an integer; `ValueError` if `filters` is below
+    `overlap`, or if `overlap` is odd or below 2.
     """
 
     def __check_init__(self) -> None:
@@ -88,8 +89,8 @@ class HalfCosine(_UniformTranslates):
     - `filters`: the number of filters, at least `overlap`. The default is 6.
     - `overlap`: the number of windows that overlap at each eigenvalue, at least 3. The default is 3.
 
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below `overlap`, or
-    if `overlap` is below 3.
+    **Raises:** `TypeError` if `filters` or `overlap` is not an integer; `ValueError` if `filters` is below
+    `overlap`, or if `overlap` is below 3.
     """
 
     overlap: int = eqx.field(static=True, default=3)

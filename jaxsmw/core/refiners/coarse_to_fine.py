@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int32
 
 from jaxsmw.choices import Search
-from jaxsmw.core.checks import check_choice
+from jaxsmw.core.checks import check_option
 from jaxsmw.core.refiner import PreparedT, Refiner, State, StateT
 from jaxsmw.core.spectrum import Spectrum
 
@@ -63,7 +63,7 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     search: Search = eqx.field(static=True, default="auto")
 
     def __check_init__(self) -> None:
-        check_choice("search", self.search, get_args(Search))
+        check_option("search", self.search, get_args(Search))
         if any(level < 1 for level in self.levels):
             raise ValueError(f"the levels are {self.levels}, but each level needs at least 1 eigenvector")
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, Int32
 from jaxsmw.choices import Search
 from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.banks.base import sample_bank
-from jaxsmw.core.checks import check_choice, check_kind
+from jaxsmw.core.checks import check_kind, check_option
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
@@ -78,9 +78,9 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def __check_init__(self) -> None:
         check_kind("bank", self.bank, FilterBank)
         check_kind("solution", self.solution, Solution)
-        check_choice("convention", self.convention, get_args(Convention))
-        check_choice("lambda_max", self.lambda_max, ("own", "common"))
-        check_choice("search", self.search, get_args(Search))
+        check_option("convention", self.convention, get_args(Convention))
+        check_option("lambda_max", self.lambda_max, ("own", "common"))
+        check_option("search", self.search, get_args(Search))
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
         """Return a `WaveletProblem`: both shapes, and the responses of the filter bank at their eigenvalues.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsmw.core.banks import frame_function
-from jaxsmw.core.checks import check_choice
+from jaxsmw.core.checks import check_option
 from jaxsmw.core.functional_map import (
     Norm,
     PseudoInverse,
@@ -62,7 +62,7 @@ class Filtering(Solution[PreparedFiltering]):
     pseudo_inverse: PseudoInverse = eqx.field(static=True, default="area")
 
     def __check_init__(self) -> None:
-        check_choice("pseudo_inverse", self.pseudo_inverse, get_args(PseudoInverse))
+        check_option("pseudo_inverse", self.pseudo_inverse, get_args(PseudoInverse))
 
     def prepare(self, problem: WaveletProblem) -> PreparedFiltering:
         """Return the multiscale kernel, and the dual eigenvectors of the shape that C maps to."""
@@ -140,7 +140,7 @@ class LeastSquares(Solution[None]):
     norm: Norm = eqx.field(static=True, default="area")
 
     def __check_init__(self) -> None:
-        check_choice("norm", self.norm, get_args(Norm))
+        check_option("norm", self.norm, get_args(Norm))
 
     def solve(
         self,

@@ -15,7 +15,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxsmw.core.banks import frame_function
-from jaxsmw.core.checks import as_parameter, check_between, check_choice
+from jaxsmw.core.checks import as_parameter, check_between, check_option
 from jaxsmw.core.functional_map import Norm, QuadraticEnergy, WaveletProblem
 from jaxsmw.core.products import product
 from jaxsmw.core.results import RESULTS, where
@@ -103,7 +103,7 @@ class RegularizedLeastSquares(Solution[None]):
     max_steps: int = eqx.field(static=True, default=256)
 
     def __check_init__(self) -> None:
-        check_choice("norm", self.norm, get_args(Norm))
+        check_option("norm", self.norm, get_args(Norm))
         for term in _TERMS:
             if getattr(self, term) is not None:
                 check_between(self, term, getattr(self, term))

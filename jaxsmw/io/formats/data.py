@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, count_of
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.wording import count_of
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 COLORS, NORMALS, TEXTURE_OF_CORNERS = "colors", "normals", "texcoord"

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of, first_equal_rows
+from jaxsmw.geometry.mesh import first_equal_rows
 from jaxsmw.io.formats.data import COLORS, Polygons, Skin, unique_name, unique_names
 from jaxsmw.io.formats.gltf_accessors import COLUMNS, DAMAGED, Document, as_floats
+from jaxsmw.wording import count_of
 
 # Limits for the numbers of vertices, of corners, of displacements (one per vertex and blend shape), and of
 # weights (one per vertex and joint).

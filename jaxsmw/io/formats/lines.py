@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.text import is_number
+from jaxsmw.wording import count_of
 
 
 def text(data: bytes) -> str:

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.formats.data import COLORS, NORMALS, MeshData, Polygons, Written, is_color, omissions
 from jaxsmw.io.formats.lines import numbers, polygon_lines, text
+from jaxsmw.wording import count_of
 
 
 def parse_off(data: bytes) -> Polygons:

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.formats.data import NORMALS, Polygons
 from jaxsmw.io.formats.lines import excerpt, numbers, text
+from jaxsmw.wording import count_of
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _NORMAL_FIELDS = ("normal_x", "normal_y", "normal_z")

@@ -7,9 +7,10 @@ import re
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of, first_equal_rows
+from jaxsmw.geometry.mesh import first_equal_rows
 from jaxsmw.io.formats.data import MeshData, Polygons, Written, omissions
 from jaxsmw.io.formats.lines import numbers, text
+from jaxsmw.wording import count_of
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 

@@ -8,7 +8,6 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.formats.data import MeshData, Polygons, Written, always, omissions
 from jaxsmw.io.formats.lines import excerpt
 from jaxsmw.io.formats.vtk_cells import (
@@ -26,6 +25,7 @@ from jaxsmw.io.formats.vtk_cells import (
     numbers_of,
     polygons_of,
 )
+from jaxsmw.wording import count_of
 
 _TYPES = {
     **{"bit": "bit", "char": "i1", "signed_char": "i1", "unsigned_char": "u1", "short": "i2"},

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.formats.data import (
     TEXTURE_OF_CORNERS,
     MeshData,
@@ -22,6 +21,7 @@ from jaxsmw.io.formats.data import (
 )
 from jaxsmw.io.formats.lines import excerpt
 from jaxsmw.io.text import is_number
+from jaxsmw.wording import count_of
 
 # Types of cells (https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html).
 VERTEX, LINE, STRIP, POLYGON = 1, 3, 6, 7

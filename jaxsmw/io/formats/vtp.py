@@ -13,7 +13,6 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import count_of
 from jaxsmw.io.formats.data import MeshData, Polygons, Written, always, omissions, unique_name
 from jaxsmw.io.formats.lines import excerpt
 from jaxsmw.io.formats.vtk_cells import (
@@ -32,6 +31,7 @@ from jaxsmw.io.formats.vtk_cells import (
     polygons_of,
 )
 from jaxsmw.runtime.files import largest_contents
+from jaxsmw.wording import count_of
 
 _TYPES = {
     **{"Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4"},
