@@ -12,6 +12,7 @@ from .core.refiners.wavelet_preservation import WaveletPreservation
 from .core.results import RESULTS
 from .core.solutions import Filtering, LeastSquares
 from .core.spectrum import Spectrum
+from .correspondence import Correspondence
 from .errors import InputError
 from .evaluation.ground_truth import read_ground_truth
 from .evaluation.metrics import geodesic_error
@@ -21,7 +22,7 @@ from .geometry.mesh import Mesh, make_mesh
 from .initial_maps import initial_map
 from .io.map_files import read_pointwise_map, write_pointwise_map
 from .io.mesh_files import read_mesh, write_mesh
-from .matching import Correspondence, match
+from .matching import match
 from .pair import Pair, paired_spectra
 from .preparation import prepare
 from .presets import PRESETS, Preset

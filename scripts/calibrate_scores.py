@@ -39,8 +39,8 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from jaxsmw import InputError, geodesic_error, match, read_mesh
+from jaxsmw.correspondence import Correspondence
 from jaxsmw.evaluation.datasets import DataPair, DataSet, choose_pairs, open_data_set
-from jaxsmw.matching import Correspondence
 from jaxsmw.presets import PRESETS, PresetName
 from jaxsmw.repair.scores import dirichlet_energy_ratio, distortion
 from jaxsmw.repair.settings import WrongProbabilitySettings

@@ -29,6 +29,7 @@ LAYERS = (
     "preparation",
     "repair",
     "presets",
+    "correspondence",
     "matching",
     "collection",
     "evaluation",

@@ -21,6 +21,7 @@ from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import LeastSquares
+from jaxsmw.correspondence import Correspondence
 from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
@@ -29,7 +30,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.initial_maps import initial_map
-from jaxsmw.matching import Correspondence, match
+from jaxsmw.matching import match
 from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.presets import choose_preset
 from jaxsmw.repair.rounds import refine_in_stages
@@ -631,7 +632,7 @@ def test_surface_points_and_expected_errors_are_computed_once(pair, monkeypatch)
     copies = points.weights.copy(), expected.copy()
     points.faces[:], points.weights[:], expected[:] = -1, -1, -1  # a caller may change the results
     for name in ("expected_error", "nearest_point_on_candidates"):
-        monkeypatch.delattr(f"jaxsmw.matching.{name}")
+        monkeypatch.delattr(f"jaxsmw.correspondence.{name}")
     again = found.surface_points()
     np.testing.assert_array_equal(again.weights, copies[0])
     np.testing.assert_array_equal(found.expected_error(), copies[1])

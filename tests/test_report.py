@@ -11,9 +11,10 @@ import pytest
 from report_helpers import TALL, embedded, renumbered
 
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.correspondence import Correspondence
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import GeodesicError, geodesic_error
-from jaxsmw.matching import Correspondence, match
+from jaxsmw.matching import match
 from jaxsmw.presets import PRESETS
 from jaxsmw.repair.wrong_probability import wrong_probability
 from jaxsmw.report.summary import REPORT_FILES, summarize, write_comparison, write_report

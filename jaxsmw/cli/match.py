@@ -24,7 +24,7 @@ from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxsmw.matching import Correspondence
+    from jaxsmw.correspondence import Correspondence
 
 HELP = "match two meshes and write the map"
 

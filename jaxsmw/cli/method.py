@@ -25,8 +25,8 @@ from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
     from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+    from jaxsmw.correspondence import Correspondence
     from jaxsmw.geometry.mesh import Mesh
-    from jaxsmw.matching import Correspondence
     from jaxsmw.stage import Stage
 
 # A dictionary from the name of each solution to its class name and its arguments. The first solution is the

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
+    from jaxsmw.correspondence import Correspondence
     from jaxsmw.io.landmarks import Landmarks
     from jaxsmw.io.mesh_data import MeshData
-    from jaxsmw.matching import Correspondence
     from jaxsmw.transfer.landmarks import TransferredLandmarks
     from jaxsmw.transfer.registered_mesh import RegisteredMesh
 

@@ -1,8 +1,9 @@
 from .consistency import edge_errors
 from .graph import choose_edges, shape_distances
 from .hands import choose_hands
-from .matching import Collection, MatchedEdge, match_collection
+from .matching import match_collection
 from .pairs import match_pairs
+from .result import Collection, MatchedEdge
 from .settings import CollectionSettings
 from .shape_models import Alignment, ShapeModel, align, shape_model
 from .shapes import PreparedShape, prepare_shapes

@@ -11,8 +11,9 @@ from jaxtyping import Int64
 
 from jaxsmw.collection.pairs import refined_starts
 from jaxsmw.collection.shapes import PreparedShape, prepare_pair
+from jaxsmw.correspondence import Correspondence
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.matching import Correspondence, match_prepared
+from jaxsmw.matching import match_prepared
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsmw.collection.matching import Collection
+from jaxsmw.collection.result import Collection
 from jaxsmw.collection.shape_models import ShapeModel
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.landmark_files import write_landmark_file

@@ -10,9 +10,10 @@ import jax
 from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection.consistency import check_pairs
 from jaxsmw.collection.shapes import fitted_preset, prepare_pair, prepare_shapes
+from jaxsmw.correspondence import Correspondence
 from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
-from jaxsmw.matching import Correspondence, match_prepared
+from jaxsmw.matching import match_prepared
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.batches import refine_batch

@@ -1,0 +1,226 @@
+"""The result of `match_collection`: the consistent maps, the registered meshes and the graph."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from jaxsmw.collection.shape_models import ShapeModel, shape_model
+from jaxsmw.descriptors import DescriptorAxes
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.transfer.registered_mesh import RegisteredMesh, register_mesh
+from jaxsmw.wording import count_of
+
+# With a larger share of outliers, the maps are at fault, and not the shapes.
+_MANY_OUTLIERS = 1 / 3
+
+
+@dataclass(frozen=True)
+class MatchedEdge:
+    """An edge of the graph of a collection: two matched shapes, and what became of their map.
+
+    Errors are in units of the square root of the area.
+
+    **Attributes:**
+
+    - `source`, `target`: the numbers of the two shapes.
+    - `expected_error`: the mean expected error of the map by itself; infinite if the match failed.
+    - `distortion`: the distortion of the map; infinite if the match failed.
+    - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The
+      estimate is the error that the cycles of the graph show (`edge_errors`), but at least half of the
+      prior. The prior is the expected error plus a term that grows with the distortion
+      (`CollectionSettings.distortion_weight`). The same term is then added to the estimate.
+    - `residual`: the mean distance between the map and the map through the template.
+    - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. A replaced map was matched again from the
+      consistent map, because the first map contradicted the other maps. A contradicted map still contradicts
+      the other maps, and hardly counts.
+    - `doubtful`: whether the map contradicts the other maps, or its estimated error is at least
+      `CollectionSettings.outlier_from`.
+    """
+
+    source: int
+    target: int
+    expected_error: float
+    distortion: float
+    estimated_error: float
+    residual: float
+    decision: str
+    doubtful: bool
+
+    def sentence(self, names: Sequence[str]) -> str:
+        """Return a sentence about the edge, given the names of all shapes."""
+        errors = (
+            f"expected error {1e3 * self.expected_error:.0f}, estimated error "
+            f"{1e3 * self.estimated_error:.0f}, "
+            f"distance from the consistent map {1e3 * self.residual:.0f} thousandths"
+        )
+        return f"{names[self.source]} to {names[self.target]}: {self.decision} ({errors})"
+
+
+@dataclass(frozen=True, eq=False)
+class Collection:
+    """The result of `match_collection`: consistent maps between all shapes of a collection.
+
+    Vertex v of the template corresponds to the same point of the body on every shape.
+
+    **Attributes:**
+
+    - `meshes`: the meshes of the N shapes.
+    - `template`: the number of the template, which has n vertices.
+    - `points`: for each shape, one `SurfacePoints` on its mesh, with an entry per vertex of the template.
+    - `mirrored`: a mask (N,), True for shapes of the other hand, such as right teeth among left teeth. Their
+      mirror images were matched. All points and positions refer to the meshes, not to the mirror images.
+    - `registered`: for each shape, the `RegisteredMesh` of the template on the shape.
+    - `edges`: the matched pairs, each a `MatchedEdge`.
+    - `axes`: the axes of the descriptors, or None.
+    - `cycle_errors`: two arrays with the errors of all triangles of the graph, in units of the square root of
+      the area. The first array was computed from the first maps of the edges, the second from the final maps.
+    - `outliers`: the numbers of shapes that differ much from all other shapes: all their maps have large
+      errors or distortions. Such a shape may be another kind of body.
+    - `left_out`: a dictionary from the name of each mesh that could not be matched to the reason.
+    - `seconds`: a dictionary from the name of each step to its wall time in seconds.
+    """
+
+    meshes: tuple[Mesh, ...]
+    template: int
+    points: tuple[SurfacePoints, ...]
+    mirrored: Bool[np.ndarray, " N"]
+    registered: tuple[RegisteredMesh, ...]
+    edges: tuple[MatchedEdge, ...]
+    axes: DescriptorAxes | None = None
+    cycle_errors: tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, " d"]] | None = None
+    outliers: tuple[int, ...] = ()
+    left_out: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        wrong = sum(edge.decision == "contradicted" for edge in self.edges)
+        return (
+            f"Collection({len(self.meshes)} shapes, template {self.names[self.template]}, "
+            f"{len(self.edges)} edges, {wrong} contradicted)"
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the shapes."""
+        return tuple(mesh.name for mesh in self.meshes)
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return sentences about the template, the decisions, the hands, the outliers and missing meshes."""
+        warning = [self.warning] if self.warning else []
+        left_out = [f"Left out: {name} ({reason})" for name, reason in self.left_out.items()]
+        return (*self.decisions(), *warning, *left_out)
+
+    def decisions(self) -> tuple[str, ...]:
+        """Return sentences about the template, the decisions and the hands."""
+        decisions = Counter(edge.decision for edge in self.edges)
+        found = [
+            f"{count_of(len(self.meshes), 'shape')}, {count_of(len(self.edges), 'matched pair')}; the "
+            f"template is {self.names[self.template]}."
+        ]
+        if self.cycle_errors is None or len(self.cycle_errors[0]):
+            found.append(
+                f"Maps that agree with the other maps: {decisions['kept']}. Wrong maps that were replaced: "
+                f"{decisions['replaced']}. Maps that still contradict the others and hardly count: "
+                f"{decisions['contradicted']}."
+            )
+        else:
+            found.append("The graph has no cycles, so no map could be compared with other maps.")
+        if self.mirrored.any():
+            names = ", ".join(name for name, other in zip(self.names, self.mirrored, strict=True) if other)
+            found.append(f"Of the other hand, so that their mirror images were matched: {names}.")
+        return tuple(found)
+
+    @property
+    def warning(self) -> str:
+        """A sentence about the outliers; an empty text if there are none."""
+        if not self.outliers:
+            return ""
+        names = ", ".join(self.names[shape] for shape in self.outliers)
+        if len(self.outliers) > _MANY_OUTLIERS * len(self.meshes):
+            return (
+                f"No good map was found for {len(self.outliers)} of {len(self.meshes)} shapes: {names}. Look "
+                "at their colours. The preset accurate matches different bodies best, and all meshes must be "
+                "of one kind of body."
+            )
+        return (
+            f"These shapes differ much from all others, so their maps are uncertain: {names}. Look at their "
+            "colours, and leave out other kinds of bodies."
+        )
+
+    def _check_number(self, *shapes: int) -> None:
+        for shape in shapes:
+            if not 0 <= shape < len(self.meshes):
+                raise InputError(
+                    f"there is no shape {shape}: give a number from 0 to {len(self.meshes) - 1}, in the "
+                    "order of `Collection.names`."
+                )
+
+    def from_template(self, shape: int) -> Int64[np.ndarray, " n"]:
+        """Return the map from the template to a shape, as 0-based vertices of the shape (n,)."""
+        self._check_number(shape)
+        return self.registered[shape].surface_points.nearest_corners(self.meshes[shape])
+
+    def to_template(self, shape: int) -> Int64[np.ndarray, " m"]:
+        """Return the map from a shape (m vertices) to the template, as 0-based template vertices (m,)."""
+        self._check_number(shape)
+        return self.registered[shape].points_of_target.nearest_corners(self.meshes[self.template])
+
+    def pointwise_map(self, source: int, target: int) -> Int64[np.ndarray, " m"]:
+        """Return the map from a shape (m vertices) to another through the template, as 0-based vertices (m,).
+
+        The maps of all pairs are consistent: a vertex that is carried around a cycle returns to itself, up to
+        the rounding to vertices.
+
+        **Raises:** `InputError` if a number is not the number of a shape.
+        """
+        self._check_number(source, target)
+        images = self.registered[target].carry(self.registered[source].points_of_target)
+        mesh = self.meshes[target]
+        return nearest_surface_points(images, mesh)[0].nearest_corners(mesh)
+
+    def registered_mesh(self, source: int, target: int) -> RegisteredMesh:
+        """Register one shape on another, by the map through the template; see `register_mesh`.
+
+        With the registered mesh, `jaxsmw.transfer` transfers landmarks and attributes from `source` to
+        `target`.
+
+        **Raises:** `InputError` if a number is not the number of a shape.
+        """
+        self._check_number(source, target)
+        if source == self.template:
+            return self.registered[target]
+        images = self.registered[target].carry(self.registered[source].points_of_target)
+        points, _ = nearest_surface_points(images, self.meshes[target])
+        return register_mesh(self.meshes[source], self.meshes[target], points)
+
+    def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
+        """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
+
+        Lengths are in the unit of the meshes, or without unit if `scale` is True. The weight of each vertex
+        is its vertex area on the template. If a shape does not have the hand of the template, its mirror
+        image enters the model.
+
+        **Arguments:**
+
+        - `scale`: whether to remove differences in size. If the meshes have different units, use True.
+        - `number_of_modes`: the largest number of modes; None for all modes.
+
+        **Returns:** A `ShapeModel` with n vertices.
+        """
+        other_hand = self.mirrored != self.mirrored[self.template]
+        signs = np.where(other_hand[:, None], [-1.0, 1.0, 1.0], 1.0)
+        return shape_model(
+            [one.vertices * sign for one, sign in zip(self.registered, signs, strict=True)],
+            scale=scale,
+            weights=self.meshes[self.template].vertex_areas,
+            reference=self.template,
+            number_of_modes=number_of_modes,
+        )
