@@ -669,7 +669,7 @@ def test_the_times_account_for_the_whole_run_and_all_files_are_named(run, pair, 
     total = float(re.match(r"time: +([\d.]+) s: ", line)[1])
     steps = {name: float(seconds) for name, seconds in re.findall(r"([a-z-][a-z -]+) ([\d.]+) s\b", line)}
     assert list(steps) == [
-        "loading", "reading", "eigenbases", "initial map", "mirror test", "refinement", "writing", "one-to-one map",
+        "loading", "reading", "eigenbases", "mirror test", "initial map", "refinement", "writing", "one-to-one map",
         "surface points", "expected error", "geodesic errors", "report", "other",
     ]  # fmt: skip
     assert sum(steps.values()) == pytest.approx(total, abs=0.01 * len(steps))
