@@ -109,22 +109,28 @@ def test_a_large_fault_makes_a_map_suspicious(body, swapped, identity):
     assert wrong < 0.02 and not found.suspicious
 
 
-@pytest.mark.parametrize("non_isometric", [0.0, 10.0])
-def test_stages_run_again_for_shapes_that_are_not_isometric(body, non_isometric):
+@pytest.mark.parametrize(
+    ("non_isometric", "coarse_from", "passes"),
+    [(10.0, 10.0, []), (0.0, 10.0, [(30,), (30,)]), (0.0, 0.0, [(10, 20), (10, 20), (10, 20), (30,)])],
+)
+def test_stages_run_again_for_shapes_that_are_not_isometric(body, non_isometric, coarse_from, passes):
     vertices, stage = body[0].vertices, Stage(FeatureRegression((30,)))
     noise = np.random.default_rng(0).normal(scale=0.3, size=vertices.shape)
     start = KDTree(vertices).query(vertices + noise)[1]
-    settings = replace(REPAIR, suspicious=2.0, suspicious_area=1.0, non_isometric=non_isometric, passes=2)
-    _, once = outcome(body, start, replace(settings, passes=0), [stage])
+    settings = replace(
+        REPAIR, suspicious=2.0, suspicious_area=1.0, non_isometric=non_isometric, passes=2,
+        coarse_from=coarse_from, coarse_passes=3, coarse_levels=(10, 20),
+    )  # fmt: skip
+    _, once = outcome(body, start, replace(settings, non_isometric=10.0), [stage])
     _, found = outcome(body, start, settings, [stage])
     expected = once
-    for _ in range(2 if non_isometric == 0 else 0):
+    for levels in passes:
         following = np.asarray(expected.pointwise_map)[: len(start)].astype(np.int64)
-        _, expected = outcome(body, following, None, [stage])
+        _, expected = outcome(body, following, None, [stage.with_levels(levels)])
     np.testing.assert_array_equal(found.pointwise_map, expected.pointwise_map)
     assert not found.suspicious
     changed = bool(np.any(np.asarray(found.pointwise_map) != np.asarray(once.pointwise_map)))
-    assert changed == (non_isometric == 0)
+    assert changed == bool(passes)
 
 
 def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity):

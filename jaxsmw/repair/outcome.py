@@ -147,17 +147,16 @@ class Judge:
         slightly_distorted = outcome.distortion < self.settings.doubtful
         return not outcome.suspicious or (slightly_distorted and not self.faults(outcome))
 
-    def isometric(self, outcome: Outcome) -> bool:
-        """Return whether a map preserves areas about as well as maps between poses of one body do.
+    def area_change(self, outcome: Outcome) -> float:
+        """Return the `area_shape_difference` of the map of an outcome, which is near 0 for poses of one body.
 
-        Maps of partial pairs count as isometric, because areas of the full shape have no match.
+        For partial pairs, the result is 0, because areas of the full shape have no match.
         """
         if self.pair.partial:
-            return True
-        difference = area_shape_difference(
+            return 0.0
+        return area_shape_difference(
             self.pair, self._matches(outcome), self.spectrum_x, self.spectrum_y, self.settings.scores
         )
-        return difference < self.settings.non_isometric
 
     def difference(self, first: Outcome, second: Outcome) -> float:
         """Return the share of X's area on which the maps of two outcomes differ; see `map_difference`."""

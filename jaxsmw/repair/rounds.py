@@ -52,7 +52,8 @@ def refine_in_stages(
        worse by less than `score_tolerance`. In all other cases, the best map of the rounds is kept.
 
     With `repair`, maps between non-isometric shapes are also refined further, because they converge slowly:
-    the repeated stage and all later stages run `repair.passes` more times.
+    the repeated stage and all later stages run `repair.passes` more times. If the shapes differ very much,
+    they run in `repair.coarse_passes` coarse passes and one usual pass instead.
 
     **Arguments:**
 
@@ -127,6 +128,19 @@ class _Runner:
         )
         return before._replace(refinements=[*before.refinements, found])
 
+    def coarse(self, levels: tuple[int, ...]) -> _Runner:
+        """Return a runner whose last stage has the given levels, if its refiner has levels at all."""
+        *before, (view, stage) = self.steps
+        if stage.refiner.levels:
+            stage = _with_levels(stage, levels)
+            view = self.prepared.view(stage)
+        return replace(self, steps=[*before, (view, stage)])
+
+
+def _with_levels(stage: Stage, levels: tuple[int, ...]) -> Stage:
+    """Return the stage with other levels, none of which exceeds its number of eigenvectors."""
+    return stage.with_levels(tuple(min(level, stage.number_of_eigenvectors) for level in levels))
+
 
 @dataclass(frozen=True)
 class _Repairer:
@@ -156,11 +170,15 @@ class _Repairer:
 
     def refined_further(self, outcome: Outcome) -> Outcome:
         """Run the repeated stage and all later stages a few more times if the shapes are not isometric."""
-        if self.judge.isometric(outcome):
+        settings, change = self.settings, self.judge.area_change(outcome)
+        if change < settings.non_isometric:
             return outcome
+        runners = [self.runner] * settings.passes
+        if change >= settings.coarse_from:
+            runners = [self.runner.coarse(settings.coarse_levels)] * settings.coarse_passes + [self.runner]
         further = outcome
-        for _ in range(self.settings.passes):
-            further = self._repeated(further)
+        for runner in runners:
+            further = replace(self, runner=runner)._repeated(further)
             if not further.successful:
                 return outcome
         further = self.judge.judged(further)
@@ -171,9 +189,7 @@ class _Repairer:
         """Repair an outcome by rounds and by the fallback."""
         outcome = self._without_faults(outcome)
         _, stage = self.runner.steps[self.settings.stage]
-        fallback = stage.with_levels(
-            tuple(min(level, stage.number_of_eigenvectors) for level in self.settings.fallback_levels)
-        )
+        fallback = _with_levels(stage, self.settings.fallback_levels)
         last = self._from_repeated(outcome, fallback)
         # The fallback depends less on the faults of previous maps than the rounds do. The outcome of the
         # fallback is preferred if it looks right and its score is not much worse. Upside-down maps are not
