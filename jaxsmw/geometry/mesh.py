@@ -109,7 +109,7 @@ class Mesh:
         """
         return self._sum_at_vertices(self.face_areas / 3)
 
-    def average(self, values: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, ...] | np.floating:
+    def average(self, values: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, " ..."] | np.floating:
         """Return the mean of values at the vertices (n, ...) over the surface, in the unit of the values.
 
         Each vertex is weighted with its area.
