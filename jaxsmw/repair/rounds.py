@@ -53,7 +53,7 @@ def refine_in_stages(
 
     With `repair`, maps between non-isometric shapes are also refined further, because they converge slowly:
     the repeated stage and all later stages run `repair.passes` more times. If the shapes differ very much,
-    they run in `repair.coarse_passes` coarse passes and one usual pass instead.
+    coarse passes with the levels `repair.coarse_levels` and one usual pass run instead.
 
     **Arguments:**
 
@@ -175,7 +175,7 @@ class _Repairer:
             return outcome
         runners = [self.runner] * settings.passes
         if change >= settings.coarse_from:
-            runners = [self.runner.coarse(settings.coarse_levels)] * settings.coarse_passes + [self.runner]
+            runners = [*map(self.runner.coarse, settings.coarse_levels), self.runner]
         further = outcome
         for runner in runners:
             further = replace(self, runner=runner)._repeated(further)

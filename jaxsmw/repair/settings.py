@@ -190,10 +190,9 @@ class RepairSettings:
     - `passes` (Table R29): how often the repeated stage and all later stages run again for such shapes, at
       least 0. Their maps converge more slowly than maps between poses of one body.
     - `coarse_from` (Table R32): a number from `non_isometric`. If the area-based shape difference is at least
-      this value, `coarse_passes` coarse passes and one usual pass run instead of the usual passes.
-    - `coarse_passes` (Table R32): the number of coarse passes, at least 0.
-    - `coarse_levels` (Table R32): the levels of the last stage in coarse passes. If the refiner of the last
-      stage has no levels, coarse passes are usual passes.
+      this value, coarse passes and one usual pass run instead of the usual passes.
+    - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass. If
+      the refiner of the last stage has no levels, coarse passes are usual passes.
     - `aligned_preference` (entry R24): a number from 0. With `init="auto"`, asymmetric shapes are matched
       from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is returned if its mean expected
       error is below this multiple of the other map's mean expected error.
@@ -219,14 +218,13 @@ class RepairSettings:
     non_isometric: float = 0.14
     passes: int = 2
     coarse_from: float = 0.3
-    coarse_passes: int = 2
-    coarse_levels: tuple[int, ...] = (20, 35, 60)
+    coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60))
     aligned_preference: float = 0.98
     alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
 
     def __post_init__(self) -> None:
-        for name in ("stage", "rounds", "finalists", "passes", "coarse_passes"):
+        for name in ("stage", "rounds", "finalists", "passes"):
             check_whole_number(name, getattr(self, name), 0)
         for name in ("suspicious_area", "negligible_area", "excessive_area"):
             check_number(name, getattr(self, name), most=1.0)
