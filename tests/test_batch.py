@@ -179,6 +179,8 @@ def test_arguments_that_do_not_fit_together_are_refused(monkeypatch):
         refine_pairs(spectra, PAIRS, starts, samples=[jnp.arange(50)])
     with pytest.raises(ValueError, match="batch_size is 0"):
         refine_pairs(spectra, PAIRS, starts, batch_size=0)
+    with pytest.raises(ValueError, match="give at least one JAX device"):
+        refine_pairs(spectra, PAIRS, starts, devices=[])
     with pytest.raises(ValueError, match=r"\[10, 11\] eigenvectors"):
         stack([random_spectrum(20, 10), random_spectrum(20, 11)])
     with pytest.raises(ValueError, match="no shapes"):

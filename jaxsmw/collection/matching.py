@@ -23,7 +23,6 @@ from jaxsmw.collection.consistency import Edge, estimate_edge_errors, find_outli
 from jaxsmw.collection.edges import EdgeMap, EdgeTask, compare_hands, match_edges
 from jaxsmw.collection.graph import choose_edges, shape_distances
 from jaxsmw.collection.hands import choose_hands
-from jaxsmw.collection.pairs import check_devices
 from jaxsmw.collection.result import Collection, MatchedEdge
 from jaxsmw.collection.settings import CollectionSettings
 from jaxsmw.collection.shapes import (
@@ -40,6 +39,7 @@ from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision
+from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.workers import run_tasks

@@ -11,13 +11,14 @@ from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection.consistency import check_pairs
 from jaxsmw.collection.shapes import fitted_preset, prepare_pair, prepare_shapes
 from jaxsmw.correspondence import Correspondence
-from jaxsmw.errors import InputError, check_whole_number
+from jaxsmw.errors import check_whole_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.matching import match_prepared
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.batches import refine_batch
 from jaxsmw.repair.outcome import Outcome
+from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.compilation import release_programs
 
 # The number of pairs per device that are refined before their maps are judged and repaired.
@@ -71,18 +72,6 @@ def match_pairs(
             yield number, found.correspondence
 
     return results()
-
-
-def check_devices(devices: Sequence[jax.Device] | None) -> None:
-    """Check that devices are a list of at least one JAX device, or None.
-
-    **Raises:** `InputError` if they are anything else.
-    """
-    if devices is None:
-        return
-    found = list(devices) if isinstance(devices, Iterable) else []
-    if not found or not all(isinstance(device, jax.Device) for device in found):
-        raise InputError(f"devices is {devices!r}: give at least one JAX device, or None for all devices.")
 
 
 def refined_starts(

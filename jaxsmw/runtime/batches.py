@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple, TypedDict, TypeVar
 
@@ -21,6 +21,7 @@ from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.search import BLOCK
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import one_blas_thread
@@ -47,18 +48,30 @@ def stack(spectra: Sequence[Spectrum]) -> Spectrum:
     **Returns:** The stacked spectrum. For s shapes and n vertices in the largest shape, `eigenvectors` has
     shape (s, n, k).
 
-    **Raises:** `ValueError` if there are no shapes, if the shapes have different numbers of eigenvectors, or
+    **Raises:** `InputError` if there are no shapes, if the shapes have different numbers of eigenvectors, or
     if only some of them have an optional array.
     """
     if not spectra:
-        raise ValueError("there are no shapes to stack: give at least one spectrum")
+        raise InputError("there are no shapes to stack: give at least one spectrum")
     sizes = {spectrum.eigenvalues.shape[0] for spectrum in spectra}
     if len(sizes) > 1:
-        raise ValueError(
+        raise InputError(
             f"shapes with {sorted(sizes)} eigenvectors cannot be stacked: truncate them to the same number"
         )
     largest = max(spectrum.mask.shape[0] for spectrum in spectra)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(spectrum.pad(largest) for spectrum in spectra))
+
+
+def check_devices(devices: Sequence[jax.Device] | None) -> None:
+    """Check that devices are a list of at least one JAX device, or None.
+
+    **Raises:** `InputError` if they are anything else.
+    """
+    if devices is None:
+        return
+    found = list(devices) if isinstance(devices, Iterable) else []
+    if not found or not all(isinstance(device, jax.Device) for device in found):
+        raise InputError(f"devices is {devices!r}: give at least one JAX device, or None for all devices.")
 
 
 def refine_pairs(
@@ -115,14 +128,16 @@ def refine_pairs(
     in `pairs`. Numerical failures raise no error, so compare the `result` of each refinement with
     `RESULTS.successful`.
 
-    **Raises:** `ValueError` if the length of `pointwise_maps` differs from that of `pairs`, or the length of
-    `samples` differs from that of `spectra`. `ValueError` is also raised if a pair refers to a shape that
+    **Raises:** `InputError` if the length of `pointwise_maps` differs from that of `pairs`, or the length of
+    `samples` differs from that of `spectra`. `InputError` is also raised if a pair refers to a shape that
     does not exist, an initial map does not contain one integer per vertex of X, a shape is not a `Spectrum`,
-    or `batch_size` is below 1. The errors of `refine` are raised while the iterator runs.
+    `batch_size` is below 1, or there are no devices. The errors of `refine` are raised while the iterator
+    runs.
     """
     _check_pairs(spectra, pairs, pointwise_maps, samples)
+    check_devices(devices)
     if batch_size is not None and batch_size < 1:
-        raise ValueError(f"batch_size is {batch_size}, but a batch needs at least 1 pair")
+        raise InputError(f"batch_size is {batch_size}, but a batch needs at least 1 pair")
     settings = _Settings(
         iterations=iterations, partial=partial, stop_when_unchanged=stop_when_unchanged, history=history
     )
@@ -163,34 +178,34 @@ def _check_pairs(
 ) -> None:
     """Raise `ValueError` if an argument of `refine_pairs`, other than `batch_size`, is not valid."""
     if len(pairs) != len(pointwise_maps):
-        raise ValueError(
+        raise InputError(
             f"there are {len(pairs)} pairs and {len(pointwise_maps)} initial maps: give one map per pair"
         )
     if samples is not None and len(samples) != len(spectra):
-        raise ValueError(
+        raise InputError(
             f"there are {len(spectra)} shapes, but samples of {len(samples)} shapes: give samples of every "
             "shape"
         )
     for position, spectrum in enumerate(spectra):
         if not isinstance(spectrum, Spectrum):
-            raise ValueError(
+            raise InputError(
                 f"shape {position} is a {type(spectrum).__name__}, but a Spectrum is needed: compute it with "
                 "compute_spectrum"
             )
     for position, (pair, pointwise_map) in enumerate(zip(pairs, pointwise_maps, strict=True)):
         if len(pair) != 2 or any(shape not in range(len(spectra)) for shape in pair):
-            raise ValueError(
+            raise InputError(
                 f"pair {position} is {tuple(pair)}, but there are {len(spectra)} shapes: give the indices of "
                 "two shapes, counted from 0"
             )
         if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
-            raise ValueError(
+            raise InputError(
                 f"the initial map of pair {position} has type {pointwise_map.dtype}: give integer vertex "
                 "indices"
             )
         vertices = spectra[pair[0]].mask.shape
         if pointwise_map.shape != vertices:
-            raise ValueError(
+            raise InputError(
                 f"the initial map of pair {position} has shape {pointwise_map.shape}, but X has "
                 f"{vertices[0]} vertices: give one vertex of Y for each vertex of X"
             )
