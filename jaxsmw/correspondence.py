@@ -180,9 +180,8 @@ class Correspondence:
             )
             found = compiled(nearest_point_on_candidates)(*jax.device_put(padded))
         faces, weights = (np.asarray(values)[: len(queries)] for values in found)
-        # Rounding errors can make weights negative.
-        weights = np.maximum(weights.astype(np.float64), 0)
-        return SurfacePoints(np.asarray(faces).astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
+        weights = weights.astype(np.float64)
+        return SurfacePoints(faces.astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
 
     def registered_mesh(self, *, stiffness: float = DEFAULT_STIFFNESS) -> RegisteredMesh:
         """Deform X onto Y, guided by `surface_points`; see `jaxsmw.transfer.register_mesh`.
