@@ -13,6 +13,7 @@ from concurrent.futures import Executor, Future
 from contextlib import nullcontext
 from itertools import permutations
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args
 
 import jax
@@ -37,7 +38,7 @@ from jaxsmw.evaluation.opponents.peers import installed_peers
 from jaxsmw.evaluation.opponents.registry import METHODS, find_methods
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import write_mesh
-from jaxsmw.report.tables import latex_table, markdown, markdown_table, summarize_methods
+from jaxsmw.report.tables import _introduction, latex_table, markdown, markdown_table, summarize_methods
 from jaxsmw.runtime.provenance import measured_code
 from jaxsmw.runtime.workers import open_executor
 
@@ -551,3 +552,13 @@ def test_the_digest_covers_all_code_that_results_depend_on():
     drawing = {path for path in loaded if path.parent.name == "report"}
     assert len(loaded) > 40 and loaded - drawing <= measured
     assert not {"cli.py", "page.py"} & {path.name for path in measured}
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(("target", "share"), [("b", "1 of 2 pairs"), ("c", "1 given pairs")])
+def test_the_summary_says_whether_pairs_belong_to_the_list_of_the_data_set(target, share):
+    """The list of a remeshed set contains pairs of one class only, but a given list may contain others."""
+    pairs = [SimpleNamespace(source="a", target=name) for name in ("b", "d")]
+    results = SimpleNamespace(rows=[{"source": "a", "target": target, "machine": "a machine"}], failures=[])
+    data_set = SimpleNamespace(pairs=pairs, layout="a set")
+    assert _introduction(data_set, results, Settings("shot")).startswith(share)

@@ -216,12 +216,15 @@ def write_tables(
 
 def _introduction(data_set: DataSet, results: Results, settings: Settings) -> str:
     """Return the paragraph above the table of `summary.md`."""
-    pairs = len({(row["source"], row["target"]) for row in results.rows})
+    pairs = {(row["source"], row["target"]) for row in results.rows}
+    # A list can contain further pairs of shapes of different classes.
+    listed = pairs <= {(pair.source, pair.target) for pair in data_set.pairs}
+    share = f"{len(pairs)} of {len(data_set.pairs)}" if listed else f"{len(pairs)} given"
     points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
     machines = "; ".join(sorted({row["machine"] for row in results.rows}))
     sentences = [
-        f"{pairs} of {len(data_set.pairs)} pairs of the data set ({data_set.layout}) were measured. All "
-        f"methods start from the same initial map ({Path(settings.init).name}).",
+        f"{share} pairs of the data set ({data_set.layout}) were measured. All methods start "
+        f"from the same initial map ({Path(settings.init).name}).",
         "Errors are mean geodesic errors in thousandths of the square root of the target's area, at "
         f"{points} of the ground truth.",
         "The mean and the median are computed over the pairs on which a method did not fail. The column "
