@@ -234,9 +234,10 @@ class RepairSettings:
             "score_tolerance",
             "non_isometric",
             "coarse_from",
+            "aligned_preference",
         ):
             check_number(name, getattr(self, name))
-        for name in ("suspicious", "doubtful", "aligned_preference"):
+        for name in ("suspicious", "doubtful"):
             check_number(name, getattr(self, name), positive=True)
 
 
