@@ -86,14 +86,7 @@ class Pair:
         **Raises:** `InputError` if a mesh has fewer than 4 referenced vertices, which are too few for
         matching.
         """
-        used = [int(mesh.referenced_vertices.sum()) for mesh in self.meshes]
-        for mesh, number in zip(self.meshes, used, strict=True):
-            if number < _FEWEST_VERTICES:
-                raise InputError(
-                    f"{mesh.name}: its faces use {number} vertices, which are too few for a match: give a "
-                    f"mesh with at least {_FEWEST_VERTICES} vertices, or hundreds for a meaningful result."
-                )
-        return min(used)
+        return min(map(number_of_usable_vertices, self.meshes))
 
     def mirrored(self) -> Pair:
         """Return the pair with the mirror image of X in place of X; see `jaxsmw.Mesh.mirrored`."""
@@ -102,6 +95,20 @@ class Pair:
     def reversed(self) -> Pair:
         """Return the pair with X and Y exchanged."""
         return Pair(self.mesh_y, self.mesh_x, self.partial)
+
+
+def number_of_usable_vertices(mesh: Mesh) -> int:
+    """Count the referenced vertices of a mesh.
+
+    **Raises:** `InputError` if there are fewer than 4, which are too few for matching.
+    """
+    number = int(mesh.referenced_vertices.sum())
+    if number < _FEWEST_VERTICES:
+        raise InputError(
+            f"{mesh.name}: its faces use {number} vertices, which are too few for a match: give a mesh with "
+            f"at least {_FEWEST_VERTICES} vertices, or hundreds for a meaningful result."
+        )
+    return number
 
 
 def paired_spectra(

@@ -143,9 +143,9 @@ def prepare(
     zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required
     descriptors. `ArithmeticError` if the initial map cannot be computed.
     """
-    check_initial_map(pair, init)  # before the eigenbases, which take longer
     seconds: dict[str, float] = {}
     if spectra is None:
+        check_initial_map(pair, init)  # before the eigenbases, which take longer
         with timed("eigenbases", seconds):
             spectra = paired_spectra(
                 pair, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver

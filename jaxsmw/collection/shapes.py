@@ -19,7 +19,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.initial_maps.nearest import nearest_map
-from jaxsmw.pair import Pair, check_eigenvalues
+from jaxsmw.pair import Pair, check_eigenvalues, number_of_usable_vertices
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset
 
@@ -167,4 +167,4 @@ def fitted_preset(preset: Preset, *meshes: Mesh) -> Preset:
 
     **Raises:** `InputError` if a mesh has too few vertices.
     """
-    return preset.fitted(min(Pair(mesh, mesh).fewest_vertices() for mesh in meshes))
+    return preset.fitted(min(map(number_of_usable_vertices, meshes)))
