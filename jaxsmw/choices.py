@@ -19,7 +19,12 @@ DEFAULT_MATCH_INIT: MatchInit = "auto"
 
 Mirror = Literal["auto", "no", "yes"]
 """Whether the mirror image of the source is matched instead of the source; see `jaxsmw.match`."""
-DEFAULT_MIRROR: Mirror = "auto"
+MirrorCollection = Literal["auto", "no"]
+"""Whether mirror images of some meshes are matched instead of the meshes; see `jaxsmw.match_collection`."""
+DEFAULT_MIRROR: MirrorCollection = "auto"
+
+Scale = Literal["unknown"]
+"""The name of a scale of a partial pair that must be estimated; see `jaxsmw.match`."""
 
 Laplacian = Literal["auto", "cotangent", "robust"]
 """The discretizations of the Laplacian; see `jaxsmw.compute_spectrum`."""

@@ -414,7 +414,8 @@ def test_rows_of_removed_empty_or_unfinished_files_are_measured_again(
 def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("jaxsmw.runtime.workers.open_executor", lambda *_: nullcontext(LocalExecutor()))
     call = ["benchmark", str(scape), "--methods", "initial", "--pairs", "1", "--output", str(tmp_path)]
-    assert run_command([*call, "--evaluation-samples", "50"]) == 0
+    assert run_command([*call, "--evaluation-samples", "50", "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
     (tmp_path / "results.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
     capsys.readouterr()
     assert run_command([*call, "--evaluation-samples", "50"]) == 2
@@ -432,6 +433,13 @@ def test_a_benchmark_does_not_change_the_calling_process(measure, monkeypatch):
     assert dict(os.environ) == environment
     assert monitoring.get_event_duration_listeners() == listeners
     assert double._cache_size() == 1
+
+
+def test_a_missing_package_is_named_before_any_pair_is_measured(scape, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert run_command(command(scape, tmp_path / "r")[3:]) == 2
+    assert "benchmarks need pyarrow, which is not installed" in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()
 
 
 def test_importing_the_benchmark_registers_no_listener():

@@ -18,9 +18,8 @@ from command_line import assert_refused, runner
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
-import jaxsmw.collection.matching as matching
 from jaxsmw import InputError, make_mesh, read_mesh, write_mesh
-from jaxsmw.collection import CollectionSettings, match_collection
+from jaxsmw.collection import CollectionSettings, edge_matcher, match_collection
 from jaxsmw.collection.files import write_registered
 from jaxsmw.geometry.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
@@ -57,7 +56,7 @@ def work(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(meshes, work):
-    return match_collection(meshes, preset="paper", settings=SETTINGS, mirror=False, directory=work)
+    return match_collection(meshes, preset="paper", settings=SETTINGS, mirror="no", directory=work)
 
 
 def error(collection, shapes, i, j):
@@ -71,7 +70,7 @@ def error(collection, shapes, i, j):
 def matched(monkeypatch):
     """The pairs that a call matches, as lists of names."""
     pairs = []
-    original = matching.match_edges
+    original = edge_matcher.match_edges
 
     def recording(tasks, *arguments):
         def noted():
@@ -81,7 +80,7 @@ def matched(monkeypatch):
 
         return original(noted(), *arguments)
 
-    monkeypatch.setattr(matching, "match_edges", recording)
+    monkeypatch.setattr(edge_matcher, "match_edges", recording)
     return pairs
 
 
@@ -117,13 +116,13 @@ def test_bad_numbers_of_shapes_are_refused(found):
 
 def test_equal_names_are_numbered(meshes):
     alike = [replace(mesh, name="mesh") for mesh in meshes[:3]]
-    collection = match_collection(alike, preset="paper", settings=SETTINGS, mirror=False)
+    collection = match_collection(alike, preset="paper", settings=SETTINGS, mirror="no")
     assert list(collection.names) == ["mesh 0", "mesh 1", "mesh 2"]
 
 
 def test_the_template_can_be_chosen(meshes, work):
     chosen = match_collection(
-        meshes, preset="paper", settings=SETTINGS, mirror=False, directory=work, template=3
+        meshes, preset="paper", settings=SETTINGS, mirror="no", directory=work, template=3
     )
     assert chosen.template == 3
     with pytest.raises(InputError, match="at least two meshes"):
@@ -131,7 +130,7 @@ def test_the_template_can_be_chosen(meshes, work):
 
 
 def test_a_second_call_matches_nothing_and_gives_the_same_result(meshes, work, found, matched):
-    again = match_collection(meshes, preset="paper", settings=SETTINGS, mirror=False, directory=work)
+    again = match_collection(meshes, preset="paper", settings=SETTINGS, mirror="no", directory=work)
     assert matched == []
     for first, second in zip(found.registered, again.registered, strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)
@@ -148,7 +147,7 @@ def test_an_interrupted_call_continues(meshes, found, matched, tmp_path):
 
     def run(progress=None):
         return match_collection(
-            meshes, preset="paper", settings=SETTINGS, mirror=False, directory=tmp_path, progress=progress
+            meshes, preset="paper", settings=SETTINGS, mirror="no", directory=tmp_path, progress=progress
         )
 
     with pytest.raises(Interrupted):
@@ -169,7 +168,7 @@ def test_an_interrupted_call_continues(meshes, found, matched, tmp_path):
 def test_an_added_mesh_is_matched_alone(meshes, matched, tmp_path):
     def run(number):
         return match_collection(
-            meshes[:number], preset="paper", settings=SETTINGS, mirror=False, directory=tmp_path
+            meshes[:number], preset="paper", settings=SETTINGS, mirror="no", directory=tmp_path
         )
 
     run(4)
@@ -184,7 +183,7 @@ def test_an_unusable_mesh_is_left_out_and_named(meshes, found, work):
     # A single triangle has too few vertices.
     triangle = make_mesh(np.eye(3), np.array([[0, 1, 2]]), name="triangle")
     result = match_collection(
-        [*meshes, triangle], preset="paper", settings=SETTINGS, mirror=False, directory=work
+        [*meshes, triangle], preset="paper", settings=SETTINGS, mirror="no", directory=work
     )
     assert list(result.left_out) == ["triangle"] and "3 vertices" in result.left_out["triangle"]
     assert result.names == found.names
@@ -193,7 +192,7 @@ def test_an_unusable_mesh_is_left_out_and_named(meshes, found, work):
 
 def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch):
     """The first match of one pair maps every vertex to the mirror image of its match."""
-    original = matching.match_edges
+    original = edge_matcher.match_edges
     settings = CollectionSettings(edges_per_shape=2)
 
     def corrupting(tasks, *arguments):
@@ -202,7 +201,7 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
             if task.init is None and (task.x.mesh.name, task.y.mesh.name) == ("shape1", "shape3"):
                 shuffled = np.random.default_rng(0).permutation(len(edge.forward))
                 back = np.random.default_rng(1).permutation(len(edge.backward))
-                edge = matching.EdgeMap(
+                edge = edge_matcher.EdgeMap(
                     edge.forward[shuffled],
                     edge.backward[back],
                     edge.expected_error,
@@ -211,8 +210,8 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
                 )
             yield edge
 
-    monkeypatch.setattr(matching, "match_edges", corrupting)
-    result = match_collection(meshes, preset="paper", settings=settings, mirror=False)
+    monkeypatch.setattr(edge_matcher, "match_edges", corrupting)
+    result = match_collection(meshes, preset="paper", settings=settings, mirror="no")
     (edge,) = (edge for edge in result.edges if (edge.source, edge.target) == (1, 3))
     assert edge.decision == "replaced"
     assert "replaced" in edge.sentence(result.names)
@@ -223,7 +222,7 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
 
 
 def test_a_mesh_whose_matches_all_fail_is_named(meshes, monkeypatch):
-    original = matching.match_edges
+    original = edge_matcher.match_edges
 
     def failing(tasks, *arguments):
         for task in tasks:
@@ -232,9 +231,9 @@ def test_a_mesh_whose_matches_all_fail_is_named(meshes, monkeypatch):
             else:
                 yield from original(iter([task]), *arguments)
 
-    monkeypatch.setattr(matching, "match_edges", failing)
+    monkeypatch.setattr(edge_matcher, "match_edges", failing)
     with pytest.raises(ArithmeticError, match="failed numerically: shape4"):
-        match_collection(meshes, preset="paper", settings=SETTINGS, mirror=False)
+        match_collection(meshes, preset="paper", settings=SETTINGS, mirror="no")
 
 
 def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
@@ -250,7 +249,7 @@ def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
     [
         ({"names": ["a", "b"]}, "2 different names for 5 meshes"),
         ({"names": list("abcda")}, "4 different names"),
-        ({"mirror": "no"}, "give True or False"),
+        ({"mirror": "yes"}, "is not a mirror setting of a collection: choose auto, no"),
         ({"template": 5}, "from 0 to 4"),
         ({"template": "a"}, "from 0 to 4"),
         ({"template": True}, "from 0 to 4"),
@@ -269,10 +268,10 @@ def test_bad_arguments_are_refused(meshes, arguments, message):
 
 
 def test_tasks_of_workers_are_kept_in_the_directory(meshes, work, found, monkeypatch):
-    monkeypatch.setattr(matching, "TemporaryDirectory", None)
+    monkeypatch.setattr(edge_matcher, "TemporaryDirectory", None)
     with ThreadPoolExecutor(1) as executor:
         again = match_collection(
-            meshes, preset="paper", settings=SETTINGS, mirror=False, directory=work, executor=executor
+            meshes, preset="paper", settings=SETTINGS, mirror="no", directory=work, executor=executor
         )
     assert again.edges == found.edges
 
@@ -295,7 +294,7 @@ def test_workers_give_the_same_maps(meshes, found, tmp_path):
 
     with open_executor(2) as executor:
         result = match_collection(
-            meshes, preset="paper", settings=SETTINGS, mirror=False, directory=tmp_path, executor=executor
+            meshes, preset="paper", settings=SETTINGS, mirror="no", directory=tmp_path, executor=executor
         )
     for i, j in permutations(range(5), 2):
         assert (result.pointwise_map(i, j) == found.pointwise_map(i, j)).mean() > 0.99
@@ -339,7 +338,7 @@ def test_real_people_through_the_template(shared):
     names = [f"tr_reg_{number:03}" for number in (0, 7, 12)]
     people = [read_mesh(data / "off" / f"{name}.off") for name in names]
     truth = [np.loadtxt(data / "corres" / f"{name}.vts", dtype=int) - 1 for name in names]
-    result = match_collection(people, settings=CollectionSettings(edges_per_shape=2.5), mirror=False)
+    result = match_collection(people, settings=CollectionSettings(edges_per_shape=2.5), mirror="no")
     errors = []
     for i, j in permutations(range(3), 2):
         offsets = people[j].vertices[result.pointwise_map(i, j)[truth[i]]] - people[j].vertices[truth[j]]
@@ -482,6 +481,23 @@ def test_other_settings_need_another_directory(result_directory, directory, run)
     assert_refused(outcome._replace(errors=outcome.errors.split("\n", 1)[1]), naming="seed = 0")
 
 
+def test_files_of_others_are_not_replaced(result_directory, directory, run, tmp_path):
+    for name in ("index.html", "registered"):
+        (tmp_path / name / "registered").mkdir(parents=True)
+        (tmp_path / name / "registered" / "shape0.ply").write_text("precious")
+        outcome = run("collection", directory, "--output", tmp_path / name, *OPTIONS, "--quiet")
+        assert outcome.code == 2 and "contains registered, but no results of a collection" in outcome.errors
+        assert os.listdir(tmp_path / name) == ["registered"]
+    other = tmp_path / "other"
+    other.mkdir()
+    for file in directory.glob("shape*"):
+        shutil.copy(file, other / f"body_{file.name}")
+    before = (result_directory / "collection.json").read_bytes()
+    outcome = run("collection", other, "--output", result_directory, *OPTIONS, "--quiet")
+    assert_refused(outcome, naming="contains the results of other meshes, such as shape0")
+    assert (result_directory / "collection.json").read_bytes() == before
+
+
 def test_files_of_earlier_meshes_and_options_are_removed(result_directory, directory, meshes, run, tmp_path):
     output = tmp_path / "result"
     shutil.copytree(result_directory, output)
@@ -491,7 +507,7 @@ def test_files_of_earlier_meshes_and_options_are_removed(result_directory, direc
     summary["files"] += ["../kept", "registered/..", "maps/../../kept", 3]
     (output / "collection.json").write_text(json.dumps(summary), "utf-8")
     far = tmp_path / "far.csv"
-    write_landmark_file(far, Landmarks(("a",), 10 * meshes[1].vertices[:1]))
+    write_landmark_file(far, Landmarks(("a",), 1.3 * meshes[1].vertices[:1]))
     outcome = run(
         "collection", directory, "--output", output, *OPTIONS, "--exclude", "shape3.stl", "--suffix", "obj",
         "--landmarks", far, "--landmarks-of", "shape1.off",
@@ -598,15 +614,16 @@ def test_names_that_are_too_long_are_refused_before_the_computation(meshes, run,
 def test_a_damaged_summary_and_names_of_any_bytes_do_not_stop_the_results(meshes, run, tmp_path):
     inputs, output = tmp_path / "in", tmp_path / "out"
     inputs.mkdir()
-    output.mkdir()
     for number, name in enumerate(
         (b"bad\xff.ply", "sch\xf6n.ply".encode(), b"a_ply.ply", b"a.ply", b"a.off")
     ):
         write_mesh(inputs / os.fsdecode(name), meshes[number])
-    (output / "collection.json").write_text("[" * 100_000)
-    outcome = run("collection", inputs, "--output", output, *OPTIONS)
-    assert outcome.code == 0, outcome.errors
-    names = json.loads((output / "collection.json").read_text("utf-8"))["shapes"]
+    for _ in range(2):
+        outcome = run("collection", inputs, "--output", output, *OPTIONS)
+        assert outcome.code == 0, outcome.errors
+        summary = (output / "collection.json").read_text("utf-8")
+        (output / "collection.json").write_text("[" * 100_000)
+    names = json.loads(summary)["shapes"]
     assert len({shape["name"] for shape in names}) == 5 == len(list((output / "registered").iterdir()))
     assert len((output / "scores.csv").read_text("utf-8", "surrogateescape").splitlines()) == 6
 

@@ -24,8 +24,7 @@ from jaxsmw.collection import (
     synchronize,
 )
 from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, find_outliers, triangles
-from jaxsmw.collection.matching import _preset_key
-from jaxsmw.collection.shapes import prepare_pair, prepare_shape, prepare_shapes
+from jaxsmw.collection.shapes import prepare_pair, prepare_shape, prepare_shapes, preset_key
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
 from jaxsmw.core.banks import LowPass
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -385,7 +384,7 @@ def test_presets_of_different_arrays_have_different_keys():
     low, high = (Preset((Stage(WaveletPreservation(LowPass(cutoff))),)) for cutoff in (0.25, 0.5))
     same = Preset((Stage(WaveletPreservation(LowPass(0.25))),))
     assert repr(low) == repr(high)
-    assert _preset_key(low) == _preset_key(same) != _preset_key(high)
+    assert preset_key(low) == preset_key(same) != preset_key(high)
 
 
 def test_pairs_may_come_from_an_iterator(three, one_by_one):

@@ -334,7 +334,7 @@ def test_repeated_eigenvalues_have_equal_responses():
         (lambda: HalfCosine(overlap=3.5), "overlap of HalfCosine must be an integer, not 3.5"),
         (lambda: Itersine(overlap=2.0), "overlap of Itersine must be an integer, not 2.0"),
         (lambda: Regular(1.5), "degree of Regular must be an integer, not 1.5"),
-        (lambda: Meyer(2.5), "Meyer needs a whole number of filters, not 2.5"),
+        (lambda: Meyer(2.5), "the number of filters of Meyer must be an integer, not 2.5"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

@@ -492,7 +492,7 @@ def test_arguments_of_wrong_types_are_named():
         "the spectrum of Y is None, but a Spectrum is needed",
         "the initial map is list, but an array is needed",
         "the bank is 'meyer', but a FilterBank is needed",
-        "Meyer needs a whole number of filters, not 3.5",
+        "the number of filters of Meyer must be an integer, not 3.5",
         "the levels are (3.5,), but they must be integers",
         "the levels are 35, but they must be integers",
         "(35, 60) 2",

@@ -97,6 +97,8 @@ def run(options: argparse.Namespace) -> None:
 
     check_drawable()
     try:
+        import pyarrow  # noqa: F401 (the tables of all pairs need it, and they are written last)
+
         from jaxsmw.evaluation.benchmark import run_benchmark
         from jaxsmw.evaluation.datasets import choose_pairs
         from jaxsmw.evaluation.measurement import Settings
@@ -124,7 +126,7 @@ def run(options: argparse.Namespace) -> None:
         quiet_children(),
         open_executor(options.workers, options.scheduler) as executor,
     ):
-        results = run_benchmark(data_set, pairs, directory, methods, settings, executor)
+        results = run_benchmark(data_set, pairs, directory, methods, settings, executor, quiet=options.quiet)
     if results.rows:
         show(markdown_table(write_tables(directory, data_set, results, settings, methods)).rstrip("\n"))
     report_progress(f"the results are in {output}")

@@ -8,9 +8,9 @@ import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
-from jaxsmw.choices import DEFAULT_PRESET, PresetName
+from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, MirrorCollection, PresetName
 from jaxsmw.cli.arguments import add_weld, path, refuse_without, whole_number
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 HELP = "match all meshes of a directory consistently; register a template on each; compute a shape model"
 
-_MirrorCollection = Literal["auto", "no"]
 # More edges cost time, but hardly improve the maps. (Table R26 of docs/research_log.md)
 _MOST_EDGES = 6
 
@@ -72,8 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--mirror",
-        choices=get_args(_MirrorCollection),
-        default="auto",
+        choices=get_args(MirrorCollection),
+        default=DEFAULT_MIRROR,
         help="auto finds meshes of opposite hands, such as left and right teeth, and matches their mirror "
         "images; no matches all meshes as they are (default: %(default)s)",
     )
@@ -147,7 +146,7 @@ def run(options: argparse.Namespace) -> None:
     with stopwatch.step("loading"):
         files = _mesh_files(options)
         _check(options, files)
-        from jaxsmw.collection.files import replace_results
+        from jaxsmw.collection.files import RESULT_DIRECTORIES, check_replaceable, replace_results
         from jaxsmw.runtime.files import make_directory, remove_leftovers
         from jaxsmw.runtime.journal import claimed_directory
     with stopwatch.step("reading"):
@@ -159,13 +158,15 @@ def run(options: argparse.Namespace) -> None:
             raise InputError(
                 f"--{option.replace('_', '-')}: {file} was left out (see above): choose another mesh."
             )
+    check_replaceable(Path(options.output), _names(data))
     directory = make_directory(options.output)
     work = make_directory(directory / "work")
     announce_consequence(
         f"finished pairs are kept in {options.output}, and the same command continues from there"
     )
     with claimed_directory(directory, _provenance(options)), _executor(options) as executor:
-        for place in (directory, *(directory / name for name in _RESULTS)):
+        # Killed runs leave temporary files.
+        for place in (directory, work, *(directory / name for name in RESULT_DIRECTORIES)):
             remove_leftovers(place)
         collection = _match(options, data, work, executor)
         collection.left_out.update(unreadable)
@@ -262,6 +263,7 @@ def _inside(options: argparse.Namespace, option: str, file: str, files: Mapping[
 
 def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
     """Check the options and the output directory before the long computation."""
+    from jaxsmw.collection.files import RESULT_FILES
     from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
     from jaxsmw.io.mesh_data import check_mesh_suffix
     from jaxsmw.runtime.files import size_of_file
@@ -282,7 +284,7 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
         options.landmarks_of = options.landmarks_of or _mesh_of(options.landmarks, files)
     check_outputs(
         [*map(str, files.values()), options.landmarks],
-        directories=[(options.output, ("collection.json", "index.html", "modes.npz", "scores.csv"))],
+        directories=[(options.output, RESULT_FILES)],
     )
     _refuse_results_as_inputs(options, files)
     if _same(options.output, Path(options.directory)):
@@ -291,20 +293,20 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
         )
 
 
-# The directories of the results. Temporary files that killed runs left in these directories are removed.
-_RESULTS = ("maps", "registered", "landmarks", "attributes", "work")
 # The longest file name that usual file systems allow, in bytes.
 _LONGEST_NAME = 255
 
 
 def _refuse_results_as_inputs(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
     """Refuse inputs that the results would replace, and mesh names that are too long for result files."""
+    from jaxsmw.collection.files import RESULT_DIRECTORIES
+
     output = Path(os.path.realpath(options.output))
     for file in filter(None, [*map(str, files.values()), options.landmarks]):
         path = Path(os.path.realpath(file))
         if path.is_relative_to(output):
             inside = path.relative_to(output)
-            if inside.parts[0] in _RESULTS or inside.stem == "mean":
+            if inside.parts[0] in (*RESULT_DIRECTORIES, "work") or inside.stem == "mean":
                 raise InputError(
                     f"{file}: lies among the results in {options.output}, which would replace it: choose "
                     "another directory for the results."
@@ -430,7 +432,7 @@ def _match(
         names=_names(data),
         preset=options.preset,
         template=None if options.template is None else list(data).index(Path(options.template).name),
-        mirror=options.mirror == "auto",
+        mirror=options.mirror,
         settings=settings,
         seed=options.seed,
         directory=work,

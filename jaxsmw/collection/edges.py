@@ -14,10 +14,8 @@ from jaxsmw.collection.shapes import PreparedShape, prepare_pair
 from jaxsmw.correspondence import Correspondence
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.matching import match_prepared
-from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset
-from jaxsmw.repair.chirality import Decision, Hands
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +117,3 @@ def match_edges(
             yield EdgeMap.of(found.correspondence)
         except ArithmeticError as error:
             yield error
-
-
-def compare_hands(x: PreparedShape, y: PreparedShape) -> Decision:
-    """Decide whether Y corresponds to X or to the mirror image of X; see `jaxsmw.repair.chirality.Hands`."""
-    return Hands(Pair(x.mesh, y.mesh), x.spectrum, y.spectrum).decide("auto")

@@ -18,6 +18,7 @@ import numpy as np
 
 from jaxsmw.collection.result import Collection
 from jaxsmw.collection.shape_models import ShapeModel
+from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.landmark_files import write_landmark_file
 from jaxsmw.io.landmarks import Landmarks
@@ -28,6 +29,10 @@ from jaxsmw.transfer.attributes import registered_data, transfer_attributes
 from jaxsmw.transfer.landmarks import transfer_landmarks
 
 logger = logging.getLogger("jaxsmw")
+
+# The names that `replace_results` replaces. The mean shape is not listed, because users choose its suffix.
+RESULT_FILES = ("collection.json", "index.html", "modes.npz", "scores.csv")
+RESULT_DIRECTORIES = ("maps", "registered", "landmarks", "attributes")
 
 
 def write_maps(collection: Collection, directory: Path) -> list[Path]:
@@ -242,6 +247,33 @@ def write_summary(
         temporary.write_text(json.dumps(contents, indent=2, allow_nan=False) + "\n", "utf-8")
 
 
+def check_replaceable(directory: Path, names: Sequence[str]) -> None:
+    """Check that a directory contains nothing that the results of a collection would wrongly replace.
+
+    **Arguments:**
+
+    - `directory`: the directory of the results, which need not exist.
+    - `names`: the names of the meshes of the collection.
+
+    **Raises:** `InputError` if the directory contains files with the names of results but no results, or
+    results of a collection without any of these meshes.
+    """
+    if not (directory / "provenance.json").exists():
+        if taken := [name for name in RESULT_FILES + RESULT_DIRECTORIES if (directory / name).exists()]:
+            raise InputError(
+                f"{directory}: contains {taken[0]}, but no results of a collection: choose another directory "
+                "for the results."
+            )
+        return
+    shapes = _summary(directory / "collection.json").get("shapes", [])
+    before = [str(shape.get("name")) for shape in shapes if isinstance(shape, dict)]
+    if before and not set(before) & set(names):
+        raise InputError(
+            f"{directory}: contains the results of other meshes, such as {before[0]}: choose another "
+            "directory for the results, or remove this directory."
+        )
+
+
 def replace_results(new: Path, directory: Path) -> None:
     """Move complete results to a directory, and remove the results of an earlier run.
 
@@ -271,15 +303,21 @@ def replace_results(new: Path, directory: Path) -> None:
 
 def _listed_files(summary: Path) -> list[str]:
     """Return the files that an earlier summary lists, if they lie within the directory of the summary."""
+    listed = _summary(summary).get("files", [])
+    return [file for file in listed if isinstance(file, str) and _LISTED.fullmatch(file)]
+
+
+def _summary(path: Path) -> dict[str, list[Any]]:
+    """Return the lists of a summary. If the file is missing or damaged, the dictionary is empty."""
     with suppress(OSError, ValueError, RecursionError):
-        found = json.loads(summary.read_text("utf-8"))
-        listed = found.get("files", []) if isinstance(found, dict) else []
-        return [file for file in listed if isinstance(file, str) and _LISTED.fullmatch(file)]
-    return []
+        found = json.loads(path.read_text("utf-8"))
+        if isinstance(found, dict):
+            return {name: value for name, value in found.items() if isinstance(value, list)}
+    return {}
 
 
 # Only results are removed, and nothing outside the directory of the results.
-_LISTED = re.compile(r"(?:(?:maps|registered|landmarks|attributes)/(?!\.\.)[^/\0]+|mean\.\w+)")
+_LISTED = re.compile(rf"(?:(?:{'|'.join(RESULT_DIRECTORIES)})/(?!\.\.)[^/\0]+|mean\.\w+)")
 
 
 def _finite(value: float) -> float | None:

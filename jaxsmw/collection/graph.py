@@ -9,8 +9,10 @@ from jaxtyping import Float64
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from jaxsmw.collection.consistency import Edge, check_pairs
+from jaxsmw.collection.settings import CollectionSettings
 from jaxsmw.collection.shapes import PreparedShape
 from jaxsmw.errors import InputError, check_number, check_whole_number
+from jaxsmw.runtime.cache import Store
 
 # Low eigenvalues describe the proportions of a body. High eigenvalues depend on the mesh.
 _COMPARED_EIGENVALUES = 50
@@ -128,3 +130,39 @@ def choose_edges(
                 break
             added.add(edge)
     return sorted(chosen | added)
+
+
+def extended_graph(
+    shapes: Sequence[PreparedShape], settings: CollectionSettings, *, seed: int = 0, store: Store
+) -> list[Edge]:
+    """Choose the pairs of a collection that are matched, and keep them in a store.
+
+    Edges between shapes of an earlier call with the same store are chosen again, even if other shapes were
+    added or removed since.
+
+    **Arguments:**
+
+    - `shapes`: the shapes, with names that differ from each other.
+    - `settings`: the settings of the graph.
+    - `seed`: the seed of the random edges.
+    - `store`: the store of the collection.
+
+    **Returns:** The edges (i, j) with i < j, in ascending order; see `choose_edges`.
+    """
+    names = [shape.mesh.name for shape in shapes]
+    inputs = (repr(settings.edges_per_shape), settings.random_share, seed)
+    stored = store.load("graph", inputs)
+    given: list[Edge] = []
+    if stored is not None:
+        row = {name: number for number, name in enumerate(names)}
+        pairs = [(row.get(a), row.get(b)) for a, b in stored["edges"].reshape(-1, 2).tolist()]
+        given = [(min(a, b), max(a, b)) for a, b in pairs if a is not None and b is not None]
+    edges = choose_edges(
+        shape_distances(shapes),
+        edges_per_shape=settings.edges_per_shape,
+        random_share=settings.random_share,
+        given=given,
+        seed=seed,
+    )
+    store.save("graph", inputs, {"edges": np.array([[names[i], names[j]] for i, j in edges])})
+    return edges

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool
 
 from jaxsmw.collection.consistency import Edge
-from jaxsmw.repair.chirality import Decision
+from jaxsmw.collection.graph import choose_edges, shape_distances
+from jaxsmw.collection.shapes import PreparedShape, shape_key
+from jaxsmw.pair import Pair
+from jaxsmw.presets import Preset
+from jaxsmw.repair.chirality import Decision, Hands
+from jaxsmw.runtime.cache import Store
+from jaxsmw.runtime.progress import Progress, no_progress
+
+# The number of pairs whose hands are compared, divided by the number of shapes.
+_COMPARED_PER_SHAPE = 1.5
+# The number of pairs whose hands are compared first. If none of these pairs is asymmetric, as with bodies,
+# no further hands are compared.
+_COMPARED_FIRST = 5
 
 
 def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.ndarray, " N"]:
@@ -47,3 +59,50 @@ def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.nda
         if 2 * mirrored.sum() > number or (2 * mirrored.sum() == number and mirrored[0])
         else mirrored
     )
+
+
+def compare_hands(
+    shapes: Sequence[PreparedShape],
+    preset: Preset,
+    *,
+    seed: int = 0,
+    store: Store = Store(),  # noqa: B008 (immutable)
+    progress: Progress = no_progress,
+) -> dict[Edge, Decision]:
+    """Compare the hands of similar shapes, and of all shapes along a sparse graph if some are asymmetric.
+
+    **Arguments:**
+
+    - `shapes`: the shapes of the collection.
+    - `preset`: the preset with which the shapes were prepared.
+    - `seed`: the seed of the random edges of the graph.
+    - `store`: the store in which decisions are kept.
+    - `progress`: a function that is called after each comparison.
+
+    **Returns:** The `Decision` of each compared edge; see `jaxsmw.repair.chirality.Hands`.
+    """
+
+    def decision(edge: Edge) -> Decision:
+        x, y = (shapes[number] for number in edge)
+
+        def compute() -> dict[str, np.ndarray]:
+            found = Hands(Pair(x.mesh, y.mesh), x.spectrum, y.spectrum).decide("auto")
+            evidence = np.nan if found.evidence is None else found.evidence
+            return {"decision": np.array([found.mirrored, evidence, found.doubtful, found.asymmetric], float)}
+
+        arrays = store.get("hand", (*shape_key(x, preset), *shape_key(y, preset)), compute)
+        mirrored, evidence, doubtful, asymmetric = arrays["decision"].tolist()
+        return Decision(
+            bool(mirrored), None if np.isnan(evidence) else evidence, bool(doubtful), bool(asymmetric)
+        )
+
+    edges = choose_edges(shape_distances(shapes), edges_per_shape=_COMPARED_PER_SHAPE, seed=seed)
+    first = edges[:: max(1, len(edges) // _COMPARED_FIRST)][:_COMPARED_FIRST]
+    decisions = {edge: decision(edge) for edge in first}
+    if not any(found.asymmetric for found in decisions.values()):
+        return decisions
+    for number, edge in enumerate(edges):
+        if edge not in decisions:
+            decisions[edge] = decision(edge)
+        progress("hands", number + 1, len(edges))
+    return decisions

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Int, Int64
 
 from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.descriptors import DescriptorAxes, SampledPair, SampledShape, compared_samples
+from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes, SampledPair, SampledShape, compared_samples
+from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import choose_eigensolver, compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
@@ -22,6 +26,10 @@ from jaxsmw.initial_maps.nearest import nearest_map
 from jaxsmw.pair import Pair, check_eigenvalues, number_of_usable_vertices
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset
+from jaxsmw.runtime.cache import Store
+from jaxsmw.runtime.progress import Progress, no_progress
+
+logger = logging.getLogger("jaxsmw")
 
 
 def _warned_already() -> AbstractContextManager[object]:
@@ -51,6 +59,10 @@ class PreparedShape:
     def sampled(self) -> SampledShape:
         """The shape with the vertices at which its descriptors are compared."""
         return SampledShape.make(self.mesh, self.compared, self.spectrum)
+
+    def mirrored(self) -> PreparedShape:
+        """Return the mirror image of a shape without descriptors."""
+        return replace(self, mesh=self.mesh.mirrored(), spectrum=self.spectrum.reflect())
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the shape as arrays, for a file."""
@@ -105,13 +117,41 @@ def prepare_shape(
     return PreparedShape(mesh, spectrum, compared, samples)
 
 
-def describe_shape(shape: PreparedShape, axes: DescriptorAxes) -> PreparedShape:
-    """Return the shape with descriptors along the axes of the whole collection.
+def prepare_usable_shapes(
+    meshes: Sequence[Mesh], preset: Preset, progress: Progress = no_progress
+) -> tuple[dict[int, PreparedShape], dict[str, str]]:
+    """Prepare all shapes that can be matched, without descriptors.
 
-    **Raises:** `InputError` if SHOT is not defined on the mesh.
+    **Arguments:**
+
+    - `meshes`: the meshes, each a `Mesh`.
+    - `preset`: see `prepare_shape`.
+    - `progress`: a function that is called after each shape.
+
+    **Returns:** A dictionary from the number of each usable mesh to its `PreparedShape`, and a dictionary
+    from the name of each other mesh to the reason.
     """
-    with _warned_already():
-        return replace(shape, spectrum=axes.describe(shape.sampled, shape.spectrum))
+    eigensolver = choose_eigensolver(*meshes) if meshes else "exact"
+    shapes, left_out = {}, {}
+    for number, mesh in enumerate(meshes):
+        try:
+            shapes[number] = prepare_shape(mesh, preset, eigensolver=eigensolver)
+        except (InputError, ArithmeticError) as error:
+            left_out[mesh.name] = str(error)
+            logger.warning("%s is left out: %s", mesh.name, error)
+        progress("shapes", number + 1, len(meshes))
+    return shapes, left_out
+
+
+def shape_key(shape: PreparedShape, preset: Preset) -> tuple[Any, ...]:
+    """Return the key of a shape without descriptors, for keys of `Store`."""
+    return shape.mesh.vertices, shape.mesh.faces, preset.number_of_eigenvectors
+
+
+def preset_key(preset: Preset) -> tuple[Any, ...]:
+    """Return the key of a preset, for keys of `Store`: its text, and the arrays that its text abbreviates."""
+    refiners = [stage.refiner for stage in preset.stages]
+    return repr(preset), *(np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(refiners, eqx.is_array)))
 
 
 def prepare_pair(
@@ -134,10 +174,39 @@ def prepare_pair(
     )
 
 
-def descriptor_axes(shapes: Sequence[PreparedShape], preset: Preset) -> DescriptorAxes:
-    """Compute the principal axes of the descriptors of all shapes; see `DescriptorAxes`."""
+def describe_shapes(
+    shapes: Sequence[PreparedShape],
+    preset: Preset,
+    store: Store = Store(),  # noqa: B008 (immutable)
+) -> tuple[list[PreparedShape], DescriptorAxes | None]:
+    """Add descriptors along the axes of the whole collection, if the preset uses descriptors.
+
+    **Arguments:**
+
+    - `shapes`: the shapes.
+    - `preset`: the preset, which determines the number of descriptors.
+    - `store`: the store in which the axes are kept. If shapes are added to a collection later, the axes do
+      not change, and so the matched edges do not change either.
+
+    **Returns:** The shapes with descriptors, and the axes. Without descriptors, the axes are None.
+
+    **Raises:** `InputError` if SHOT is not defined on a mesh.
+    """
+    if not (shapes and preset.number_of_descriptors):
+        return list(shapes), None
+
+    def compute() -> dict[str, np.ndarray]:
+        axes = DescriptorAxes.of([shape.sampled for shape in shapes], preset.number_of_descriptors)
+        return {
+            "radii": np.array(axes.radii),
+            "mean": axes.principal.mean,
+            "axes": axes.principal.axes,
+        }
+
     with _warned_already():
-        return DescriptorAxes.of([shape.sampled for shape in shapes], preset.number_of_descriptors)
+        arrays = store.get("descriptor-axes", preset_key(preset), compute)
+        axes = DescriptorAxes(tuple(arrays["radii"].tolist()), PrincipalAxes(arrays["mean"], arrays["axes"]))
+        return [replace(one, spectrum=axes.describe(one.sampled, one.spectrum)) for one in shapes], axes
 
 
 def prepare_shapes(
@@ -156,10 +225,7 @@ def prepare_shapes(
     """
     eigensolver = choose_eigensolver(*meshes) if meshes else "exact"
     shapes = [prepare_shape(mesh, preset, eigensolver=eigensolver) for mesh in meshes]
-    if not (shapes and preset.number_of_descriptors):
-        return shapes, None
-    axes = descriptor_axes(shapes, preset)
-    return [describe_shape(shape, axes) for shape in shapes], axes
+    return describe_shapes(shapes, preset)
 
 
 def fitted_preset(preset: Preset, *meshes: Mesh) -> Preset:

@@ -89,6 +89,8 @@ def run_benchmark(
     methods: Mapping[str, Method],
     settings: Settings,
     executor: Executor,
+    *,
+    quiet: bool = False,
 ) -> Results:
     """Run every method on every pair, and store the errors and times in CSV files.
 
@@ -106,6 +108,7 @@ def run_benchmark(
     - `settings`: the `Settings` of the benchmark. Results that `output` already contains must have been
       measured with the same settings.
     - `executor`: the executor that runs the tasks; see `jaxsmw.runtime.workers.open_executor`.
+    - `quiet`: whether to hide the progress bars.
 
     **Returns:** The `Results` of these pairs and methods. If a shape or pair cannot be measured,
     `Results.failures` contains the error message. No error is raised until `Results.check` is called.
@@ -121,9 +124,9 @@ def run_benchmark(
     with claimed_directory(output, _origin(settings, number_of_eigenvectors), {"commit": commit()}):
         store = _Store(output, data_set, pairs)
         measure = partial(measure_shape, number_of_eigenvectors=number_of_eigenvectors)
-        failed = _measure_all("shapes", measure, store.missing_shapes(), executor, store.shapes)
+        failed = _measure_all("shapes", measure, store.missing_shapes(), executor, store.shapes, quiet)
         measure = partial(measure_pair, settings=settings, number_of_eigenvectors=number_of_eigenvectors)
-        failed |= _measure_all("pairs", measure, store.missing_pairs(methods), executor, store.results)
+        failed |= _measure_all("pairs", measure, store.missing_pairs(methods), executor, store.results, quiet)
         return store.collected(methods, failed)
 
 
@@ -211,6 +214,7 @@ def _measure_all(
     tasks: Mapping[str, Any],
     executor: Executor,
     journal: Journal,
+    quiet: bool,
 ) -> dict[str, BaseException]:
     """Run all tasks, show a progress bar, and append the rows of each finished task to a journal.
 
@@ -219,7 +223,7 @@ def _measure_all(
     if not tasks:
         return {}
     failed: dict[str, BaseException] = {}
-    with tqdm(total=len(tasks), desc=what, unit=what[:-1], smoothing=0) as progress:
+    with tqdm(total=len(tasks), desc=what, unit=what[:-1], smoothing=0, disable=quiet) as progress:
         for name, result in run_tasks(measure, tasks, executor):
             if isinstance(result, BaseException):
                 failed[name] = result

@@ -211,7 +211,7 @@ def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
 
     **Raises:** `InputError` if an entry of the map is not a vertex of Y.
     """
-    image = np.unique(
-        check_indices(pointwise_map, len(mesh_y.vertices), f"pointwise map on {mesh_y.name}: vertex")
-    )
-    return float(mesh_y.vertex_areas[image].sum() / mesh_y.vertex_areas.sum())
+    image = check_indices(pointwise_map, len(mesh_y.vertices), f"pointwise map on {mesh_y.name}: vertex")
+    matched = np.zeros(len(mesh_y.vertices), bool)
+    matched[image] = True
+    return float(mesh_y.average(matched))

@@ -407,7 +407,7 @@ def summarize(
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     if correspondence.distortion is not None:
         limit, suspicion = (correspondence.preset.repair or WITHOUT_REPAIR).suspicious, ""
-        if correspondence.distortion >= limit:
+        if correspondence.suspicious and correspondence.distortion >= limit:
             suspicion = f"; above {limit} limbs may be swapped"
         facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
     facts["expected error, mean"] = f"{correspondence.mesh_x.average(expected_error):.4f} √area"

@@ -85,16 +85,18 @@ class Store:
 
     **Arguments:**
 
-    - `directory`: an existing directory.
+    - `directory`: an existing directory; None (the default) for a store that keeps nothing.
     """
 
-    def __init__(self, directory: Path):
+    def __init__(self, directory: Path | None = None):
         self.directory = directory
 
     def load(
         self, kind: str, inputs: Sequence[np.ndarray | str | int | float]
     ) -> dict[str, np.ndarray] | None:
         """Return a stored result, or None if it is missing or damaged; see `cached` for the arguments."""
+        if self.directory is None:
+            return None
         key = _key(kind, inputs)
         return _load(self._path(kind, key), key)
 
@@ -105,11 +107,30 @@ class Store:
 
         **Raises:** `OSError` or `InputError` if the result cannot be written.
         """
+        if self.directory is None:
+            return
         key = _key(kind, inputs)
         with atomic_write(self._path(kind, key)) as temporary:
             np.savez(temporary, contents=np.array([key, *arrays]), **arrays)  # type: ignore[arg-type]
 
+    def get(
+        self,
+        kind: str,
+        inputs: Sequence[np.ndarray | str | int | float],
+        compute: Callable[[], dict[str, np.ndarray]],
+    ) -> dict[str, np.ndarray]:
+        """Return a stored result, or compute and store the result; see `cached` for the arguments.
+
+        **Raises:** `OSError` or `InputError` if the result cannot be written.
+        """
+        arrays = self.load(kind, inputs)
+        if arrays is None:
+            arrays = compute()
+            self.save(kind, inputs, arrays)
+        return arrays
+
     def _path(self, kind: str, key: str) -> Path:
+        assert self.directory is not None
         return self.directory / f"{kind}-{key}.npz"
 
 

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 logger = logging.getLogger("jaxsmw")
+
+Progress = Callable[[str, int, int], None]
+"""A function that is called with the name of a step, the number of finished parts and the number of parts."""
+
+
+def no_progress(step: str, done: int, number: int) -> None:
+    """Report nothing; a `Progress`."""
 
 
 @contextmanager

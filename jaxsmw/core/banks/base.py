@@ -5,8 +5,9 @@ from __future__ import annotations
 import abc
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Array, Float
+
+from jaxsmw.core.checks import check_integer
 
 
 class FilterBank(eqx.Module):
@@ -65,7 +66,6 @@ def check_number_of_filters(bank: FilterBank, filters: int, least: int) -> None:
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below the minimum
     `least`.
     """
-    if not isinstance(filters, int | np.integer):
-        raise TypeError(f"{type(bank).__name__} needs a whole number of filters, not {filters!r}")
+    check_integer(f"the number of filters of {type(bank).__name__}", filters)
     if filters < least:
         raise ValueError(f"{type(bank).__name__} needs at least {least} filters, not {filters}")
