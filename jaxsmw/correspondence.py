@@ -202,7 +202,7 @@ class Correspondence:
             self.mesh_y,
             self.surface_points(),
             stiffness=stiffness,
-            same_unit=self.pair.partial,
+            scale=self.pair.scale if self.pair.partial else None,
         )
 
     def one_to_one(self) -> Int64[np.ndarray, " m"]:

@@ -22,6 +22,7 @@ from jaxsmw.choices import (
     Laplacian,
     MatchInit,
     Mirror,
+    Scale,
 )
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.correspondence import Correspondence
@@ -53,6 +54,7 @@ def match(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
+    scale: float | Scale = 1.0,
     mirror: Mirror = DEFAULT_MIRROR,
     history: bool = False,
 ) -> Correspondence:
@@ -108,8 +110,11 @@ def match(
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"` (the default). `"approximate"` takes less time on
       large meshes. `"auto"` chooses `"approximate"` if one mesh has at least 50 000 referenced vertices, else
       `"exact"`.
-    - `partial`: True if one mesh is a partial shape and the other mesh the full shape, in the same unit of
-      length; see `paired_spectra`. The default is False, for two full shapes.
+    - `partial`: True if one mesh is a partial shape and the other mesh the full shape; see `paired_spectra`.
+      The default is False, for two full shapes.
+    - `scale`: for a partial pair, the factor by which lengths on X are multiplied to become lengths in the
+      unit of Y. The default is 1, for meshes in the same unit. With `"unknown"`, the factor is estimated; see
+      `jaxsmw.geometry.estimate_scale`. Full shapes are always scaled to the same area.
     - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. If they are, the
       mirror image of X is matched instead of X. Whether X is mirrored or not, entry i of the map is the match
       of vertex i of X.
@@ -134,7 +139,7 @@ def match(
     computation of the initial map or the refinement fails numerically.
     """
     check_choice(mirror, Mirror, "a mirror setting")
-    pair = Pair.make(mesh_x, mesh_y, partial=partial)
+    pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
     adapts = isinstance(preset, str | Preset)
     chosen, fewest = choose_preset(preset), pair.fewest_vertices()
     if adapts:
@@ -309,7 +314,10 @@ def _correspondence(
     m = len(pair.mesh_x.vertices)
     last = outcome.refinements[-1].unpadded(m)
     if last.result != RESULTS.successful:
-        raise ArithmeticError(f"{pair.name}: {sentence(last.result)}")
+        cure = (
+            ' If the units of length differ, set scale="unknown" (--scale unknown).' if pair.partial else ""
+        )
+        raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
     spectrum_x, spectrum_y = preset.stages[-1].view(
         prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial
     )
@@ -345,16 +353,18 @@ def _warning(prepared: PreparedPair, repair: RepairSettings | None, outcome: Out
     """Return the text of the warning that a map looks wrong."""
     pair, spectrum_x, init = prepared.pair, prepared.spectrum_x, prepared.init
     settings = repair or WITHOUT_REPAIR
-    found = np.asarray(outcome.pointwise_map)[: len(pair.mesh_x.vertices)].astype(np.int64)
-    areas = pair.mesh_x.vertex_areas / pair.mesh_x.area
-    mirrored = areas[orientation_reversal(pair, found, spectrum_x, settings.scores)].sum()
-    cut_off = areas[discontinuous_parts(pair, found, settings.scores)].sum()
+    found = outcome.unpadded_map(pair)
+    mirrored = pair.mesh_x.average(orientation_reversal(pair, found, spectrum_x, settings.scores))
+    cut_off = pair.mesh_x.average(discontinuous_parts(pair, found, settings.scores))
     more = not isinstance(init, str | SurfacePoints) and np.ndim(init) == 2
     cure = f"use {'more' if more else 'a few'} landmarks as the initial map"
     if repair is None:
         cure = f'use preset="accurate" (--preset accurate), which repairs such maps, or {cure}'
     if pair.partial:
-        cure += ", and check that both meshes have the same unit of length"
+        cure += (
+            ", and check that both meshes have the same unit of length, or estimate the scale with "
+            'scale="unknown" (--scale unknown)'
+        )
     else:
         cure += "; if one mesh is a partial shape, set partial=True (--partial)"
     return (

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxsmw.choices import Eigensolver, Laplacian
+from jaxsmw.choices import Eigensolver, Laplacian, Scale
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_choice, check_number
 from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
+from jaxsmw.geometry.scale import estimate_scale, relative_boundary
 from jaxsmw.runtime.threads import side_by_side
+
+logger = logging.getLogger("jaxsmw")
 
 # A preset uses at most one eigenvector per two vertices. With fewer vertices, a preset would use fewer than
 # two eigenvectors.
@@ -19,6 +24,9 @@ _FEWEST_VERTICES = 4
 # The smallest allowed ratio of the smaller area to the larger area of a partial pair. A part with less than a
 # thousandth of a body's area shows too little of the body's shape.
 _SMALLEST_PART = 1e-3
+# The smallest allowed ratio of the area of a closed full shape to the area of its part. The area of a body
+# changes by a few per cent between poses.
+_SMALLEST_FULL_SHAPE = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +39,25 @@ class Pair:
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), each a `Mesh`.
     - `partial`: False for two full shapes. True if one mesh is a partial shape and the other mesh the full
-      shape, in the same unit of length.
+      shape.
+    - `scale`: for a partial pair, the factor by which lengths on X are multiplied to become lengths in the
+      unit of Y. The factor is 1 if both meshes have the same unit. Full shapes ignore the scale.
     """
 
     mesh_x: Mesh
     mesh_y: Mesh
     partial: bool = False
+    scale: float = 1.0
 
     @classmethod
-    def make(cls, mesh_x: Mesh | MeshLike, mesh_y: Mesh | MeshLike, *, partial: bool = False) -> Pair:
+    def make(
+        cls,
+        mesh_x: Mesh | MeshLike,
+        mesh_y: Mesh | MeshLike,
+        *,
+        partial: bool = False,
+        scale: float | Scale = 1.0,
+    ) -> Pair:
         """Make a pair from meshes of this library or of other libraries.
 
         **Arguments:**
@@ -47,18 +65,26 @@ class Pair:
         - `mesh_x`, `mesh_y`: the source X and the target Y, each as a `Mesh` or as any mesh that
           `jaxsmw.make_mesh` accepts.
         - `partial`: False for two full shapes. True if one mesh is a partial shape and the other mesh the
-          full shape, in the same unit of length.
+          full shape.
+        - `scale`: for a partial pair, the factor by which lengths on X are multiplied to become lengths in
+          the unit of Y. With `"unknown"`, the factor is estimated; see `jaxsmw.geometry.estimate_scale`.
 
-        **Returns:** A `Pair`.
+        **Returns:** A `Pair`. The function issues a `UserWarning` if the estimated scale is uncertain.
 
         **Raises:** `InputError` if `jaxsmw.make_mesh` refuses a mesh, or `partial` is not a Boolean.
+        `InputError` is also raised if the scale is neither positive nor `"unknown"`, if full shapes have a
+        scale, or if the scale cannot be estimated. For a partial pair, `InputError` is raised if one mesh is
+        closed and is clearly smaller than the other mesh.
         """
         if not isinstance(partial, bool | np.bool):
             raise InputError(f"partial is {partial!r}: give True or False.")
         mesh_x, mesh_y = (
             as_mesh(mesh, name) for mesh, name in ((mesh_x, "source mesh"), (mesh_y, "target mesh"))
         )
-        return cls(mesh_x, mesh_y, bool(partial))
+        pair = cls(mesh_x, mesh_y, bool(partial), _known_scale(mesh_x, mesh_y, bool(partial), scale))
+        if pair.partial:
+            pair._check_areas()
+        return pair
 
     @property
     def meshes(self) -> tuple[Mesh, Mesh]:
@@ -77,8 +103,30 @@ class Pair:
         For two full shapes, the units are the square roots of the areas of X and of Y, which compensates for
         a difference in size. For a partial pair, both units are the square root of the larger area.
         """
-        roots = self.mesh_x.area**0.5, self.mesh_y.area**0.5
-        return (max(roots),) * 2 if self.partial else roots
+        root_x, root_y = self.mesh_x.area**0.5, self.mesh_y.area**0.5
+        if not self.partial:
+            return root_x, root_y
+        return max(root_x, root_y / self.scale), max(root_x * self.scale, root_y)
+
+    @property
+    def areas(self) -> tuple[float, float]:
+        """The areas of X and of Y in `units_of_length`: 1 for full shapes and for the larger shape."""
+        unit_x, unit_y = self.units_of_length
+        return self.mesh_x.area / unit_x**2, self.mesh_y.area / unit_y**2
+
+    def _check_areas(self) -> None:
+        """Check that a closed mesh, which cannot be the partial shape, is not the smaller mesh.
+
+        **Raises:** `InputError` if it is.
+        """
+        sides = zip(self.meshes, self.areas, map(relative_boundary, self.meshes), strict=True)
+        (closed, small, hole), (other, large, boundary) = sorted(sides, key=lambda side: side[2])
+        if hole == 0 < boundary and small < _SMALLEST_FULL_SHAPE * large:
+            raise InputError(
+                f"{other.name} is open and {closed.name} is closed, so {other.name} should be the partial "
+                f"shape, but it has {large / small:.3g} times the area: check the units of length, or set "
+                'scale="unknown" (--scale unknown).'
+            )
 
     def fewest_vertices(self) -> int:
         """Count the referenced vertices of each mesh, and return the smaller count.
@@ -90,11 +138,36 @@ class Pair:
 
     def mirrored(self) -> Pair:
         """Return the pair with the mirror image of X in place of X; see `jaxsmw.Mesh.mirrored`."""
-        return Pair(self.mesh_x.mirrored(), self.mesh_y, self.partial)
+        return replace(self, mesh_x=self.mesh_x.mirrored())
 
     def reversed(self) -> Pair:
         """Return the pair with X and Y exchanged."""
-        return Pair(self.mesh_y, self.mesh_x, self.partial)
+        return Pair(self.mesh_y, self.mesh_x, self.partial, 1 / self.scale)
+
+
+def _known_scale(mesh_x: Mesh, mesh_y: Mesh, partial: bool, scale: float | Scale) -> float:
+    """Return the scale of a pair as a number; see `Pair.make`."""
+    if not partial:
+        if scale != 1.0:
+            raise InputError(
+                f"scale is {scale!r}, but full shapes are scaled to the same area: leave the scale out, or "
+                "set partial=True (--partial)."
+            )
+        return 1.0
+    if isinstance(scale, str):
+        check_choice(scale, Scale, "a scale")
+        found = estimate_scale(mesh_x, mesh_y)
+        logger.info("scale: lengths on %s are multiplied by %.4g", mesh_x.name, found.scale)
+        if found.uncertain:
+            warnings.warn(
+                f"{mesh_x.name} to {mesh_y.name}: the estimated scale {found.scale:.3g} is uncertain, "
+                "because few points of the two shapes resemble each other. If the unit of length is known, "
+                "give the scale as a number.",
+                stacklevel=4,
+            )
+        return found.scale
+    check_number("scale", scale, positive=True)
+    return float(scale)
 
 
 def number_of_usable_vertices(mesh: Mesh) -> int:
@@ -144,11 +217,11 @@ def paired_spectra(
     eigenvalues of a mesh are zero. For a partial pair, `InputError` is also raised if the area of one mesh is
     less than a thousandth of the other area.
     """
-    areas = pair.mesh_x.area, pair.mesh_y.area
-    if pair.partial and min(areas) < _SMALLEST_PART * max(areas):
+    if min(pair.areas) < _SMALLEST_PART:
         raise InputError(
-            f"{pair.mesh_x.name} has area {areas[0]:.3g} and {pair.mesh_y.name} has area {areas[1]:.3g}, so "
-            "their units of length probably differ: scale one of the meshes."
+            f"{pair.mesh_x.name} has area {pair.mesh_x.area * pair.scale**2:.3g} and {pair.mesh_y.name} has "
+            f"area {pair.mesh_y.area:.3g}, so their units of length probably differ: scale one of the "
+            'meshes, or set scale="unknown" (--scale unknown).'
         )
     if eigensolver == "auto":  # both shapes need the same eigensolver, because the spectra are compared
         eigensolver = choose_eigensolver(*pair.meshes)
@@ -162,9 +235,8 @@ def paired_spectra(
         check_eigenvalues(mesh, spectrum)
     if not pair.partial:
         return spectrum_x, spectrum_y
-    scales = (area / max(areas) for area in areas)
     return common_range(
-        *(s.scale(factor) for s, factor in zip((spectrum_x, spectrum_y), scales, strict=True))
+        *(s.scale(area) for s, area in zip((spectrum_x, spectrum_y), pair.areas, strict=True))
     )
 
 

@@ -94,10 +94,6 @@ class PreparedPair:
         padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
         return jax.device_put(padded)
 
-    def unpadded_map(self, padded: Int[Array, " p"]) -> Int64[np.ndarray, " m"]:
-        """Return the map of X's vertices (m,) from a map (p,) that was padded."""
-        return np.asarray(padded)[: len(self.pair.mesh_x.vertices)].astype(np.int64)
-
     def view(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
         """Return the padded spectra with the eigenvectors and descriptors of a stage; see `Stage.view`."""
         return stage.view(*self.padded, partial=self.pair.partial)

@@ -243,7 +243,7 @@ def draw_another_kind() -> None:
         creature(kind, vertices=1500 + 30 * number, pose=pose, seed=seed)
         for number, (kind, pose, seed) in enumerate([*kinds, ("biped", "rest", 0)])
     ]
-    collection = jaxsmw.match_collection(meshes, mirror=False)
+    collection = jaxsmw.match_collection(meshes, mirror="no")
     print(*collection.sentences(), sep="\n")
     colors = position_colors(collection.meshes[collection.template])
     shown = [collection.template, *(n for n in (2, 3, 4) if n != collection.template)]
@@ -255,7 +255,7 @@ def draw_without_repair() -> None:
     """Draw two different quadrupeds of a collection that was matched twice, by `paper` and by `accurate`."""
     meshes = [creature("quadruped", vertices=800 + 20 * seed, seed=seed) for seed in range(5)]
     found = {
-        preset: jaxsmw.match_collection(meshes, preset=preset, template=0, mirror=False)
+        preset: jaxsmw.match_collection(meshes, preset=preset, template=0, mirror="no")
         for preset in ("paper", "accurate")
     }
     errors = np.zeros(len(meshes))

@@ -420,8 +420,17 @@ def test_single_landmarks_off_the_surface_cause_a_warning():
     positions = mesh.vertices[[0, 50, 100]] + [[0, 0, 0], [0, 0, 0], [0, 0, 9]]
     (warning,) = check_frame(Landmarks(("a", "b", "c"), positions), mesh)
     assert "'c' is " in warning and warning.endswith("% of the diagonal of the mesh.")
-    elsewhere = Landmarks(("a", "b"), np.full((2, 3), 100.0))
+    elsewhere = Landmarks(("a", "b"), (mesh.vertices + 0.5 * mesh.vertex_normals)[[0, 50]])
     assert len(check_frame(elsewhere, mesh)) == 2  # neither frame fits, so no change is suggested
+
+
+def test_landmarks_in_another_unit_are_refused():
+    mesh = shifted_sphere()
+    in_millimetres = Landmarks(("a", "b"), 1000 * mesh.vertices[[0, 50]], name="points.csv")
+    with pytest.raises(
+        InputError, match=r"points.csv: .* but its diagonal is 3.46: give landmarks of this mesh, in its unit"
+    ):
+        check_frame(in_millimetres, mesh)
 
 
 def test_a_real_skull(shared, tmp_path):

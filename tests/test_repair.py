@@ -156,6 +156,8 @@ def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
     assert found.suspicious and found.distortion > 1.3
     facts = summarize(found, {}, found.expected_error())
     assert f"{found.distortion:.2f}; above 1.12 limbs may be swapped" in facts.values()
+    trusted = replace(found, suspicious=False)  # the page does not contradict `match`
+    assert f"{found.distortion:.2f}" in summarize(trusted, {}, found.expected_error()).values()
     right = match(mesh, mesh, preset=preset, init=identity)
     assert right.distortion < 1.1 and not right.suspicious
 

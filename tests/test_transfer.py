@@ -127,8 +127,8 @@ class TestRegisteredMesh:
         points = nearest_surface_points(mesh_x.vertices, mesh_y)[0]
         used = mesh_x.referenced_vertices
         scales, offsets = [], []
-        for same_unit in (True, False):
-            registered = register_mesh(mesh_x, mesh_y, points, same_unit=same_unit)
+        for scale in (1.0, None):
+            registered = register_mesh(mesh_x, mesh_y, points, scale=scale)
             scales.append(np.abs(registered.similarities.scales[used] - 1).max())
             offsets.append(in_percent((registered.vertices - mesh_y.vertices)[used], mesh_y).max())
         assert scales[0] < 1e-4 and offsets[0] < 1e-3
@@ -410,7 +410,7 @@ class TestAttributes:
         kept = (mesh_y.vertices[mesh_y.faces, 0] < 0.3).all(axis=1)
         data = decorated(make_mesh(mesh_y.vertices, mesh_y.faces[kept]))
         points = nearest_surface_points(mesh_y.vertices, mesh_y)[0]
-        registered = register_mesh(data.mesh, mesh_y, points, same_unit=True)
+        registered = register_mesh(data.mesh, mesh_y, points, scale=1.0)
         out = transfer_attributes(data, registered)
         far = (registered.target_distances > 0.03 * np.sqrt(mesh_y.area)).sum()
         assert 500 < far < 1200

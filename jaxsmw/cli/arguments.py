@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from collections.abc import Callable
 from typing import get_args
 
-from jaxsmw.choices import APPROXIMATE_FROM, Axis, Eigensolver, IndexBase, Laplacian
+from jaxsmw.choices import APPROXIMATE_FROM, Axis, Eigensolver, IndexBase, Laplacian, Scale
 from jaxsmw.errors import InputError
 
 # Larger numbers are refused, because JAX uses 32-bit integers by default.
@@ -115,14 +116,45 @@ def add_index_base(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_partial(parser: argparse.ArgumentParser) -> None:
-    """Add `--partial`."""
+def add_partial(
+    parser: argparse.ArgumentParser, *, condition: str = "; both must have the same unit of length"
+) -> None:
+    """Add `--partial`. The help text ends with a condition on the two meshes."""
     parser.add_argument(
         "--partial",
         action="store_true",
-        help="declare that one mesh is a partial shape and the other mesh is the full shape; both must "
-        "have the same unit of length",
+        help=f"declare that one mesh is a partial shape and the other mesh is the full shape{condition}",
     )
+
+
+def add_partial_of_any_scale(parser: argparse.ArgumentParser) -> None:
+    """Add `--partial` and `--scale`."""
+    add_partial(parser, condition="")
+    parser.add_argument(
+        "--scale",
+        type=_scale,
+        help="with --partial: the number by which lengths on the source are multiplied to become lengths in "
+        "the target's unit, or unknown to estimate this number (default: 1, for the same unit of length)",
+    )
+
+
+def _scale(text: str) -> float | Scale:
+    """Return a scale as a number, or the name of an unknown scale.
+
+    **Raises:** `argparse.ArgumentTypeError` if the text is neither.
+    """
+    (unknown,) = get_args(Scale)
+    if text == unknown:
+        return unknown
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(
+            f"{shortened(text)!r} is no scale: give a positive number or {unknown}"
+        )
+    return number
 
 
 def add_up(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxsmw.cli.arguments import (
     add_index_base,
-    add_partial,
+    add_partial_of_any_scale,
     add_source_and_target,
     add_up,
     add_weld,
@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_ground_truth(
         parser, required=False, purpose="true map, for errors of the map before and after refinement"
     )
-    add_partial(parser)
+    add_partial_of_any_scale(parser)
     add_method(parser)
     add_weld(parser)
     add_index_base(parser)
@@ -106,7 +106,13 @@ def run(options: argparse.Namespace) -> None:
 
         check_one_to_one(int(mesh_x.referenced_vertices.sum()), int(mesh_y.referenced_vertices.sum()))
     correspondence = match_meshes(
-        options, mesh_x, mesh_y, stopwatch, partial=options.partial, index_base=options.index_base
+        options,
+        mesh_x,
+        mesh_y,
+        stopwatch,
+        partial=options.partial,
+        scale=options.scale,
+        index_base=options.index_base,
     )
     others = _write_files(options, correspondence, stopwatch)
     expected = None
@@ -131,6 +137,7 @@ def _check(options: argparse.Namespace) -> None:
     check_preset(options)
     check_initial_map(options.init)
     check_evaluation(options)
+    refuse_without(options, "--partial", options.partial, "scale")
     refuse_without(options, "--report", bool(options.report), "up")
     reads_indices = bool(options.ground_truth or init_files)
     refuse_without(options, "--ground-truth or a file of --init", reads_indices, "index_base")

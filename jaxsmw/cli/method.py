@@ -15,6 +15,7 @@ from jaxsmw.choices import (
     MatchInit,
     Mirror,
     PresetName,
+    Scale,
     Search,
 )
 from jaxsmw.cli.arguments import add_eigenproblem, whole_number
@@ -185,6 +186,7 @@ def match_meshes(
     stopwatch: Stopwatch,
     *,
     partial: bool = False,
+    scale: float | Scale | None = None,
     index_base: IndexBase | None = None,
 ) -> Correspondence:
     """Match two meshes with the options of `add_method`.
@@ -195,6 +197,7 @@ def match_meshes(
     - `mesh_x`, `mesh_y`: the source X and the target Y.
     - `stopwatch`: the stopwatch to which the times of the match are added.
     - `partial`: whether one mesh is a partial shape and the other mesh the full shape.
+    - `scale`: the scale of a partial pair; see `jaxsmw.match`. None means 1.
     - `index_base`: the index of the first vertex in a file of `--init`, 0 or 1; None for the default of the
       file's format.
 
@@ -219,9 +222,12 @@ def match_meshes(
             laplacian=options.laplacian,
             eigensolver=options.eigensolver,
             partial=partial,
+            scale=scale or 1.0,
             mirror=options.mirror,
         )
     stopwatch.add(correspondence.seconds)
+    if isinstance(scale, str):
+        show(f"scale:       {correspondence.pair.scale:.4g} (lengths on the target / lengths on the source)")
     if correspondence.mirrored or correspondence.mirror_evidence is not None:
         _say_hand(correspondence)
     return correspondence

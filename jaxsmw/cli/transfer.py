@@ -10,7 +10,7 @@ from jaxsmw.choices import CoordinateSystem
 from jaxsmw.cli.arguments import (
     MAP_FORMS,
     add_index_base,
-    add_partial,
+    add_partial_of_any_scale,
     add_source_and_target,
     add_up,
     add_weld,
@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write pictures, an interactive 3D page and a summary to this directory, like match --report",
     )
     add_up(parser)
-    add_partial(parser)
+    add_partial_of_any_scale(parser)
     add_method(parser)
     add_weld(parser)
     add_index_base(parser)
@@ -177,6 +177,7 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError(f"{given[0]} has no effect with --map: give one of the two.")
     if options.map and options.report:
         raise InputError("--report: describes a match, but --map gives a map: leave one of the two out.")
+    refuse_without(options, "--partial", options.partial, "scale")
     refuse_without(options, "--report", bool(options.report), "up")
     init_files = initial_map_files(options.init)
     check_preset(options)
@@ -231,13 +232,19 @@ def _register(
     options: argparse.Namespace, source: MeshData, target: MeshData, stopwatch: Stopwatch
 ) -> tuple[Correspondence | None, RegisteredMesh]:
     """Return the match and the registered mesh. If a map is given, the match is None."""
+    from jaxsmw.pair import Pair
     from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, points_of_map, register_mesh
 
     meshes, index_base = (source.mesh, target.mesh), options.index_base
     stiffness = options.stiffness or DEFAULT_STIFFNESS
     if not options.map:
         correspondence = match_meshes(
-            options, *meshes, stopwatch, partial=options.partial, index_base=index_base
+            options,
+            *meshes,
+            stopwatch,
+            partial=options.partial,
+            scale=options.scale,
+            index_base=index_base,
         )
         report_progress("registered mesh ...")
         with stopwatch.step("registered mesh"):
@@ -245,8 +252,10 @@ def _register(
     report_progress("registered mesh ...")
     with stopwatch.step("registered mesh"):
         (pointwise_map,) = read_maps([options.map], *meshes, index_base=index_base).values()
-        points = points_of_map(*meshes, pointwise_map, same_unit=options.partial)
-        return None, register_mesh(*meshes, points, stiffness=stiffness, same_unit=options.partial)
+        pair = Pair.make(*meshes, partial=options.partial, scale=options.scale or 1.0)
+        scale = pair.scale if pair.partial else None
+        points = points_of_map(*meshes, pointwise_map, scale=scale)
+        return None, register_mesh(*meshes, points, stiffness=stiffness, scale=scale)
 
 
 def _transfer_landmarks(

@@ -5,17 +5,20 @@ from .geodesics import SurfacePoints, geodesic_distances
 from .mesh import Mesh, diagnose, make_mesh
 from .point_cloud import triangulate_points
 from .sampling import farthest_point_samples
+from .scale import ScaleEstimate, estimate_scale
 from .shot import shot_descriptors
 from .surface_distance import distances_to_surface, nearest_surface_points
 
 __all__ = [
     "CreaturePair",
     "Mesh",
+    "ScaleEstimate",
     "SurfacePoints",
     "compute_spectrum",
     "creature_pair",
     "diagnose",
     "distances_to_surface",
+    "estimate_scale",
     "farthest_point_samples",
     "geodesic_distances",
     "make_mesh",

@@ -109,10 +109,12 @@ class Mesh:
         """
         return self._sum_at_vertices(self.face_areas / 3)
 
-    def average(self, values: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, " ..."] | np.floating:
+    def average(
+        self, values: Float[np.ndarray, "n ..."] | Bool[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " ..."] | np.floating:
         """Return the mean of values at the vertices (n, ...) over the surface, in the unit of the values.
 
-        Each vertex is weighted with its area.
+        Each vertex is weighted with its area. The mean of a mask is the share of the area that it selects.
         """
         return np.average(values, axis=0, weights=self.vertex_areas)
 

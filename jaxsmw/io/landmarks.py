@@ -17,8 +17,9 @@ from jaxsmw.geometry.surface_distance import bounding_box_diagonal, distances_to
 
 # Limits for the mean distance from landmarks to the surface, as fractions of the diagonal of the box around
 # the mesh. Landmarks whose mean distance is above `FAR` may be in the wrong coordinate system. The mean
-# distance of landmarks in the right coordinate system is below `NEAR` in all data sets.
-FAR, NEAR = 0.05, 0.02
+# distance of landmarks in the right coordinate system is below `NEAR` in all data sets. If the median
+# distance is above `ELSEWHERE`, the landmarks have another unit, or belong to another mesh.
+FAR, NEAR, ELSEWHERE = 0.05, 0.02, 0.25
 
 # Control characters, line separators, and characters that UTF-8 or XML cannot represent.
 _NOT_IN_NAMES = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\ufffe\uffff]")
@@ -245,7 +246,8 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
     the box around the mesh.
 
     **Raises:** `InputError` if the mean distance of the landmarks to the surface is above 5 % of the
-    diagonal, but would be below 2 % in the other coordinate system.
+    diagonal, but would be below 2 % in the other coordinate system. `InputError` is also raised if the median
+    distance is above 25 % of the diagonal.
     """
     diagonal = bounding_box_diagonal(mesh)
     distances = distances_to_surface(landmarks.positions, mesh)
@@ -254,6 +256,12 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
         flipped = find_frame(landmarks, mesh).flipped
         if flipped < NEAR * diagonal:
             raise InputError(_flip_message(landmarks, mesh, as_read, flipped))
+    if (usual := float(np.median(distances))) > ELSEWHERE * diagonal:
+        raise InputError(
+            f"{landmarks.name}: the median distance of the landmarks to the surface of {mesh.name} is "
+            f"{usual:.3g}, but its diagonal is {diagonal:.3g}: give landmarks of this mesh, in its unit and "
+            "coordinates."
+        )
     return tuple(
         f"{landmarks.name}: the landmark {landmarks.names[i]!a} is {distances[i]:.3g} from the surface of "
         f"{mesh.name}, which is {100 * distances[i] / diagonal:.3g} % of the diagonal of the mesh."

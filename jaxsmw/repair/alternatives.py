@@ -106,7 +106,7 @@ class Alternatives:
         score, margin = self.judge.score, self.settings.alternatives.margin
         close = [outcome for outcome in outcomes if score(outcome) <= score(outcomes[0]) + margin]
         for outcome in self._distinct(close):
-            yield self.prepared.unpadded_map(outcome.pointwise_map)
+            yield outcome.unpadded_map(self.pair)
 
     def _distinct(self, outcomes: Sequence[Outcome]) -> Iterator[Outcome]:
         """Yield outcomes that differ from each other, from outcomes that are sorted by their scores.
@@ -129,7 +129,7 @@ class Alternatives:
     def _without_faults(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Refine each outcome without each of its faults."""
         faulty = [(outcome, fault) for outcome in outcomes for fault in self.judge.faults(outcome)]
-        maps = [self._reduced(self.prepared.unpadded_map(one.pointwise_map)) for one, _ in faulty]
+        maps = [self._reduced(one.unpadded_map(self.pair)) for one, _ in faulty]
         return self._refined(maps, [fault[self.x.samples.vertices] for _, fault in faulty])
 
     def _initial_maps(self) -> Iterator[SampleMap]:

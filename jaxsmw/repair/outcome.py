@@ -52,6 +52,10 @@ class Outcome(NamedTuple):
         """The map of the last stage that has run (m,), or the initial map if no stage has run."""
         return self.refinements[-1].pointwise_map if self.refinements else self.initial_map
 
+    def unpadded_map(self, pair: Pair) -> Int64[np.ndarray, " m"]:
+        """Return the pointwise map (m,), with one entry for each vertex of the source mesh of the pair."""
+        return np.asarray(self.pointwise_map)[: len(pair.mesh_x.vertices)].astype(np.int64)
+
 
 def score(outcome: Outcome, settings: RepairSettings = RepairSettings()) -> float:  # noqa: B008 (immutable)
     """Return the score of an outcome, for comparison with other outcomes of the same pair; lower is better.
@@ -106,14 +110,13 @@ class Judge:
         """
         if not outcome.successful:
             return outcome._replace(distortion=np.inf, suspicious=True)
-        matches = self._matches(outcome)
+        matches = outcome.unpadded_map(self.pair)
         if self.measure_deformation is not None:
             outcome = outcome._replace(deformation=self.measure_deformation(matches))
         found = distortion(self.pair, matches, self.spectrum_x, self.settings.scores)
         outcome = outcome._replace(distortion=found, suspicious=not found < self.settings.suspicious)
-        areas = self.pair.mesh_x.vertex_areas / self.pair.mesh_x.area
         if not outcome.suspicious and self.settings.suspicious_area < 1:
-            largest = max((areas[fault].sum() for fault in self.faults(outcome)), default=0)
+            largest = max(map(self.pair.mesh_x.average, self.faults(outcome)), default=0)
             outcome = outcome._replace(suspicious=bool(largest >= self.settings.suspicious_area))
         return outcome
 
@@ -128,14 +131,13 @@ class Judge:
         parts. A fault is not returned if its share of X's area is at most `negligible_area` or at least
         `excessive_area` in the settings.
         """
-        mesh_x, found, scores = self.pair.mesh_x, self._matches(outcome), self.settings.scores
+        found, scores = outcome.unpadded_map(self.pair), self.settings.scores
         both = (
             orientation_reversal(self.pair, found, self.spectrum_x, scores),
             discontinuous_parts(self.pair, found, scores),
         )
-        areas = mesh_x.vertex_areas / mesh_x.area
         low, high = self.settings.negligible_area, self.settings.excessive_area
-        return [fault for fault in both if low < areas[fault].sum() < high]
+        return [fault for fault in both if low < self.pair.mesh_x.average(fault) < high]
 
     def looks_right(self, outcome: Outcome) -> bool:
         """Return whether the map of a judged outcome looks right.
@@ -155,12 +157,14 @@ class Judge:
         if self.pair.partial:
             return 0.0
         return area_shape_difference(
-            self.pair, self._matches(outcome), self.spectrum_x, self.spectrum_y, self.settings.scores
+            self.pair,
+            outcome.unpadded_map(self.pair),
+            self.spectrum_x,
+            self.spectrum_y,
+            self.settings.scores,
         )
 
     def difference(self, first: Outcome, second: Outcome) -> float:
         """Return the share of X's area on which the maps of two outcomes differ; see `map_difference`."""
-        return map_difference(self.pair, self._matches(first), self._matches(second), self.settings.scores)
-
-    def _matches(self, outcome: Outcome) -> Int64[np.ndarray, " m"]:
-        return np.asarray(outcome.pointwise_map)[: len(self.pair.mesh_x.vertices)].astype(np.int64)
+        maps = first.unpadded_map(self.pair), second.unpadded_map(self.pair)
+        return map_difference(self.pair, *maps, self.settings.scores)

@@ -82,15 +82,17 @@ def refine_in_stages(
     repairer = _Repairer(runner, judge, repair)
     if best.suspicious:
         logger.info(
-            "limbs may be swapped (distortion %.3f; correct maps have at most %.2f)",
+            "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
+            "%.0f %% of the area)",
             best.distortion,
             repair.suspicious,
+            100 * repair.suspicious_area,
         )
         if alternatives is None and isinstance(prepared.init, str) and prepared.init == "shot":
             proxies = Alternatives(prepared, repair)
             judge = replace(judge, measure_deformation=proxies.deformation)
             repairer = replace(repairer, judge=judge)
-            alternatives = proxies.best(prepared.unpadded_map(best.pointwise_map))
+            alternatives = proxies.best(best.unpadded_map(prepared.pair))
         best = repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives or ()))
     return repairer.refined_further(best)
 

@@ -85,9 +85,10 @@ def distortion(
     **Returns:** The distortion, without unit.
     """
     reversed_ = orientation_reversal(pair, pointwise_map, spectrum_x, settings)
-    share = float(pair.mesh_x.vertex_areas[reversed_].sum() / pair.mesh_x.area)
+    share = float(pair.mesh_x.average(reversed_))
     ratio = dirichlet_energy_ratio(pair, pointwise_map, spectrum_x, settings)
-    least = min(1.0, pair.mesh_y.area / pair.mesh_x.area) if pair.partial else 1.0
+    area_x, area_y = pair.areas
+    least = min(1.0, area_y / area_x) if pair.partial else 1.0
     ratio = max(ratio, least / max(ratio, 1e-6))
     return ratio * (1 + settings.orientation_weight * share)
 
@@ -210,7 +211,7 @@ def map_difference(
     _, unit_y = pair.units_of_length
     distances = np.linalg.norm(pair.mesh_y.vertices[first] - pair.mesh_y.vertices[second], axis=1)
     apart = distances > settings.different_distance * unit_y
-    return float(pair.mesh_x.vertex_areas[apart].sum() / pair.mesh_x.area)
+    return float(pair.mesh_x.average(apart))
 
 
 def edge_lengths(

@@ -178,7 +178,7 @@ def register_mesh(
     points: SurfacePoints,
     *,
     stiffness: float = DEFAULT_STIFFNESS,
-    same_unit: bool = False,
+    scale: float | None = None,
 ) -> RegisteredMesh:
     """Deform X onto Y, so that its vertices follow a map and its triangles keep their shapes.
 
@@ -195,8 +195,8 @@ def register_mesh(
     - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map is smoothed if
       its wavelength is shorter than the stiffness. The default is 0.003. A stiffness of 0.03 makes the
       registered mesh of a noisy map smooth, but moves it farther away from the target.
-    - `same_unit`: whether X and Y have the same unit of length, as partial shapes do. If False (the
-      default), X is first scaled to the area of Y.
+    - `scale`: the factor by which X is first scaled. With None (the default), X is scaled to the area of Y.
+      Give 1 for a partial shape and a full shape in the same unit of length.
 
     **Returns:** A `RegisteredMesh` with positions `vertices` (m, 3) in the unit of Y.
 
@@ -217,7 +217,7 @@ def register_mesh(
     # Positions are relative to the middle of Y, because large coordinates would lose digits.
     middle = mesh_y.vertices[mesh_y.referenced_vertices].mean(axis=0)
     targets = points.positions(mesh_y) - middle
-    around = Neighborhoods(mesh_x, 1.0 if same_unit else root / np.sqrt(mesh_x.area))
+    around = Neighborhoods(mesh_x, root / np.sqrt(mesh_x.area) if scale is None else scale)
     areas = around.size**2 * mesh_x.vertex_areas
     # A vertex of no or little area still follows the map.
     areas = np.maximum(areas, 0.1 * np.median(areas[areas > 0]))
@@ -262,7 +262,7 @@ def _with_unreferenced(
 
 
 def points_of_map(
-    mesh_x: Mesh, mesh_y: Mesh, pointwise_map: ArrayLike, *, same_unit: bool = False
+    mesh_x: Mesh, mesh_y: Mesh, pointwise_map: ArrayLike, *, scale: float | None = None
 ) -> SurfacePoints:
     """Convert a map to vertices into a map to points between the vertices.
 
@@ -273,7 +273,7 @@ def points_of_map(
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), as 0-based vertices of Y.
-    - `same_unit`: whether X and Y have the same unit of length.
+    - `scale`: see `register_mesh`.
 
     **Returns:** `SurfacePoints` on Y with m entries, for `register_mesh`.
 
@@ -282,7 +282,7 @@ def points_of_map(
     vertices = check_indices(pointwise_map, len(mesh_y.vertices), f"map to {mesh_y.name}: vertex")
     # An unreferenced vertex of Y has no face, so its nearest point represents it.
     points, _ = nearest_surface_points(mesh_y.vertices[vertices], mesh_y)
-    smooth = register_mesh(mesh_x, mesh_y, points, stiffness=_STIFFNESS_OF_MAPS, same_unit=same_unit)
+    smooth = register_mesh(mesh_x, mesh_y, points, stiffness=_STIFFNESS_OF_MAPS, scale=scale)
     return smooth.surface_points
 
 

@@ -1,0 +1,201 @@
+"""An estimate of the relative scale of a partial shape and a full shape in different units of length."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.sampling import poisson_disk_samples
+from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
+from jaxsmw.runtime.threads import one_blas_thread, side_by_side
+
+
+@dataclass(frozen=True)
+class ScaleSettings:
+    """The settings of `estimate_scale`. Lengths are in units of the square root of the full shape's area.
+
+    Table R33 is in `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `shares`: the tested shares of the full shape's area that the partial shape covers.
+    - `samples` (Table R33): the approximate number of samples of the full shape.
+    - `radii` (Table R33): the radii of SHOT, in units of 0.06.
+    - `distances` (Table R33): the least and the largest distance of the pairs of samples that are compared.
+      Farther samples move against each other between poses.
+    - `angle_tolerance` (Table R33): a pair of samples is compared with the pair of their matches only if the
+      cosines of three angles differ by less than this number. The angles are those between the two normals,
+      and between each normal and the line through both samples.
+    - `tolerance`: two ratios agree if their logarithms differ by less than this number.
+    - `uncertain_below` (Table R33): an estimate with a smaller support is uncertain.
+    """
+
+    shares: tuple[float, ...] = (0.08, 0.11, 0.15, 0.2, 0.27, 0.36, 0.49, 0.66, 0.9)
+    samples: int = 3000
+    radii: tuple[float, ...] = (1.0, 2.0)
+    distances: tuple[float, float] = (0.05, 0.4)
+    angle_tolerance: float = 0.15
+    tolerance: float = 0.05
+    uncertain_below: float = 1.5
+
+
+class ScaleEstimate(NamedTuple):
+    """The estimated relative scale of two meshes.
+
+    **Attributes:**
+
+    - `scale`: a length on X, multiplied by `scale`, is the corresponding length on Y.
+    - `support`: the mean number of other matches with which a match agrees on the scale.
+    - `uncertain`: whether the support is so small that the scale can be wrong.
+    """
+
+    scale: float
+    support: float
+    uncertain: bool
+
+
+def estimate_scale(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    settings: ScaleSettings = ScaleSettings(),
+) -> ScaleEstimate:
+    """Estimate the relative scale of a partial shape and a full shape.
+
+    The shape with the longer boundary, relative to the square root of its area, is taken as the partial
+    shape. Several shares of the full shape's area are tested. For each share, SHOT is computed with the same
+    radius relative to the full shape, and samples with mutually nearest descriptors are matched. The distance
+    between two nearby samples, compared with the distance between their matches, gives a ratio. The ratios of
+    correct matches agree, and the ratios of wrong matches are scattered. The function therefore returns the
+    most frequent ratio of the share with the largest support. Pairs of samples are compared only if their
+    normals agree (point pair features; Drost, Ulrich, Navab, Ilic, "Model globally, match locally", 2010).
+
+    **Arguments:**
+
+    - `mesh_x`, `mesh_y`: a partial shape and a full shape, in either order and in any units of length.
+    - `settings`: the settings of the search.
+
+    **Returns:** A `ScaleEstimate`.
+
+    **Raises:** `InputError` if neither mesh has a boundary, or if the meshes are too coarse.
+    """
+    boundary_x, boundary_y = (relative_boundary(mesh) for mesh in (mesh_x, mesh_y))
+    names = f"{mesh_x.name} and {mesh_y.name}"
+    if boundary_x == boundary_y == 0:
+        raise InputError(
+            f"{names}: both meshes are closed, so neither seems to be a partial shape: give the scale as a "
+            "number, or match the meshes as full shapes."
+        )
+    x_is_part = boundary_x >= boundary_y
+    part, full = (mesh_x, mesh_y) if x_is_part else (mesh_y, mesh_x)
+    described = _describe(full, 1.0, settings)
+
+    def vote(share: float) -> _Vote:
+        try:
+            return _vote(_describe(part, share, settings), described, share, settings)
+        except InputError:  # the samples are too sparse for SHOT
+            return _Vote(share, 0.0)
+
+    with one_blas_thread():
+        best = max(map(vote, settings.shares), key=lambda found: found.support)
+        # At the estimated share, the radii of both shapes agree, and so do more descriptors.
+        best = max(best, vote(best.share), key=lambda found: found.support)
+    if best.support == 0:
+        raise InputError(
+            f"{names}: no scale can be estimated, because the meshes have too few similar points: give the "
+            "scale as a number, or finer meshes."
+        )
+    from_part = float(np.sqrt(best.share * full.area / part.area))
+    return ScaleEstimate(
+        from_part if x_is_part else 1 / from_part, best.support, best.support < settings.uncertain_below
+    )
+
+
+class _Described(NamedTuple):
+    """The samples of a shape: positions in the unit of the full shape, normals and descriptors."""
+
+    positions: Float[np.ndarray, "s 3"]
+    normals: Float[np.ndarray, "s 3"]
+    descriptors: Float[np.ndarray, "s d"]
+
+
+class _Vote(NamedTuple):
+    """A share of the full shape's area, and the mean number of matches that agree with each match."""
+
+    share: float
+    support: float
+
+
+def relative_boundary(mesh: Mesh) -> float:
+    """Return the length of the boundary, divided by the square root of the area; 0 for a closed surface."""
+    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.boundary_edges], axis=1)[:, 0], axis=1)
+    return float(lengths.sum() / mesh.area**0.5)
+
+
+def _describe(mesh: Mesh, share: float, settings: ScaleSettings) -> _Described:
+    """Describe a shape that covers the given share of the full shape's area."""
+    unit = (mesh.area / share) ** 0.5
+    samples = poisson_disk_samples(mesh, max(1, round(settings.samples * share)))
+    with warnings.catch_warnings():
+        # SHOT warns if samples are sparse, but sparse samples only lower the support.
+        warnings.simplefilter("ignore")
+        shot = side_by_side(
+            lambda radius: shot_descriptors(mesh, radius=radius * SHOT_RADIUS / share**0.5, samples=samples),
+            *settings.radii,
+        )
+    vertices = samples.vertices
+    return _Described(mesh.vertices[vertices] / unit, mesh.vertex_normals[vertices], np.hstack(shot))
+
+
+def _vote(part: _Described, full: _Described, share: float, settings: ScaleSettings) -> _Vote:
+    """Return the share with which most pairs of matches agree, near a tested share."""
+    rows, matches = _mutually_nearest(part.descriptors, full.descriptors)
+    before, angles_before = _pair_features(part, rows)
+    after, angles_after = _pair_features(full, matches)
+    least, most = settings.distances
+    compared = (least < before) & (before < most) & (after > 0)
+    compared &= np.all(np.abs(angles_before - angles_after) < settings.angle_tolerance, axis=1)
+    ratios = np.sort(np.log(after[compared] / before[compared]))
+    if len(ratios) < _FEWEST:
+        return _Vote(share, 0.0)
+    # The most frequent ratio has the most ratios within the tolerance. Other shares give ratios far from 1.
+    tolerance = settings.tolerance
+    counts = np.searchsorted(ratios, ratios + tolerance) - np.searchsorted(ratios, ratios - tolerance)
+    counts = np.where(np.abs(ratios) < _FARTHEST, counts, 0)
+    near = ratios[np.abs(ratios - ratios[np.argmax(counts)]) < tolerance]
+    return _Vote(share * float(np.exp(2 * np.mean(near))), 2 * float(counts.max()) / len(rows))
+
+
+def _pair_features(
+    shape: _Described, rows: Int64[np.ndarray, " p"]
+) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "q 3"]]:
+    """Return the distances of all pairs of samples, and the cosines of the three angles of their normals."""
+    first, second = np.triu_indices(len(rows), 1)
+    positions, normals = shape.positions[rows], shape.normals[rows]
+    lines = positions[second] - positions[first]
+    distances = np.linalg.norm(lines, axis=1)
+    lines /= np.maximum(distances, np.finfo(float).tiny)[:, None]
+    pairs = ((normals[first], normals[second]), (normals[first], lines), (normals[second], lines))
+    return distances, np.stack([np.sum(a * b, axis=1) for a, b in pairs], axis=1)
+
+
+def _mutually_nearest(
+    x: Float[np.ndarray, "s d"], y: Float[np.ndarray, "t d"]
+) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, " p"]]:
+    """Return the rows of both arrays that are the nearest rows of each other."""
+    # Descriptors of one radius have the same length, so the nearest descriptor has the largest inner product.
+    products = x @ y.T
+    forward, backward = products.argmax(axis=1), products.argmax(axis=0)
+    rows = np.flatnonzero(backward[forward] == np.arange(len(x)))
+    return rows, forward[rows]
+
+
+# The largest logarithm of a ratio of lengths for which the descriptors of both shapes are still comparable.
+_FARTHEST = 0.3
+# Fewer compared pairs can agree by chance.
+_FEWEST = 30
