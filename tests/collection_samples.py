@@ -12,6 +12,7 @@ from jaxsmw.report.collection_page import PageEdge
 
 HOSTILE = '</script></title><img src=x onerror="window.hacked=1"><b>\'&{{script}}'
 _POSES = ("rest", "stand", "walk", "sit")
+NAMES = [*_POSES, "blend"]
 
 
 @cache
@@ -30,7 +31,7 @@ def collection() -> dict[str, Any]:
     moved = [Rotation.random(rng=generator).apply(shape) + generator.normal(size=3) for shape in shapes]
     registered = [shapes[0], *moved[1:]]
     return {
-        "names": [*_POSES, "blend"],
+        "names": list(NAMES),
         "faces": meshes[0].faces,
         "registered": registered,
         "template": 0,

@@ -217,17 +217,18 @@ def test_positions_are_rounded_to_16_bits() -> None:
         ({"faces": np.array([[0, 1, 9999]])}, "the faces do not fit the 600 vertices"),
         ({"faces": np.zeros((0, 3), dtype=int)}, "the faces do not fit"),
         ({"edges": [PageEdge(0, 5, 1.0, False, "")]}, "an edge joins the shapes 0 and 5"),
-        ({"model": shape_model(collection()["registered"][:3])}, "the model has 3 shapes with 600 vertices"),
-        (
-            {"registered": [*collection()["registered"][:4], np.eye(3)]},
-            "blend: there are 3 positions, but the template has 600",
-        ),
-        (
-            {"registered": [*collection()["registered"][:4], np.full((600, 3), np.nan)]},
-            "blend: some coordinates are not finite",
-        ),
+        ({"model": slice(3)}, "the model has 3 shapes with 600 vertices"),
+        ({"registered": np.eye(3)}, "blend: there are 3 positions, but the template has 600"),
+        ({"registered": np.full((600, 3), np.nan)}, "blend: some coordinates are not finite"),
     ],
 )
 def test_invalid_collections_are_refused(changes: dict[str, Any], message: str) -> None:
+    """An array stands for the positions of the last shape, and a slice for the shapes of the model."""
+    arguments = collection()
+    registered = arguments["registered"]
+    for name, value in changes.items():
+        if isinstance(value, np.ndarray) and name == "registered":
+            value = [*registered[:-1], value]
+        arguments[name] = shape_model(registered[value]) if isinstance(value, slice) else value
     with pytest.raises(InputError, match=re.escape(message)):
-        write_collection_page(os.devnull, **collection() | changes)
+        write_collection_page(os.devnull, **arguments)

@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from browser_pages import OpenPage, differ
-from collection_samples import HOSTILE, collection
+from collection_samples import HOSTILE, NAMES, collection
 from report_helpers import embedded
 
 from jaxsmw.collection.shape_models import shape_model
 from jaxsmw.report.collection_page import PageEdge, write_collection_page
 
 pytestmark = pytest.mark.browser
-
-NAMES = collection()["names"]
 
 
 class CollectionPage(OpenPage):
