@@ -25,7 +25,7 @@ from jaxsmw.pair import Pair
 from jaxsmw.preparation import program_size
 from jaxsmw.presets import Preset
 from jaxsmw.repair.expected_error import expected_error
-from jaxsmw.repair.settings import WITHOUT_REPAIR
+from jaxsmw.repair.settings import WITHOUT_REPAIR, ExpectedErrorSettings
 from jaxsmw.repair.wrong_probability import wrong_probability
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
@@ -305,13 +305,18 @@ class Correspondence:
 
     @functools.cached_property
     def _expected_error(self) -> Float[np.ndarray, " m"]:
+        return self.estimate_error(ExpectedErrorSettings())
+
+    def estimate_error(self, settings: ExpectedErrorSettings) -> Float[np.ndarray, " m"]:
+        """Return the `expected_error` with other settings (m,), divided by the square root of Y's area."""
         expected = expected_error(
             self.pair.mirrored() if self.mirrored else self.pair,
             self.pointwise_map,
             self.reverse_map(),
             self.spectrum_x,
             self.spectrum_y,
-            scores=(self.preset.repair or WITHOUT_REPAIR).scores,
+            settings,
+            (self.preset.repair or WITHOUT_REPAIR).scores,
         )
         return extend_to_unreferenced(self.mesh_x, expected)
 

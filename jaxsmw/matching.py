@@ -35,9 +35,9 @@ from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision, Hands
 from jaxsmw.repair.outcome import Outcome
-from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.repair.rounds import refine_further, refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
-from jaxsmw.repair.settings import WITHOUT_REPAIR, RepairSettings
+from jaxsmw.repair.settings import WITHOUT_REPAIR, ExpectedErrorSettings, RepairSettings
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.stage import Stage
@@ -85,8 +85,9 @@ def match(
 
         - `"auto"` (the default): `"shot"`. The initial map `"aligned"` is refined as well if `partial` is
           False, the preset has repair, and both shapes differ from their own mirror images, as teeth do. The
-          map from `"aligned"` is then returned unless the mean expected error of the map from `"shot"` is at
-          least 2 % smaller.
+          map from `"aligned"` is then chosen unless the mean expected error of the map from `"shot"` is at
+          least 2 % smaller. Both expected errors are computed without the factor for the difference of the
+          shapes.
         - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
           with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, repair also tries alternative maps.
@@ -225,9 +226,9 @@ def match_prepared(
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `starts`: the prepared pair, once for each initial map. The sequence contains one initial map, or
-      `"shot"` and `"aligned"` in this order. If `decision.mirrored` is True, the prepared pair contains the
-      mirror image of X instead of X.
+    - `starts`: one prepared pair for each initial map: a single one, or one with `"shot"` and one with
+      `"aligned"`, in this order. If `decision.mirrored` is True, the prepared pairs contain the mirror image
+      of X instead of X.
     - `preset`: the stages and the repair.
     - `decision`: the decision between X and its mirror image.
     - `history`: whether to record a `History` of the last stage.
@@ -258,22 +259,31 @@ def match_prepared(
             for start, known in zip(starts, refined or [None] * len(starts), strict=True)
         ]
         jax.block_until_ready([outcome.refinements[-1] for outcome in outcomes])
-    candidates = [
-        (start, outcome) for start, outcome in zip(starts, outcomes, strict=True) if outcome.successful
-    ] or [(starts[0], outcomes[0])]
     times = {} if seconds is None else seconds
-    found = [
-        Match(_correspondence(pair, start, preset, outcome, times, decision), start, outcome, decision)
-        for start, outcome in candidates
-    ]
-    if len(found) == 1:
-        return found[0]
-    assert preset.repair is not None
-    with _step("expected error", seconds):
-        from_shot, from_aligned = (
-            float(pair.mesh_x.average(one.correspondence.expected_error())) for one in found
-        )
-    return found[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
+
+    def found(start: PreparedPair, outcome: Outcome) -> Match:
+        return Match(_correspondence(pair, start, preset, outcome, times, decision), start, outcome, decision)
+
+    candidates = [one for one in zip(starts, outcomes, strict=True) if one[1].successful]
+    start, outcome = candidates[0] if candidates else (starts[0], outcomes[0])
+    if len(candidates) > 1:
+        assert preset.repair is not None
+        with _step("choice of the initial map", seconds):
+            from_shot, from_aligned = (_inconsistency(found(*one)) for one in candidates)
+        start, outcome = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
+    with _step("further passes", seconds), one_blas_thread():
+        outcome = refine_further(start, preset.stages, preset.repair, outcome, history=history)
+        jax.block_until_ready(outcome.refinements[-1])
+    return found(start, outcome)
+
+
+def _inconsistency(found: Match) -> float:
+    """Return the mean expected error of a map, without the factor for the difference of the shapes.
+
+    The factor depends on the shapes, not on the quality of the map. (Entry R24 of docs/research_log.md)
+    """
+    settings = ExpectedErrorSettings(area_weight=0.0)
+    return float(found.correspondence.mesh_x.average(found.correspondence.estimate_error(settings)))
 
 
 def _step(name: str, seconds: dict[str, float] | None) -> AbstractContextManager[None]:

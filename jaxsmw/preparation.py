@@ -123,8 +123,8 @@ def prepare(
       are computed.
     - `init`: the initial map; see `match`. The argument is `"shot"`, `"wks"`, `"hks"`, `"wavelet"`,
       `"functional"`, `"aligned"`, a pointwise map (m,) of 0-based vertices of Y, a `SurfacePoints` with m
-      points on Y, or an array (l, 2) of landmarks. Each row of landmarks contains a vertex of X and its
-      match on Y.
+      points on Y, or an array (l, 2) of landmarks. Each row of landmarks contains a vertex of X and the
+      matching vertex of Y, both 0-based.
     - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. If False, the
@@ -132,8 +132,8 @@ def prepare(
     - `spectra`: the result of `jaxsmw.pair.paired_spectra` for this pair, if it was already computed.
 
     **Returns:** A `PreparedPair` with the attributes `spectrum_x`, `spectrum_y`, `initial_map` (m,) and
-    `samples`. The initial map contains 0-based vertices of Y. The samples are a pair of arrays of vertices of
-    X and of Y; None if no samples were requested.
+    `samples`. The initial map contains 0-based vertices of Y. The samples are a pair of arrays of 0-based
+    vertices, those of X and those of Y; None if no samples were requested.
 
     **Raises:** `InputError` if a spectrum cannot be computed, if all requested eigenvalues of a mesh are
     zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required

@@ -162,9 +162,9 @@ class Stage:
     ) -> tuple[Spectrum, Spectrum]:
         """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
 
-        If the stage uses fewer eigenvectors than a partial pair has, the spectra are then cut at a common
-        limit, the smaller of the two spectra's largest eigenvalues: eigenpairs with eigenvalues above this
-        limit are removed (`jaxsmw.pair.common_range`).
+        The two spectra of a partial pair end at a common limit. If the stage leaves out eigenvectors of a
+        partial pair, the limit is chosen again. The new limit is the smaller of the two largest eigenvalues
+        that remain. Eigenpairs with eigenvalues above this limit are removed (`jaxsmw.pair.common_range`).
 
         **Arguments:**
 

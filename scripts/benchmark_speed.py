@@ -139,8 +139,9 @@ def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
 def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
     """Return a dictionary from names to functions that multiply the eigenvector matrices of X and Y.
 
-    The functions are different implementations. Each function computes the product `ITERATIONS` times. The
-    time of the fastest function is a lower bound for the time of an exhaustive search.
+    All functions compute the same product, but in different ways: by JAX or NumPy, in blocks or as a whole.
+    Each function computes the product `ITERATIONS` times. The time of the fastest function is a lower bound
+    for the time of an exhaustive search.
     """
     # Each block of products fits into the processor's cache. Only the maximum of each row is kept.
     rows = x.eigenvectors

@@ -253,10 +253,10 @@ def _evaluate(
 
 @contextmanager
 def reading(path: Path) -> Iterator[BinaryIO]:
-    """Open a file of arrays that equinox wrote. The body of a `with` statement must read the whole file.
+    """Open a file of arrays that equinox wrote, for a `with` statement whose block reads the whole file.
 
-    **Raises:** `InputError` if the file cannot be opened, if the body raises an error, or if the body leaves
-    data unread.
+    **Raises:** `InputError` if the file cannot be opened, if the block raises an error, or if the block ends
+    before the end of the file is reached.
     """
     try:
         with open(path, "rb") as stream:

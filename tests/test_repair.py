@@ -16,7 +16,7 @@ from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import PRESETS, Preset
 from jaxsmw.repair.outcome import Judge
-from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.repair.rounds import refine_further, refine_in_stages
 from jaxsmw.repair.scores import distortion
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.report.summary import summarize
@@ -59,6 +59,7 @@ def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), **options):
     mesh, spectrum = body
     prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, initial_map, initial_map)
     found = refine_in_stages(prepared, stages, repair, **options)
+    found = refine_further(prepared, stages, repair, found)
     assert found.successful
     n = len(mesh.vertices)
     wrong = np.asarray(found.pointwise_map)[:n] != np.arange(n)

@@ -34,11 +34,12 @@ def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.nda
 
     **Arguments:**
 
-    - `number`: the number N of shapes.
-    - `decisions`: for each compared edge (i, j), the `Decision`. Decisions without
+    - `number`: the number N of shapes. The shapes are numbered from 0 to N - 1, in any fixed order.
+    - `decisions`: for each compared edge (i, j), a pair of shape numbers, the `Decision`. Decisions without
       evidence, and decisions on symmetric shapes, are ignored.
 
-    **Returns:** An array (N,), True for shapes whose mirror image is matched. At most half are True.
+    **Returns:** An array (N,), whose entry i is True if the mirror image of shape i is matched. At most half
+    of the entries are True.
     """
     agreement = np.zeros((number, number))
     for (i, j), decision in decisions.items():

@@ -58,11 +58,12 @@ def match_collection(
     - `names`: the new names of the meshes. By default, the meshes keep their names. If two of these names are
       equal, all names are numbered.
     - `preset`: see `match`.
-    - `template`: the number of the template. The default is the shape with the smallest sum of errors along
-      the best paths to all other shapes (the medoid).
+    - `template`: the 0-based position of the template in the argument `meshes`. The default is the shape with
+      the smallest sum of errors along the best paths to all other shapes (the medoid).
     - `mirror`: `"auto"` (the default) to recognise shapes of opposite hands, such as left and right teeth,
       and to match their mirror images. `"no"` to match all meshes as they are.
-    - `stiffness`: see `register_mesh`.
+    - `stiffness`: the stiffness of the registered meshes, a positive length in units of the square root of
+      each shape's area; see `register_mesh`.
     - `settings`: the `CollectionSettings`.
     - `seed`: the seed of the random edges of the graph.
     - `directory`: an existing directory in which finished steps are kept. A second call with the same
@@ -73,7 +74,8 @@ def match_collection(
     - `progress`: a function that is called after each part of a step with the name of the step, the number of
       finished parts, and the number of parts.
 
-    **Returns:** A `Collection`. Meshes that cannot be matched are left out and named in `left_out`.
+    **Returns:** A `Collection`. Meshes that cannot be matched are left out and named in `left_out`. The
+    numbers of shapes in the result are 0-based positions in `Collection.meshes`, the list of the kept meshes.
 
     **Raises:** `InputError` if an argument is not valid, if fewer than two meshes can be matched, or if the
     template is left out.

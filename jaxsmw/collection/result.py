@@ -26,18 +26,20 @@ _MANY_OUTLIERS = 1 / 3
 class MatchedEdge:
     """An edge of the graph of a collection: two matched shapes, and what became of their map.
 
-    Errors are in units of the square root of the area.
+    Errors are distances on a shape, in units of the square root of this shape's area.
 
     **Attributes:**
 
-    - `source`, `target`: the numbers of the two shapes.
+    - `source`, `target`: the 0-based numbers of the two shapes in `Collection.meshes`.
     - `expected_error`: the mean expected error of the map by itself; infinite if the match failed.
     - `distortion`: the distortion of the map; infinite if the match failed.
     - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The
       estimate is the error that the cycles of the graph show (`edge_errors`), but at least half of the
       prior. The prior is the expected error plus a term that grows with the distortion
-      (`CollectionSettings.distortion_weight`). The same term is then added to the estimate.
-    - `residual`: the mean distance between the map and the map through the template.
+      (`CollectionSettings.distortion_weight`). The same term is then added to the estimate. The estimate is
+      infinite if the match failed.
+    - `residual`: the mean distance between the map and the map through the template, in the direction in
+      which this distance is larger; infinite if the match failed.
     - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. A replaced map was matched again from the
       consistent map, because the first map contradicted the other maps. A contradicted map still contradicts
       the other maps, and hardly counts.
@@ -68,7 +70,8 @@ class MatchedEdge:
 class Collection:
     """The result of `match_collection`: consistent maps between all shapes of a collection.
 
-    Vertex v of the template corresponds to the same point of the body on every shape.
+    Vertex v of the template corresponds to the same point of the body on every shape. The number of a shape
+    is its 0-based position in `meshes`, which contains only the meshes that were matched.
 
     **Attributes:**
 
@@ -79,9 +82,11 @@ class Collection:
       mirror images were matched. All points and positions refer to the meshes, not to the mirror images.
     - `registered`: for each shape, the `RegisteredMesh` of the template on the shape.
     - `edges`: the matched pairs, each a `MatchedEdge`.
-    - `axes`: the axes of the descriptors, or None.
-    - `cycle_errors`: two arrays with the errors of all triangles of the graph, in units of the square root of
-      the area. The first array was computed from the first maps of the edges, the second from the final maps.
+    - `axes`: the axes of the descriptors; None if the preset uses no descriptors.
+    - `cycle_errors`: two arrays with the errors of all triangles of the graph. The first array was computed
+      from the first maps of the edges, the second from the final maps. An error is a mean over the three
+      shapes of the triangle, on each shape in units of the square root of its area. `match_collection` always
+      computes `cycle_errors`; None if a `Collection` was made without them.
     - `outliers`: the numbers of shapes that differ much from all other shapes: all their maps have large
       errors or distortions. Such a shape may be another kind of body.
     - `left_out`: a dictionary from the name of each mesh that could not be matched to the reason.

@@ -257,7 +257,8 @@ class ShapeModel:
 
         **Returns:** The mean error of the N shapes for each number, and its standard error.
 
-        **Raises:** `InputError` if there are fewer than two shapes, or a number is not between 0 and N - 2.
+        **Raises:** `InputError` if there are fewer than two shapes, or if an entry of `numbers_of_modes` is
+        not a whole number from 0 to N - 2.
         """
         count = len(self.scores)
         if count < 2:
@@ -293,8 +294,8 @@ class ShapeModel:
 
         **Returns:** The mean distance for each number, and its standard error.
 
-        **Raises:** `InputError` if there are fewer than two samples, the seed is negative, or a number is not
-        between 0 and k.
+        **Raises:** `InputError` if `samples` is below 2, if `seed` is negative, or if an entry of
+        `numbers_of_modes` is not a whole number from 0 to k.
         """
         samples = check_whole_number("samples", samples, 2)
         seed = check_whole_number("seed", seed, 0)

@@ -108,14 +108,22 @@ def robust_mean(
 class Network:
     """The shapes of a collection and the maps along the edges of its graph.
 
+    The constructor only stores the data. The function `synchronize` computes consistent maps from a network.
+    The number of a shape is its 0-based position in `meshes`.
+
     **Arguments:**
 
     - `meshes`: the meshes of the N shapes.
     - `maps`: for each edge, the maps in both directions. The value of the key (i, j) is one `SurfacePoints`
       on mesh j, with one entry for every vertex of mesh i.
-    - `errors`: the estimated error of each edge, with the key (i, j) for i < j, in units of the square root
-      of the area.
+    - `errors`: the estimated error of each edge, with the key (i, j) for i < j. An error is a distance on a
+      shape, in units of the square root of this shape's area.
     - `settings`: the settings of the synchronisation.
+
+    **Attributes:**
+
+    - `meshes`, `errors`, `settings`: the arguments.
+    - `units`: a list with the square root of the area of each mesh.
     """
 
     def __init__(
@@ -143,7 +151,7 @@ class Network:
         return csr_array((values, (rows, columns)), shape=(len(self.meshes),) * 2)
 
     def medoid(self) -> int:
-        """Return the shape with the smallest sum of errors along the best paths to all shapes."""
+        """Return the number of the shape with the smallest sum of errors along the best paths."""
         return int(np.argmin(dijkstra(self.lengths(), directed=False).sum(axis=1)))
 
     def along_best_paths(self, template: int) -> list[SurfacePoints]:
@@ -223,7 +231,7 @@ def synchronize(network: Network, template: int) -> list[SurfacePoints]:
     **Arguments:**
 
     - `network`: the `Network` of shapes and maps.
-    - `template`: the number of the template.
+    - `template`: the 0-based number of the template in `network.meshes`.
 
     **Returns:** For each shape, one `SurfacePoints` with n entries, one for each vertex of the template.
 

@@ -114,9 +114,9 @@ def decode_to_triangles(
       X. With `"pushforward"`, C maps functions on X to functions on Y.
     - `faces_y`: (f, 3), the triangles of Y, as vertex indices from 0 to n - 1.
 
-    **Returns:** Two arrays with one row per vertex of X. The first array (m,), int32, contains the index of a
-    triangle of Y. The second array (m, 3) contains the barycentric weights of the triangle's corners, which
-    are not negative and sum to 1.
+    **Returns:** Two arrays with one row per vertex of X. The first array (m,), int32, contains the 0-based
+    index of a triangle of Y, a row of `faces_y`. The second array (m, 3) contains the barycentric weights of
+    the triangle's corners, which are not negative and sum to 1.
 
     **Raises:** `ValueError` for an unknown convention.
     """

@@ -38,10 +38,10 @@ class History(eqx.Module):
     - `objective`: (iterations,), the result of `Refiner.objective` in each iteration, computed from the state
       and from the pointwise map that was recovered from this state. The objective is the mean squared
       distance between matched points of the embeddings; lower is better.
-    - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. The entries of
-      skipped iterations repeat the final map. After a failure, all entries of `pointwise_maps` are -1.
-      `pointwise_maps` is None if the refinement uses samples, because the iterations then map only the
-      samples.
+    - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. Each row
+      contains a 0-based vertex of Y for each of the m vertices of X. The rows of skipped iterations repeat
+      the final map. After a failure, all entries of `pointwise_maps` are -1. `pointwise_maps` is None if the
+      refinement uses samples, because the iterations then map only the samples.
     """
 
     changed: Float[Array, " iterations"]
@@ -55,8 +55,8 @@ class Refinement(eqx.Module):
 
     **Attributes:**
 
-    - `pointwise_map`: the refined map T: X -> Y (m,), one vertex of Y per vertex of X; all entries are -1
-      after a failure.
+    - `pointwise_map`: the refined map T: X -> Y (m,), one 0-based vertex of Y per vertex of X; all entries
+      are -1 after a failure.
     - `functional_map`: the functional map C (k_out, k_in) from which the pointwise map was recovered. This
       property returns `state.functional_map`. By default, C is a pullback (k_X, k_Y), which takes functions
       on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y, k_X) takes functions
@@ -116,9 +116,10 @@ def refine(
     equal size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For pairs of different sizes, use
     `jaxsmw.refine_pairs`.
 
-    If samples are given, the first functional map is computed from all vertices. The iterations then match
-    only the samples, and the final search matches all vertices. The fast variant of the MWP authors' program
-    also iterates on samples.
+    If samples are given, only the first and the last step use all vertices. The first step computes a
+    functional map from the initial map of all vertices. The last step recovers the refined map of all
+    vertices. All steps in between use only the samples. The fast variant of the MWP authors' program also
+    iterates on samples.
 
     **Arguments:**
 

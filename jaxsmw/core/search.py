@@ -233,9 +233,9 @@ def _variations(points: Float[Array, "p s d"], mask: Bool[Array, "p s"], rank: i
     def iterate(_: Int[Array, ""], variations: Float[Array, "p r s"]) -> Float[Array, "p r s"]:
         return _orthonormal(product(variations, products))
 
-    # The initial vectors of the power iteration are coordinates of the points: first coordinate 1, then
-    # coordinate 2, and so on. Coordinate 0 comes last, because the first eigenvector of a surface is constant
-    # and does not distinguish points.
+    # Each initial vector of the power iteration contains one coordinate of all points of a patch. The first
+    # vector contains coordinate 1, the second vector contains coordinate 2, and so on. Coordinate 0 comes
+    # last, because the first eigenvector of a surface is constant and does not distinguish points.
     _, width, d = points.shape
     start = jnp.swapaxes(deviations[..., (1 + jnp.arange(min(rank, d, width))) % d], 1, 2)
     return lax.fori_loop(0, _POWER_ITERATIONS, iterate, start)

@@ -213,7 +213,7 @@ class Recovery(eqx.Module):
 
 
 class Softmax(Recovery):
-    """A recovery that gives shares to all database rows, and larger shares to nearer rows.
+    """A recovery in which each query gives shares to all database rows, and larger shares to nearer rows.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
     `refine_softly` passes the spectral embeddings of X and Y to the recovery. The m points of X are then the
@@ -253,7 +253,7 @@ class Softmax(Recovery):
 
 
 class NearestFew(Recovery):
-    """A recovery that gives shares only to the nearest database rows of each query.
+    """A recovery in which each query gives shares only to its nearest database rows.
 
     Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
     `refine_softly` passes the spectral embeddings of X and Y to the recovery. The m points of X are then the

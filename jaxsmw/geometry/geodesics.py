@@ -179,8 +179,8 @@ def _unfold(
     - `depth`: the number of sides to cross.
 
     **Returns:** An iterator with `depth` pairs (beams, corners). The beams of pair i have crossed i + 1
-    sides. Each beam has entered a triangle by the last of these sides. The beam's entry in `corners` is the
-    position of the corner opposite this side.
+    sides. The last side that a beam has crossed belongs to the triangle that the beam is now in. The beam's
+    entry in `corners` is the position of the corner opposite this side, in the same triangle.
     """
     right, left = -position * sides.length[side], (1 - position) * sides.length[side]
     beams = _Beams(origin, side, right, left, right, left)

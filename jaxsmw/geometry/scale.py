@@ -50,9 +50,9 @@ class ScaleEstimate(NamedTuple):
 
     **Attributes:**
 
-    - `scale`: a length on X, multiplied by `scale`, is the corresponding length on Y.
+    - `scale`: the factor by which lengths on X are multiplied to become lengths in the unit of Y.
     - `support`: the mean number of other matches with which a match agrees on the scale.
-    - `uncertain`: whether the support is so small that the scale can be wrong.
+    - `uncertain`: whether `support` is below `ScaleSettings.uncertain_below`, so that the scale can be wrong.
     """
 
     scale: float
@@ -80,7 +80,8 @@ def estimate_scale(
     - `mesh_x`, `mesh_y`: a partial shape and a full shape, in either order and in any units of length.
     - `settings`: the settings of the search.
 
-    **Returns:** A `ScaleEstimate`.
+    **Returns:** A `ScaleEstimate` with the attributes `scale`, `support` and `uncertain`. Lengths on X are
+    multiplied by `scale` to become lengths in the unit of Y, even if Y is the partial shape.
 
     **Raises:** `InputError` if neither mesh has a boundary, or if the meshes are too coarse.
     """

@@ -37,12 +37,13 @@ class Alternatives:
 
     Each shape is reduced to about a thousand samples. On the samples, a feature regression with few
     eigenvectors refines many initial maps in the time that one refinement takes at all vertices. An initial
-    map is a nearest-neighbour search in one of the following features.
+    map is the result of a nearest-neighbour search in features. There are three kinds of features:
 
-    - SHOT with several radii.
-    - SHOT and the distances to extremities, for each of the most plausible pairings of extremities.
-    - SHOT and the positions along the principal axes of inertia, for each of the four rotations that take
-      principal axes to principal axes.
+    - SHOT with several radii. Each choice of radii gives one map.
+    - SHOT and the distances to extremities, such as the ends of limbs. A pairing assigns extremities of X to
+      extremities of Y. Each of the most plausible pairings gives one map.
+    - SHOT and the positions along the principal axes of inertia. Each of the four rotations that take
+      principal axes to principal axes gives one map.
 
     For a partial pair, only the first kind is used, because a part has other extremities and other axes.
 

@@ -20,9 +20,9 @@ class Extremities(NamedTuple):
     **Attributes:**
 
     - `samples`: the samples at the extremities (e,), as 0-based indices of the samples of a `Proxy`.
-    - `distances`: the distances between extremities (e, e) along the surface, in units of the mean remoteness
-      of the extremities.
-    - `remoteness`: the remoteness of each extremity (e,), in units of the mean remoteness of the extremities.
+    - `distances`: the distances between extremities (e, e) along the surface, divided by the mean remoteness
+      of all e extremities.
+    - `remoteness`: the remoteness of each extremity (e,), divided by the same mean.
     """
 
     samples: Int64[np.ndarray, " e"]

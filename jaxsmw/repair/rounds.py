@@ -51,9 +51,7 @@ def refine_in_stages(
        is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
        worse by less than `score_tolerance`. In all other cases, the best map of the rounds is kept.
 
-    With `repair`, maps between non-isometric shapes are also refined further, because they converge slowly:
-    the repeated stage and all later stages run `repair.passes` more times. If the shapes differ very much,
-    coarse passes with the levels `repair.coarse_levels` and one usual pass run instead.
+    Maps between non-isometric shapes need further passes; see `refine_further`.
 
     **Arguments:**
 
@@ -71,30 +69,69 @@ def refine_in_stages(
 
     **Raises:** `InputError` if alternative maps cannot be computed.
     """
-    views = [prepared.view(stage) for stage in stages]
-    runner = _Runner(prepared, list(zip(views, stages, strict=True)), history)
+    runner, judge = _runner_and_judge(prepared, stages, repair or WITHOUT_REPAIR, history)
     first = prepared.padded_map(prepared.initial_map)
-    finest = max(views, key=lambda view: view[0].eigenvalues.shape[0])
-    judge = Judge(prepared.pair, *finest, repair or WITHOUT_REPAIR)
     best = judge.judged(refined or runner.run(0, Outcome([], first)))
     if repair is None or not best.successful:
         return best
+    if not best.suspicious:
+        return best
+    logger.info(
+        "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
+        "%.0f %% of the area)",
+        best.distortion,
+        repair.suspicious,
+        100 * repair.suspicious_area,
+    )
+    if alternatives is None and isinstance(prepared.init, str) and prepared.init == "shot":
+        proxies = Alternatives(prepared, repair)
+        judge = replace(judge, measure_deformation=proxies.deformation)
+        alternatives = proxies.best(best.unpadded_map(prepared.pair))
     repairer = _Repairer(runner, judge, repair)
-    if best.suspicious:
-        logger.info(
-            "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
-            "%.0f %% of the area)",
-            best.distortion,
-            repair.suspicious,
-            100 * repair.suspicious_area,
-        )
-        if alternatives is None and isinstance(prepared.init, str) and prepared.init == "shot":
-            proxies = Alternatives(prepared, repair)
-            judge = replace(judge, measure_deformation=proxies.deformation)
-            repairer = replace(repairer, judge=judge)
-            alternatives = proxies.best(best.unpadded_map(prepared.pair))
-        best = repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives or ()))
-    return repairer.refined_further(best)
+    return repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives or ()))
+
+
+def refine_further(
+    prepared: PreparedPair,
+    stages: Sequence[Stage],
+    repair: RepairSettings | None,
+    outcome: Outcome,
+    *,
+    history: bool = False,
+) -> Outcome:
+    """Refine the map between non-isometric shapes further, because such maps converge slowly.
+
+    The repeated stage and all later stages run `repair.passes` more times. If the shapes differ very much,
+    coarse passes with the levels `repair.coarse_levels` and one usual pass run instead.
+
+    **Arguments:**
+
+    - `prepared`: the pair with its spectra.
+    - `stages`: the stages from which the outcome was computed.
+    - `repair`: the settings of the repair, or None for no passes.
+    - `outcome`: an outcome of `refine_in_stages`.
+    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
+
+    **Returns:** The `Outcome` of the last pass. The given outcome is returned if `repair` is None, if the
+    shapes are nearly isometric, or if the given outcome or a pass failed.
+    """
+    if repair is None or not outcome.successful:
+        return outcome
+    runner, judge = _runner_and_judge(prepared, stages, repair, history)
+    change = judge.area_change(outcome)
+    if change < repair.non_isometric:
+        return outcome
+    runners = [runner] * repair.passes
+    if change >= repair.coarse_from:
+        runners = [*map(runner.coarse, repair.coarse_levels), runner]
+    further = outcome
+    for one in runners:
+        further = _Repairer(one, judge, repair).repeated(further)
+        if not further.successful:
+            return outcome
+    further = judge.judged(further)
+    # A map that looked right before stays near that map, so it does not become suspicious.
+    return further._replace(suspicious=outcome.suspicious and not judge.looks_right(further))
 
 
 _View = tuple[Spectrum, Spectrum]
@@ -144,6 +181,16 @@ def _with_levels(stage: Stage, levels: tuple[int, ...]) -> Stage:
     return stage.with_levels(tuple(min(level, stage.number_of_eigenvectors) for level in levels))
 
 
+def _runner_and_judge(
+    prepared: PreparedPair, stages: Sequence[Stage], settings: RepairSettings, history: bool
+) -> tuple[_Runner, Judge]:
+    """Return the runner of the stages, and the judge of their outcomes."""
+    views = [prepared.view(stage) for stage in stages]
+    finest = max(views, key=lambda view: view[0].eigenvalues.shape[0])
+    runner = _Runner(prepared, list(zip(views, stages, strict=True)), history)
+    return runner, Judge(prepared.pair, *finest, settings)
+
+
 @dataclass(frozen=True)
 class _Repairer:
     """A repairer of outcomes, which repeats the stage at position `settings.stage` and all later stages."""
@@ -169,23 +216,6 @@ class _Repairer:
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)
         return best
-
-    def refined_further(self, outcome: Outcome) -> Outcome:
-        """Run the repeated stage and all later stages a few more times if the shapes are not isometric."""
-        settings, change = self.settings, self.judge.area_change(outcome)
-        if change < settings.non_isometric:
-            return outcome
-        runners = [self.runner] * settings.passes
-        if change >= settings.coarse_from:
-            runners = [*map(self.runner.coarse, settings.coarse_levels), self.runner]
-        further = outcome
-        for runner in runners:
-            further = replace(self, runner=runner)._repeated(further)
-            if not further.successful:
-                return outcome
-        further = self.judge.judged(further)
-        # A map that looked right before stays near that map, so it does not become suspicious.
-        return further._replace(suspicious=outcome.suspicious and not self.judge.looks_right(further))
 
     def _by_rounds(self, outcome: Outcome) -> Outcome:
         """Repair an outcome by rounds and by the fallback."""
@@ -220,9 +250,9 @@ class _Repairer:
         self, outcome: Outcome, stage: Stage | None = None, excluded: Bool[np.ndarray, " m"] | None = None
     ) -> Outcome:
         """Run the repeated stage and all later stages from the map of an outcome, and judge the result."""
-        return self.judge.judged(self._repeated(outcome, stage, excluded))
+        return self.judge.judged(self.repeated(outcome, stage, excluded))
 
-    def _repeated(
+    def repeated(
         self, outcome: Outcome, stage: Stage | None = None, excluded: Bool[np.ndarray, " m"] | None = None
     ) -> Outcome:
         """Run the repeated stage and all later stages from the map of an outcome.

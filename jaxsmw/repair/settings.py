@@ -194,8 +194,9 @@ class RepairSettings:
     - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass. If
       the refiner of the last stage has no levels, coarse passes are usual passes.
     - `aligned_preference` (entry R24): a number from 0. With `init="auto"`, asymmetric shapes are matched
-      from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is returned if its mean expected
-      error is below this multiple of the other map's mean expected error.
+      from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean expected
+      error is below this multiple of the other map's mean expected error. Both expected errors are computed
+      without `ExpectedErrorSettings.area_weight`, and before further passes.
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 

@@ -22,9 +22,9 @@ from jaxsmw.wording import count_of
 # A vertex of the target is far from the registered mesh if its distance exceeds this number times the square
 # root of the target's area. The vertex then probably belongs to a part that the source lacks.
 _FAR = 0.03
-# A face of the target receives its data from four of its points. One point is the centroid of the face. Each
-# other point is the centroid of a triangle between a corner and the midpoints of the two edges at this
-# corner. If two labels have two points each, the label at the face's centroid wins.
+# The data of a target face are computed from the data at four points of the face. One point is the centroid
+# of the face. Each other point is the centroid of a triangle between a corner and the midpoints of the two
+# edges at this corner. If two labels have two points each, the label at the face's centroid wins.
 _SAMPLES = np.vstack([np.full((1, 3), 1 / 3), np.full((3, 3), 1 / 6) + np.eye(3) / 2])
 _VOTES = np.array([1.5, 1, 1, 1])
 _Value = TypeVar("_Value")
@@ -47,8 +47,8 @@ def transfer_attributes(
 ) -> MeshData:
     """Transfer all data on the vertices and faces of X to Y.
 
-    Each vertex of Y receives the values at the nearest point of the registered mesh. Each face of Y receives
-    the values at four points of the face:
+    The value of a vertex of Y comes from the nearest point of the registered mesh. The value of a face of Y
+    is computed from the values at four points of the face. Each kind of data has its own rule:
 
     - Floats and colours are interpolated. If the vertex with the largest weight has a value that is not
       finite, this value is the result. Otherwise, values that are not finite are left out. Components of
@@ -63,7 +63,8 @@ def transfer_attributes(
       either.
     - Skin weights are interpolated. A vertex of Y has at most as many joints as the vertices of X; the
       smallest weights are left out. Each row sums to 1, unless all weights of the nearest face are 0.
-    - Blend shapes are rotated and scaled with the neighbourhoods (`RegisteredMesh.similarities`), and then
+    - Blend shapes are displacements of the vertices of X. Each displacement is first rotated and scaled in
+      the same way as the neighbourhood of its vertex (`RegisteredMesh.similarities`). The results are then
       interpolated.
     - Normals describe the shape of X, so they are not transferred.
 
@@ -120,10 +121,10 @@ def registered_data(data: MeshData, registered: RegisteredMesh) -> MeshData:
     """Return the data of X at the positions of the registered mesh.
 
     The vertices, the faces, the texture, the skin, the labels and all other data keep their order and values.
-    Blend shapes are rotated and scaled with the neighbourhoods (`RegisteredMesh.similarities`), and normals
-    are rotated. Some vertices are used by faces of the file, but not by faces of the mesh. Examples are
-    welded duplicates and the vertices of small components. These vertices move with the nearest vertex of the
-    mesh.
+    Two kinds of vectors follow the neighbourhood of their vertex (`RegisteredMesh.similarities`): the
+    displacements of blend shapes are rotated and scaled, and normals are rotated. Some vertices are used by
+    faces of the file, but not by faces of the mesh. Examples are welded duplicates and the vertices of small
+    components. These vertices move with the nearest vertex of the mesh.
 
     **Arguments:**
 
@@ -172,7 +173,7 @@ def _face_numbers(data: MeshData, mesh_x: Mesh) -> Int64[np.ndarray, " f"]:
     if len(data.faces) != len(numbers):
         numbers = data.mesh.face_numbers
     fits = len(numbers) == 0 or numbers[-1] < len(data.faces)
-    # Welding can replace the vertices of a face, but not their positions.
+    # Welding can change which vertices are the corners of a face. The positions of the corners do not change.
     if not fits or not np.array_equal(mesh_x.vertices[data.faces[numbers]], mesh_x.vertices[data.mesh.faces]):
         raise InputError(
             f"{data.mesh.name}: the faces of the data are not those of their mesh: make the data with "

@@ -51,7 +51,8 @@ def transfer_landmarks(
     - `landmarks`: `Landmarks` with l landmarks on X, in the unit and the coordinate system of X.
     - `registered`: the `RegisteredMesh` of X on Y.
     - `expected_error`: the expected error of each vertex of X (m,), divided by the square root of Y's area;
-      see `Correspondence.expected_error`.
+      see `Correspondence.expected_error`. If given, the result contains the expected error of each landmark
+      (`expected_errors`). The positions do not depend on this argument.
 
     **Returns:** `TransferredLandmarks`, whose attribute `landmarks` contains the positions (l, 3) on Y. The
     result states the coordinate system and the unit of the given landmarks, so both meshes should have this

@@ -17,8 +17,9 @@ class FilterBank(eqx.Module):
     `CubicSpline`.
 
     A subclass must define `__call__(points, eigenvalues)`, which returns the responses (filters, p) at
-    `points` (p,) in [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order; the
-    last one is lambda_max.
+    `points` (p,) in [0, lambda_max]. By convention, row 0 of the responses is the scaling function.
+    `eigenvalues` (k,) are the shape's eigenvalues in ascending order; the last one is lambda_max. The unit of
+    the eigenvalues is arbitrary, but the points have the same unit.
 
     A bank is an Equinox module, and therefore a pytree. The continuous parameters of a bank are arrays, which
     JAX can trace and differentiate. The sizes of a bank, such as the number of filters, are static fields.
@@ -35,10 +36,12 @@ class FilterBank(eqx.Module):
         **Arguments:**
 
         - `points`: (p,), points in [0, lambda_max], in any order.
-        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit as the points. The
-          last eigenvalue is lambda_max. Most banks use only lambda_max and ignore all other eigenvalues.
+        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same (arbitrary) unit as the
+          points. The last eigenvalue is lambda_max. Most banks use only lambda_max and ignore all other
+          eigenvalues.
 
-        **Returns:** The responses (filters, p), which are dimensionless. Row 0 is the scaling function.
+        **Returns:** The responses (filters, p), which are dimensionless. By convention, row 0 is the scaling
+        function.
         """
 
 

@@ -416,7 +416,8 @@ def _rotations_of_quaternions() -> Float64[np.ndarray, "9 16"]:
     """
     signs = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, -1, -1, 1], [1, 1, -1, -1]])
     units = np.arange(4)
-    multiplication = np.zeros((4, 4, 4))  # the product of two quaternion units is plus or minus a unit
+    # The product of two of the quaternion units 1, i, j and k is again one of these units, or its negative.
+    multiplication = np.zeros((4, 4, 4))
     multiplication[units[:, None], units, units[:, None] ^ units] = signs
     # A unit quaternion q rotates a vector v to q v q*.
     rotations = np.einsum("ajc,cbi,b->ijab", multiplication, multiplication, [1, -1, -1, -1])

@@ -17,7 +17,7 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.presets import PRESETS, PresetName
-from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.repair.rounds import refine_further, refine_in_stages
 from jaxsmw.stage import Stage
 
 
@@ -81,6 +81,7 @@ class Chosen(Method):
         assert pair.prepared is not None
         preset = PRESETS[self.preset].fitted(pair.prepared.pair.fewest_vertices())
         outcome = refine_in_stages(pair.prepared, preset.stages, preset.repair)
+        outcome = refine_further(pair.prepared, preset.stages, preset.repair, outcome)
         return outcome.pointwise_map, outcome.refinements[-1].result
 
 

@@ -41,7 +41,9 @@ class Skin(NamedTuple):
     **Attributes:**
 
     - `joints`: the names of the joints, a tuple of distinct strings.
-    - `weights`: the weight of each joint at each vertex (n, joints), float64.
+    - `weights`: the weight of each joint at each vertex (n, joints), float64. The weights are finite numbers
+      as in the file. They are usually from 0 to 1 with sum 1 at each vertex, but neither range nor sum is
+      checked.
     """
 
     joints: tuple[str, ...]
@@ -291,8 +293,8 @@ def texture_of_corners(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return texture vertices, and the texture vertex of each corner, given the coordinates of all corners.
 
-    Corners of one vertex with equal coordinates share a texture vertex. The texture vertices are numbered in
-    the order of their vertices. Corners at NaN have no texture vertex.
+    Two corners share a texture vertex if they belong to the same vertex and have equal texture coordinates.
+    The texture vertices are numbered in the order of their vertices. Corners at NaN have no texture vertex.
     """
     known = np.isfinite(at_corners).all(axis=1)
     rows = np.column_stack([corners, at_corners])[known]
