@@ -86,7 +86,7 @@ def match(
         - `"auto"` (the default): `"shot"`. The initial map `"aligned"` is refined as well if `partial` is
           False, the preset has repair, and both shapes differ from their own mirror images, as teeth do. The
           map from `"aligned"` is then chosen unless the mean expected error of the map from `"shot"` is at
-          least 2 % smaller. Both expected errors are computed without the factor for the difference of the
+          least 10 % smaller. Both expected errors are computed without the factor for the difference of the
           shapes.
         - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
           with the nearest descriptor of this kind. Only SHOT distinguishes left from right.

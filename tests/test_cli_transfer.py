@@ -62,6 +62,22 @@ def test_all_files_are_written(run, pair, tmp_path):
     assert "are in LPS coordinates" in outcome.errors
 
 
+def test_missing_pictures_and_coordinate_systems_are_noted(run, pair, tmp_path):
+    mesh = jaxsmw.read_mesh(pair / "x.off")
+    texture = mesh.vertices[:, :2], mesh.faces
+    write_mesh_data(tmp_path / "x.obj", MeshData(mesh, mesh.faces, texture=texture))
+    outcome = run(
+        "transfer", tmp_path / "x.obj", pair / "y.ply", "--map", pair / "truth.txt",
+        "--registered", tmp_path / "r.glb", "--attributes", tmp_path / "a.ply",
+        "--landmarks", pair / "x.csv", "--landmarks-output", tmp_path / "l.mrk.json", "--coordinates", "RAS",
+    )  # fmt: skip
+    assert outcome.code == 0, outcome.errors
+    for name in ("r.glb", "a.ply"):
+        assert f"{name}: the file contains texture coordinates, but no picture" in outcome.errors
+    assert "x.csv: the file states no coordinate system, so its positions are used as RAS" in outcome.errors
+    assert read_landmark_file(tmp_path / "l.mrk.json").coordinates == "RAS"
+
+
 def test_a_map_replaces_the_match(run, pair, tmp_path):
     outcome = run(
         "transfer",
@@ -98,6 +114,9 @@ def test_the_report_shows_a_registered_mesh_that_is_computed_once(run, pair, tmp
     assert "report.html" in outcome.errors and "mean expected error" in outcome.output
     page = (tmp_path / "report" / "report.html").read_text()
     assert '"registered"' in page and "x.off to y.ply" in page
+    assert (
+        page.count('"names": ["a", "b"]') + page.count('"names":["a","b"]') == 2
+    )  # of the source and of the target
     summary = json.loads((tmp_path / "report" / "summary.json").read_text())
     assert summary["settings"]["preset"] == "paper" and "registered mesh" in summary["seconds"]
     assert sorted(calls) == ["registered_mesh", "surface_points"]
@@ -181,6 +200,7 @@ def test_landmarks_of_both_meshes_are_the_initial_map(run, pair, tmp_path):
         ("--registered {t}/r.off --coordinates LPS", "--coordinates: has no effect without --landmarks"),
         ("--registered {t}/r.xyz", "r.xyz: meshes cannot be written"),
         ("--attributes {t}/r", "meshes cannot be written as"),
+        ("--attributes {t}/a.ply", "x.off: has no attributes"),
         ("--registered {p}/x.off", "would be overwritten"),
         ("--registered {t}/a.off --attributes {t}/a.off", "two outputs have this name"),
         ("--registered {t}/r.off --stiffness 0", "is not a positive number"),

@@ -19,6 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io import Landmarks
 from jaxsmw.report.page import EXPECTED_ERROR, ShownMap, write_page
 from jaxsmw.report.rendering import camera_axes, choose_azimuth
 from jaxsmw.report.standing import stand_pair
@@ -67,6 +68,30 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shown = {"map": ShownMap(NUMBER, {EXPECTED_ERROR: expected_error()})}
     write_page(path, SOURCE, TARGET, shown, title="Two", registered=TARGET.vertices[NUMBER])
     return path
+
+
+def test_the_page_opens_with_the_landmarks_of_a_transfer(browser: Any, tmp_path: Path) -> None:
+    vertices = visible("x")[[0, 30]]
+    names = ("nose <b>", "chin")
+    given = (
+        Landmarks(names, SOURCE.vertices[vertices], name="/data/source.mrk.json", coordinates="LPS"),
+        Landmarks(names, TARGET.vertices[NUMBER[vertices]]),
+    )
+    path = tmp_path / "page.html"
+    write_page(path, SOURCE, TARGET, {"map": ShownMap(NUMBER)}, title="Two", landmarks=given)
+    page = OpenPage(browser, path)
+    assert page.find("#landmark-mode").get_attribute("aria-pressed") == "true"
+    found = page.run("return jaxsmw.landmarks.entries")
+    assert tuple(entry["name"] for entry in found) == names
+    for entry, vertex in zip(found, vertices, strict=True):
+        np.testing.assert_allclose(
+            entry["positions"]["x"], SOURCE.vertices[vertex], atol=1e-4 * diagonal(SOURCE)
+        )
+        np.testing.assert_allclose(
+            entry["positions"]["y"], TARGET.vertices[NUMBER[vertex]], atol=1e-4 * diagonal(TARGET)
+        )
+    assert page.find("#landmark-format-x").get_attribute("value") == "LPS"
+    assert "2 of them on both bodies" in page.find("#landmark-status").text
 
 
 class LandmarkPage(OpenPage):

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from jaxsmw.correspondence import Correspondence
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
+    from jaxsmw.io.landmarks import Landmarks
     from jaxsmw.transfer.registered_mesh import RegisteredMesh
 
 
@@ -93,6 +94,7 @@ def write_match_report(
     *,
     up: Any,
     registered: RegisteredMesh | None = None,
+    landmarks: tuple[Landmarks, Landmarks] | None = None,
 ) -> None:
     """Write the report of a match to a directory. The report's summary contains the options of the command.
 
@@ -102,6 +104,7 @@ def write_match_report(
     - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
     - `registered`: the registered mesh if it was already computed; None otherwise.
+    - `landmarks`: the landmarks on the source and on the target with which the page opens.
     """
     from jaxsmw.report.summary import write_report
 
@@ -118,6 +121,7 @@ def write_match_report(
             seconds=stopwatch.steps(),
             up=up,
             registered=registered,
+            landmarks=landmarks,
         )
     report_written(*written)
 

@@ -126,6 +126,11 @@ def run(options: argparse.Namespace) -> None:
         )
         for file, data in ((options.source, source), (options.target, target)):
             report_mesh(file, data.mesh)
+        if options.attributes and not source.has_attributes:
+            raise InputError(
+                f"{options.source}: has no attributes (colours, labels, texture coordinates, blend shapes, a "
+                "skin or other data) for --attributes: leave the option out, or give a source that has some."
+            )
         landmarks = _read_landmarks(options, source) if options.landmarks else None
     correspondence, registered = _register(options, source, target, stopwatch)
     expected = None
@@ -148,8 +153,9 @@ def run(options: argparse.Namespace) -> None:
         for note in carried.mesh.notes[len(target.mesh.notes) :]:
             say(f"note: {note}")
         _write(options.attributes, carried, stopwatch)
+    transferred = None
     if landmarks:
-        _transfer_landmarks(options, landmarks, expected, registered, stopwatch)
+        transferred = _transfer_landmarks(options, landmarks, expected, registered, stopwatch)
     if correspondence is not None and expected is not None and options.report:
         write_match_report(
             options.report,
@@ -160,6 +166,7 @@ def run(options: argparse.Namespace) -> None:
             stopwatch,
             up=options.up,
             registered=registered,
+            landmarks=(landmarks, transferred) if landmarks and transferred else None,
         )
     show(f"time: {stopwatch.summary()} (compilation included)")
 
@@ -209,6 +216,10 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
     for note in landmarks.notes:
         report_progress(f"{options.landmarks}: {note}")
     if options.coordinates and landmarks.coordinates is None:
+        report_progress(
+            f"{options.landmarks}: the file states no coordinate system, so its positions are used as "
+            f"{options.coordinates} coordinates without a conversion."
+        )
         landmarks = landmarks.stated(options.coordinates)
     elif options.coordinates:
         landmarks = landmarks.in_coordinates(options.coordinates)
@@ -264,8 +275,8 @@ def _transfer_landmarks(
     expected_error: Float[np.ndarray, " m"] | None,
     registered: RegisteredMesh,
     stopwatch: Stopwatch,
-) -> None:
-    """Transfer the landmarks, write them, and print their expected errors.
+) -> Landmarks:
+    """Transfer the landmarks, write them, print their expected errors, and return them.
 
     `expected_error` is the expected error of each match (m,), as a fraction of sqrt(area of Y),
     or None if a map was given.
@@ -280,6 +291,7 @@ def _transfer_landmarks(
     _show_landmarks(found)
     write_landmark_file(options.landmarks_output, found.landmarks)
     report_written(options.landmarks_output)
+    return found.landmarks
 
 
 def _show_landmarks(found: TransferredLandmarks) -> None:
@@ -301,11 +313,16 @@ _LARGE = 2
 
 
 def _write(file: str, data: Any, stopwatch: Stopwatch) -> None:
-    """Write a mesh with its data, and print notes about data that the format cannot hold."""
+    """Write a mesh with its data, and print notes about data that the file does not contain."""
     from jaxsmw.io.mesh_data import write_mesh_data
 
     with stopwatch.step("writing"):
         notes = write_mesh_data(file, data)
+    if data.texture is not None and not any("texture coordinates" in note for note in notes):
+        notes += (
+            "the file contains texture coordinates, but no picture and no material: assign those of the "
+            "source in your program.",
+        )
     for note in notes:
         say(f"note: {file}: {note}")
     report_written(file)

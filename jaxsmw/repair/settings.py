@@ -220,7 +220,7 @@ class RepairSettings:
     passes: int = 2
     coarse_from: float = 0.3
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60))
-    aligned_preference: float = 0.98
+    aligned_preference: float = 0.9
     alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
 

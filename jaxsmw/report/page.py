@@ -18,6 +18,7 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, position_colors
 from jaxsmw.report.inputs import check_error_limit, check_errors, check_map, describe
 from jaxsmw.report.page_data import (
@@ -105,6 +106,7 @@ def write_page(
     figures: Sequence[tuple[str, bytes]] = (),
     up: Axis | None = None,
     registered: Float[np.ndarray, "m 3"] | None = None,
+    landmarks: tuple[Landmarks, Landmarks] | None = None,
 ) -> None:
     """Write a web page that shows both bodies in 3D and colours them by one map at a time.
 
@@ -148,6 +150,8 @@ def write_page(
       default) for a page without these positions. The page can draw X at these positions, on top of Y. A
       slider on the page deforms X from its own shape to these positions. The positions take 16 bytes per
       vertex.
+    - `landmarks`: the landmarks on X and on Y with which the page opens, in the coordinates of the mesh
+      files. Landmarks of the same name correspond. With None (the default), the page opens without landmarks.
 
     **Raises:** `InputError` if there is no map, or if the maps, errors or spectra do not fit the meshes.
     `InputError` is also raised if a functional map is not a matrix of finite numbers, the limit is not
@@ -171,6 +175,8 @@ def write_page(
     }
     if registered is not None:
         data["registered"] = encode_registered(registered, mesh_x, mesh_y, shown_y)
+    if landmarks is not None:
+        data["landmarks"] = dict(zip("xy", map(_encode_landmarks, landmarks), strict=True))
     filters = _add_wavelets(data, mesh_x, mesh_y, spectra, refiner)
     modes = _modes(maps, error_names, has_spectra=filters > 0)
     fragments = {
@@ -202,6 +208,15 @@ def _encode_view(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
         "azimuth": choose_azimuth([shown_x, shown_y]),
         "elevation": ELEVATION,
         "wide": bool(max(reach[0], reach[2]) > _WIDE * reach[1]),
+    }
+
+
+def _encode_landmarks(landmarks: Landmarks) -> dict[str, Any]:
+    return {
+        "file": os.path.basename(landmarks.name),
+        "names": list(landmarks.names),
+        "positions": landmarks.positions.tolist(),
+        "system": landmarks.coordinates,
     }
 
 

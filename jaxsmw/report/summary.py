@@ -25,6 +25,7 @@ from jaxsmw.correspondence import Correspondence
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.repair.settings import WITHOUT_REPAIR
 from jaxsmw.report.figures import (
@@ -84,6 +85,7 @@ def write_report(
     seconds: Mapping[str, float] | None = None,
     up: Axis | None = None,
     registered: RegisteredMesh | None = None,
+    landmarks: tuple[Landmarks, Landmarks] | None = None,
 ) -> list[Path]:
     """Write pictures of a match, an interactive page and a summary to a directory.
 
@@ -110,6 +112,7 @@ def write_report(
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
     - `registered`: the registered mesh that the page shows. By default, the page shows the result of
       `Correspondence.registered_mesh`.
+    - `landmarks`: the landmarks on X and on Y with which the page opens; see `jaxsmw.report.page.write_page`.
 
     **Returns:** The files that were written.
 
@@ -142,6 +145,7 @@ def write_report(
         figures=[(caption, path.read_bytes()) for path, caption in captions.items()],
         up=up,
         registered=(registered or correspondence.registered_mesh()).vertices,
+        landmarks=landmarks,
     )
     summary = {
         "settings": dict(settings or {}),

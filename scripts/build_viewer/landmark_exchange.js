@@ -33,6 +33,15 @@ export class LandmarkExchange {
     }
   }
 
+  /** Shows landmarks that belong to the page, as a mapping from sides to landmarks with the name of their file. */
+  show(landmarks) {
+    this.mode.toggle(true);
+    for (const side of sides) {
+      const { file, ...placed } = landmarks[side];
+      this.#merge(side, file, placed, this.#snap(side, placed.positions));
+    }
+  }
+
   /** Merges the landmarks of a file, or asks first if they lie off the surface. */
   #consider(side, file, landmarks) {
     const snapped = this.#snap(side, landmarks.positions);

@@ -467,6 +467,7 @@ startRegistered({ bodies, data, draw });
 byId("filter").disabled = filters < 2;
 chooseFilter();
 chooseMap(0);
+if (data.landmarks) landmarks.exchange.show(data.landmarks);
 
 // For scripts and tests: pick a source vertex, and read the state, the colours, the landmarks and the position of a
 // vertex in the window.

@@ -127,6 +127,17 @@ class MeshData:
             object.__setattr__(self, attribute, value)
         self._check_labels()
 
+    @property
+    def has_attributes(self) -> bool:
+        """Whether there are data besides positions and normals, which `transfer_attributes` can transfer."""
+        return bool(
+            {*self.vertex_data} - {NORMALS}
+            or self.face_data
+            or self.texture is not None
+            or self.blend_shapes
+            or self.skin is not None
+        )
+
     def _fail(self, fault: str) -> InputError:
         return InputError(f"{self.mesh.name}: {fault}")
 

@@ -1,4 +1,4 @@
-/* Built from the viewer's sources with SHA-256 2585f25ae7c3bb241b2f00a2223e4dc91b3880ad758ea3a43f9a81d41ec96394.
+/* Built from the viewer's sources with SHA-256 9dbf5e13a35658d5ffffa3f256bebd8ad9aec0906429a3318002a2455f85909e.
 Contains three.js:
 
 The MIT License
