@@ -101,28 +101,31 @@ def refine_further(
 ) -> Outcome:
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
-    The repeated stage and all later stages run `repair.passes` more times. If the shapes differ very much,
-    coarse passes with the levels `repair.coarse_levels` and one usual pass run instead.
+    The repeated stage and all later stages run `repair.passes` more times. If the shapes differ very much, or
+    if the initial map is `"aligned"`, coarse passes with the levels `repair.coarse_levels` and one usual pass
+    run instead.
 
     **Arguments:**
 
-    - `prepared`: the pair with its spectra.
+    - `prepared`: the pair with its spectra and the kind of its initial map.
     - `stages`: the stages from which the outcome was computed.
     - `repair`: the settings of the repair, or None for no passes.
     - `outcome`: an outcome of `refine_in_stages`.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
-    **Returns:** The `Outcome` of the last pass. The given outcome is returned if `repair` is None, if the
-    shapes are nearly isometric, or if the given outcome or a pass failed.
+    **Returns:** The `Outcome` of the last pass. The given outcome is returned if `repair` is None, if no
+    passes are needed, or if the given outcome or a pass failed.
     """
     if repair is None or not outcome.successful:
         return outcome
     runner, judge = _runner_and_judge(prepared, stages, repair, history)
     change = judge.area_change(outcome)
-    if change < repair.non_isometric:
+    # Rigidly aligned shapes differ in form, not in pose, and their map has the details of the alignment.
+    aligned = isinstance(prepared.init, str) and prepared.init == "aligned"
+    if change < repair.non_isometric and not aligned:
         return outcome
     runners = [runner] * repair.passes
-    if change >= repair.coarse_from:
+    if change >= repair.coarse_from or aligned:
         runners = [*map(runner.coarse, repair.coarse_levels), runner]
     further = outcome
     for one in runners:

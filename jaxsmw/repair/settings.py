@@ -190,7 +190,8 @@ class RepairSettings:
     - `passes` (Table R29): how often the repeated stage and all later stages run again for such shapes, at
       least 0. Their maps converge more slowly than maps between poses of one body.
     - `coarse_from` (Table R32): a number from `non_isometric`. If the area-based shape difference is at least
-      this value, coarse passes and one usual pass run instead of the usual passes.
+      this value, coarse passes and one usual pass run instead of the usual passes. They also run for all maps
+      that start from `"aligned"` (entry R24).
     - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass. If
       the refiner of the last stage has no levels, coarse passes are usual passes.
     - `aligned_preference` (entry R24): a number from 0. With `init="auto"`, asymmetric shapes are matched
