@@ -11,7 +11,11 @@ from jaxsmw import Mesh, creature_pair, make_mesh, read_ground_truth, read_mesh
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import SurfacePoints
 from jaxsmw.geometry.rotations import nearest_rotations
-from jaxsmw.geometry.surface_distance import nearest_points_of_triangles, nearest_surface_points
+from jaxsmw.geometry.surface_distance import (
+    nearest_facing_points,
+    nearest_points_of_triangles,
+    nearest_surface_points,
+)
 from jaxsmw.io import Landmarks, MeshData, Skin, Texture, read_mesh_data, write_mesh_data
 from jaxsmw.transfer import (
     RegisteredMesh,
@@ -551,6 +555,28 @@ class TestTexture:
         assert np.array_equal(shown[np.abs(middle) > 0.1, 0], middle[np.abs(middle) > 0.1] > 0)
         bare = replace(data, texture=Texture(np.empty((0, 2)), np.full_like(corners, -1)))
         assert (transfer_attributes(bare, registered).texture.corners == -1).all()
+
+    @pytest.mark.parametrize("turn", [np.eye(3), TURN])
+    def test_a_registered_leg_stays_on_its_leg(self, turn):
+        """Two spheres nearly touch. The registered mesh reaches a little into the other sphere."""
+        unit, triangles = sphere_mesh(4)
+        offset = np.array([1.01, 0, 0])
+        vertices = np.vstack([unit - offset, unit + offset])
+        faces = np.vstack([triangles, triangles + len(unit)])
+        target = make_mesh(vertices @ turn.T, faces)
+        shifted = vertices + np.repeat([[0.08, 0, 0], [-0.08, 0, 0]], len(unit), axis=0)
+        source = make_mesh(shifted @ turn.T, faces)
+        found, _ = nearest_surface_points(source.vertices, target)
+        sphere = np.arange(len(vertices)) >= len(unit)
+        assert (sphere != (found.faces >= len(triangles))).sum() > 10
+        facing = nearest_facing_points(source.vertices, source.vertex_normals, found, target)
+        np.testing.assert_array_equal(sphere, facing.faces >= len(triangles))
+        distances = np.linalg.norm(facing.positions(target) - source.vertices, axis=1)
+        assert distances.max() < 0.1
+        # The normals of triangles without a consistent orientation decide nothing.
+        mixed = replace(target, faces=np.where(np.arange(len(faces))[:, None] % 2, faces, faces[:, ::-1]))
+        same = nearest_facing_points(source.vertices, source.vertex_normals, found, mixed)
+        np.testing.assert_array_equal(same.faces, found.faces)
 
     def test_nearest_points_of_single_triangles(self):
         random = np.random.default_rng(0)

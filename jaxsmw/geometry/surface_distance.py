@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import igl
 import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+
+# If more than this share of the nearest triangles face away, the triangles are not oriented consistently.
+_LARGEST_SHARE_AWAY = 0.2
 
 
 def nearest_surface_points(
@@ -60,6 +65,50 @@ class SurfaceTree:
         weights = np.maximum(weights, 0)  # rounding errors can make weights negative
         weights /= weights.sum(axis=1, keepdims=True)
         return SurfacePoints(faces, weights), np.sqrt(np.maximum(np.atleast_1d(squared), 0))
+
+
+def nearest_facing_points(
+    points: Float64[np.ndarray, "p 3"],
+    normals: Float64[np.ndarray, "p 3"],
+    nearest: SurfacePoints,
+    mesh: Mesh,
+) -> SurfacePoints:
+    """Replace nearest points on triangles that face away, such as on the other one of two touching legs.
+
+    A triangle faces away if its normal and the normal at the point in space form an angle above 90 degrees.
+    Such points move to the nearest triangle that faces the same side of the same axis as the normal, if this
+    triangle does not face away. Nothing is replaced if more than 20 % of the triangles face away, because the
+    triangles of the mesh are then not oriented consistently.
+
+    **Arguments:**
+
+    - `points`: positions (p, 3), in the unit and the coordinate system of the mesh.
+    - `normals`: the normals at the positions (p, 3), of any length.
+    - `nearest`: the result of `nearest_surface_points` for the positions.
+    - `mesh`: a `Mesh`.
+
+    **Returns:** A `SurfacePoints` with p points.
+    """
+    of_faces = np.cross(
+        *(mesh.vertices[mesh.faces[:, corner]] - mesh.vertices[mesh.faces[:, 0]] for corner in (1, 2))
+    )
+    away = np.einsum("px,px->p", normals, of_faces[nearest.faces]) < 0
+    faces, weights = nearest.faces.copy(), nearest.weights.copy()
+    if not 0 < away.sum() <= _LARGEST_SHARE_AWAY * len(away):
+        return nearest
+    axes = np.abs(normals).argmax(axis=1)
+    signs = np.sign(np.take_along_axis(normals, axes[:, None], axis=1)[:, 0])
+    for axis in range(3):
+        for sign in (-1, 1):
+            rows = np.flatnonzero(away & (axes == axis) & (signs == sign))
+            facing = np.flatnonzero(sign * of_faces[:, axis] > 0)
+            if not len(rows) or not len(facing):
+                continue
+            found, _ = nearest_surface_points(points[rows], replace(mesh, faces=mesh.faces[facing]))
+            chosen = facing[found.faces]
+            better = np.einsum("px,px->p", normals[rows], of_faces[chosen]) > 0
+            faces[rows[better]], weights[rows[better]] = chosen[better], found.weights[better]
+    return SurfacePoints(faces, weights)
 
 
 def distances_to_surface(points: Float64[np.ndarray, "p 3"], mesh: Mesh) -> Float64[np.ndarray, " p"]:

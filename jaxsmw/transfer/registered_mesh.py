@@ -15,7 +15,7 @@ from scipy.sparse.linalg import cg
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
 from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced
-from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_surface_points
+from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_facing_points, nearest_surface_points
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 from jaxsmw.wording import count_of
@@ -86,8 +86,13 @@ class RegisteredMesh:
 
     @cached_property
     def surface_points(self) -> SurfacePoints:
-        """The nearest point of Y for each vertex of the registered mesh: `SurfacePoints` with m entries."""
-        return self._nearest[0]
+        """The nearest point of Y for each vertex of the registered mesh: `SurfacePoints` with m entries.
+
+        Triangles of Y that face away from a vertex are left out; see `nearest_facing_points`.
+        """
+        hand = np.sign(np.linalg.det(self.similarities.rotations[0]))
+        normals = hand * self.mesh.vertex_normals
+        return nearest_facing_points(self.vertices, normals, self._nearest[0], self.mesh_y)
 
     @cached_property
     def distances(self) -> Float64[np.ndarray, " m"]:
