@@ -196,7 +196,10 @@ def test_landmarks_of_both_meshes_are_the_initial_map(run, pair, tmp_path):
         ("", "nothing to write"),
         ("--landmarks {p}/x.mrk.json", "nothing to write"),
         ("--landmarks-output {t}/l.csv", "--landmarks-output: has no effect without --landmarks"),
-        ("--registered {t}/r.off --landmarks {p}/x.mrk.json", "--landmarks: has no effect without --landmarks-output"),
+        (
+            "--registered {t}/r.off --landmarks {p}/x.mrk.json",
+            "--landmarks: has no effect without --landmarks-output or --report",
+        ),
         ("--registered {t}/r.off --coordinates LPS", "--coordinates: has no effect without --landmarks"),
         ("--registered {t}/r.xyz", "r.xyz: meshes cannot be written"),
         ("--attributes {t}/r", "meshes cannot be written as"),

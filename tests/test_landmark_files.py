@@ -3,6 +3,7 @@
 import codecs
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -420,17 +421,24 @@ def test_single_landmarks_off_the_surface_cause_a_warning():
     positions = mesh.vertices[[0, 50, 100]] + [[0, 0, 0], [0, 0, 0], [0, 0, 9]]
     (warning,) = check_frame(Landmarks(("a", "b", "c"), positions), mesh)
     assert "'c' is " in warning and warning.endswith("% of the diagonal of the mesh.")
+    # Neither frame and no other unit fits, so the message suggests no change.
     elsewhere = Landmarks(("a", "b"), (mesh.vertices + 0.5 * mesh.vertex_normals)[[0, 50]])
-    assert len(check_frame(elsewhere, mesh)) == 2  # neither frame fits, so no change is suggested
+    with pytest.raises(InputError, match="give landmarks of this mesh, in its unit and coordinates"):
+        check_frame(elsewhere, mesh)
 
 
-def test_landmarks_in_another_unit_are_refused():
+@pytest.mark.parametrize("centered", [False, True])
+@pytest.mark.parametrize(("factor", "cure"), [(1000, "0.001"), (0.001, "1000"), (1 / 25.4, "25.4")])
+def test_landmarks_in_another_unit_are_refused(centered, factor, cure):
+    """Landmarks that shrink towards the middle of a centred mesh are inside of the mesh."""
     mesh = shifted_sphere()
-    in_millimetres = Landmarks(("a", "b"), 1000 * mesh.vertices[[0, 50]], name="points.csv")
+    if centered:
+        mesh = replace(mesh, vertices=mesh.vertices - mesh.vertices.mean(axis=0))
+    scaled = Landmarks(("a", "b", "c"), factor * mesh.vertices[[0, 50, 90]], name="points.csv")
     with pytest.raises(
-        InputError, match=r"points.csv: .* but its diagonal is 3.46: give landmarks of this mesh, in its unit"
+        InputError, match=rf"points.csv: .* but its diagonal is 3.46: multiply the positions by {cure},"
     ):
-        check_frame(in_millimetres, mesh)
+        check_frame(scaled, mesh)
 
 
 def test_a_real_skull(shared, tmp_path):

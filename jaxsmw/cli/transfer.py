@@ -179,7 +179,8 @@ def _check(options: argparse.Namespace) -> None:
             "with --landmarks-output FILE."
         )
     refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_output", "coordinates")
-    refuse_without(options, "--landmarks-output", bool(options.landmarks_output), "landmarks")
+    written = options.landmarks_output or options.report
+    refuse_without(options, "--landmarks-output or --report", bool(written), "landmarks")
     if options.map and (given := given_method(options)):
         raise InputError(f"{given[0]} has no effect with --map: give one of the two.")
     if options.map and options.report:
@@ -234,7 +235,8 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
             "same unit."
         )
     # Both checks precede the long computation.
-    check_known_system(options.landmarks_output, landmarks)
+    if options.landmarks_output:
+        check_known_system(options.landmarks_output, landmarks)
     check_frame(landmarks, source.mesh)
     return landmarks
 
@@ -276,7 +278,7 @@ def _transfer_landmarks(
     registered: RegisteredMesh,
     stopwatch: Stopwatch,
 ) -> Landmarks:
-    """Transfer the landmarks, write them, print their expected errors, and return them.
+    """Transfer the landmarks, print their expected errors, write them if requested, and return them.
 
     `expected_error` is the expected error of each match (m,), as a fraction of sqrt(area of Y),
     or None if a map was given.
@@ -289,8 +291,9 @@ def _transfer_landmarks(
     for note in found.notes:
         say(f"note: {note}")
     _show_landmarks(found)
-    write_landmark_file(options.landmarks_output, found.landmarks)
-    report_written(options.landmarks_output)
+    if options.landmarks_output:
+        write_landmark_file(options.landmarks_output, found.landmarks)
+        report_written(options.landmarks_output)
     return found.landmarks
 
 

@@ -19,7 +19,9 @@ from jaxsmw.geometry.surface_distance import bounding_box_diagonal, distances_to
 # the mesh. Landmarks whose mean distance is above `FAR` may be in the wrong coordinate system. The mean
 # distance of landmarks in the right coordinate system is below `NEAR` in all data sets. If the median
 # distance is above `ELSEWHERE`, the landmarks have another unit, or belong to another mesh.
-FAR, NEAR, ELSEWHERE = 0.05, 0.02, 0.25
+FAR, NEAR, ELSEWHERE = 0.05, 0.02, 0.03
+# The factors between usual units of length: metres, centimetres, inches, millimetres and micrometres.
+_UNITS = tuple(factor for unit in (1000.0, 100.0, 10.0, 25.4, 1e6) for factor in (unit, 1 / unit))
 
 # Control characters, line separators, and characters that UTF-8 or XML cannot represent.
 _NOT_IN_NAMES = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\ufffe\uffff]")
@@ -247,7 +249,7 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
 
     **Raises:** `InputError` if the mean distance of the landmarks to the surface is above 5 % of the
     diagonal, but would be below 2 % in the other coordinate system. `InputError` is also raised if the median
-    distance is above 25 % of the diagonal.
+    distance is above 3 % of the diagonal. The message names the factor if another unit explains the distance.
     """
     diagonal = bounding_box_diagonal(mesh)
     distances = distances_to_surface(landmarks.positions, mesh)
@@ -259,14 +261,23 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
     if (usual := float(np.median(distances))) > ELSEWHERE * diagonal:
         raise InputError(
             f"{landmarks.name}: the median distance of the landmarks to the surface of {mesh.name} is "
-            f"{usual:.3g}, but its diagonal is {diagonal:.3g}: give landmarks of this mesh, in its unit and "
-            "coordinates."
+            f"{usual:.3g}, but its diagonal is {diagonal:.3g}: {_cure_of_unit(landmarks, mesh)}."
         )
     return tuple(
         f"{landmarks.name}: the landmark {landmarks.names[i]!a} is {distances[i]:.3g} from the surface of "
         f"{mesh.name}, which is {100 * distances[i] / diagonal:.3g} % of the diagonal of the mesh."
         for i in np.flatnonzero(distances > NEAR * diagonal).tolist()
     )
+
+
+def _cure_of_unit(landmarks: Landmarks, mesh: Mesh) -> str:
+    """Return the cure for landmarks that are far from a surface, which names the factor of a wrong unit."""
+    diagonal = bounding_box_diagonal(mesh)
+    for factor in _UNITS:
+        scaled = factor * landmarks.positions
+        if usable(scaled).all() and distances_to_surface(scaled, mesh).mean() < NEAR * diagonal:
+            return f"multiply the positions by {factor:.4g}, which converts them to the unit of the mesh"
+    return "give landmarks of this mesh, in its unit and coordinates"
 
 
 def _flip_message(landmarks: Landmarks, mesh: Mesh, as_read: float, flipped: float) -> str:
