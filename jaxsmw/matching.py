@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import Future, wait
@@ -268,12 +269,15 @@ def match_prepared(
     start, outcome = candidates[0] if candidates else (starts[0], outcomes[0])
     if len(candidates) > 1:
         assert preset.repair is not None
-        with _step("choice of the initial map", seconds):
+        with _step("expected error", seconds):
             from_shot, from_aligned = (_inconsistency(found(*one)) for one in candidates)
         start, outcome = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
-    with _step("further passes", seconds), one_blas_thread():
+    begin = time.perf_counter()
+    with one_blas_thread():
         outcome = refine_further(start, preset.stages, preset.repair, outcome, history=history)
         jax.block_until_ready(outcome.refinements[-1])
+    if seconds is not None:
+        seconds["refinement"] += time.perf_counter() - begin
     return found(start, outcome)
 
 

@@ -175,7 +175,7 @@ def compilations():
 def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
     """Refinement uses the programs that `match` compiles ahead of time."""
     jax.clear_caches()
-    found = match(*pair[:2], preset=preset, mirror="no")
+    found = match(*pair[:2], preset=preset, init="shot", mirror="no")
     assert compilations.count("jit(refine)") == len(found.preset.stages)
 
 
