@@ -507,7 +507,8 @@ def test_files_of_earlier_meshes_and_options_are_removed(result_directory, direc
     summary["files"] += ["../kept", "registered/..", "maps/../../kept", 3]
     (output / "collection.json").write_text(json.dumps(summary), "utf-8")
     far = tmp_path / "far.csv"
-    write_landmark_file(far, Landmarks(("a",), 1.3 * meshes[1].vertices[:1]))
+    scales = np.array([[1.3], [1.0], [1.0]])
+    write_landmark_file(far, Landmarks(("a", "b", "c"), scales * meshes[1].vertices[:3]))
     outcome = run(
         "collection", directory, "--output", output, *OPTIONS, "--exclude", "shape3.stl", "--suffix", "obj",
         "--landmarks", far, "--landmarks-of", "shape1.off",
