@@ -102,8 +102,8 @@ def refine_further(
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
     The repeated stage and all later stages run `repair.passes` more times. If the shapes differ very much, or
-    if the initial map is `"aligned"`, coarse passes with the levels `repair.coarse_levels` and one usual pass
-    run instead.
+    if the initial map of full shapes is `"aligned"`, coarse passes with the levels `repair.coarse_levels` and
+    one usual pass run instead.
 
     **Arguments:**
 
@@ -120,8 +120,8 @@ def refine_further(
         return outcome
     runner, judge = _runner_and_judge(prepared, stages, repair, history)
     change = judge.area_change(outcome)
-    # Rigidly aligned shapes differ in form, not in pose, and their map has the details of the alignment.
-    aligned = isinstance(prepared.init, str) and prepared.init == "aligned"
+    # Rigidly aligned full shapes differ in form, not in pose, and their map has the details of the alignment.
+    aligned = isinstance(prepared.init, str) and prepared.init == "aligned" and not prepared.pair.partial
     if change < repair.non_isometric and not aligned:
         return outcome
     runners = [runner] * repair.passes
