@@ -42,6 +42,7 @@ from jaxsmw.geometry import farthest_point_samples, nearest_surface_points
 from jaxsmw.geometry.alignment import align_rigidly
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal
 from jaxsmw.io import Landmarks, read_landmark_file
+from jaxsmw.runtime.compilation import release_programs
 from jaxsmw.runtime.journal import Journal
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import RegisteredMesh, transfer_landmarks
@@ -71,6 +72,7 @@ def main() -> None:
         journal = Journal(options.output / f"{name}.csv", ("source", "target"))
         for source, target in _draw(options.directory / name, options.pairs):
             if (source.stem, target.stem) not in journal:
+                release_programs()
                 row = {"source": source.stem, "target": target.stem, **measure(source, target)}
                 journal.append([row])
                 print(row, flush=True)
