@@ -244,7 +244,7 @@ def test_normals_are_zero_where_they_cancel():
         [[0.1, 0.2, 0.3], [1, 0, 0.5], [0, 1, 0.7], [1, 0, 0.5], [0, 1, 0.7], [0.3, 0.7, 0.64]]
     )
     mesh = make_mesh(corners, [[0, 1, 2], [0, 5, 3], [0, 4, 5]])
-    assert mesh._area_vectors.sum(axis=0).any(), "without rounding errors the test is trivial"
+    assert mesh.area_vectors.sum(axis=0).any(), "without rounding errors the test is trivial"
     assert (mesh.vertex_normals[0] == 0).all()
     assert np.allclose(np.linalg.norm(mesh.vertex_normals[1:], axis=1), 1)
 

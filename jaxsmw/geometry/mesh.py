@@ -85,15 +85,15 @@ class Mesh:
         return np.delete(np.arange(len(self.faces) + len(self.dropped_faces)), self.dropped_faces)
 
     @cached_property
-    def _area_vectors(self) -> Float64[np.ndarray, "f 3"]:
-        """The normal of each face, with twice the area of the face as its length."""
+    def area_vectors(self) -> Float64[np.ndarray, "f 3"]:
+        """The normal of each face (f, 3), with twice the area of the face as its length."""
         corners = self.vertices[self.faces]
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
     @cached_property
     def face_areas(self) -> Float64[np.ndarray, " f"]:
         """The areas of the faces (f,), in the squared unit of the vertices."""
-        return 0.5 * np.linalg.norm(self._area_vectors, axis=1)
+        return 0.5 * np.linalg.norm(self.area_vectors, axis=1)
 
     @cached_property
     def area(self) -> float:
@@ -124,7 +124,7 @@ class Mesh:
 
         The normal is 0 where the normals of the faces cancel, and at vertices without faces.
         """
-        total = np.stack([self._sum_at_vertices(component) for component in self._area_vectors.T], axis=1)
+        total = np.stack([self._sum_at_vertices(component) for component in self.area_vectors.T], axis=1)
         length = np.linalg.norm(total, axis=1, keepdims=True)
         # If the normals of the faces do not cancel, `length` is about six times the vertex area.
         defined = length > 1e-10 * 6 * self.vertex_areas[:, None]

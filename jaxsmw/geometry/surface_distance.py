@@ -89,13 +89,11 @@ def nearest_facing_points(
 
     **Returns:** A `SurfacePoints` with p points.
     """
-    of_faces = np.cross(
-        *(mesh.vertices[mesh.faces[:, corner]] - mesh.vertices[mesh.faces[:, 0]] for corner in (1, 2))
-    )
+    of_faces = mesh.area_vectors
     away = np.einsum("px,px->p", normals, of_faces[nearest.faces]) < 0
-    faces, weights = nearest.faces.copy(), nearest.weights.copy()
     if not 0 < away.sum() <= _LARGEST_SHARE_AWAY * len(away):
         return nearest
+    faces, weights = nearest.faces.copy(), nearest.weights.copy()
     axes = np.abs(normals).argmax(axis=1)
     signs = np.sign(np.take_along_axis(normals, axes[:, None], axis=1)[:, 0])
     for axis in range(3):

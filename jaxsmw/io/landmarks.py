@@ -261,7 +261,7 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
     if (usual := float(np.median(distances))) > ELSEWHERE * diagonal:
         raise InputError(
             f"{landmarks.name}: the median distance of the landmarks to the surface of {mesh.name} is "
-            f"{usual:.3g}, but its diagonal is {diagonal:.3g}: {_cure_of_unit(landmarks, mesh)}."
+            f"{usual:.3g}, but its diagonal is {diagonal:.3g}: {_cure_of_unit(landmarks, mesh, diagonal)}."
         )
     return tuple(
         f"{landmarks.name}: the landmark {landmarks.names[i]!a} is {distances[i]:.3g} from the surface of "
@@ -270,9 +270,8 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
     )
 
 
-def _cure_of_unit(landmarks: Landmarks, mesh: Mesh) -> str:
+def _cure_of_unit(landmarks: Landmarks, mesh: Mesh, diagonal: float) -> str:
     """Return the cure for landmarks that are far from a surface, which names the factor of a wrong unit."""
-    diagonal = bounding_box_diagonal(mesh)
     for factor in _UNITS:
         scaled = factor * landmarks.positions
         if usable(scaled).all() and distances_to_surface(scaled, mesh).mean() < NEAR * diagonal:
