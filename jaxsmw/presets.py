@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import get_args
 
 from jaxsmw.choices import PresetName
@@ -26,38 +27,50 @@ class Preset:
       map of the previous stage.
     - `repair`: the `RepairSettings` that determine when and how a map is repaired; None (the default) for no
       repair.
+    - `large_stages`: the stages that run instead of `stages` if both meshes have at least 15 000 vertices;
+      None (the default) to run `stages` on meshes of any size.
 
     **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage has the
-    position `repair.stage`. `InputError` is also raised for the stage that repair repeats: if its refiner has
-    no levels, or if the stage has fewer samples than the largest of `repair.fallback_levels`.
+    position `repair.stage`. `InputError` is also raised if the last stage ends on samples, or if the stage
+    after a stage that ends on samples does not start on these samples. `InputError` is also raised for the
+    stage that repair repeats: if its refiner has no levels, or if the stage has fewer samples than the
+    largest of `repair.fallback_levels`.
     """
 
     stages: tuple[Stage, ...]
     repair: RepairSettings | None = None
+    large_stages: tuple[Stage, ...] | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.stages, tuple) or not all(isinstance(stage, Stage) for stage in self.stages):
-            raise InputError(f"stages is {self.stages!r}: give a tuple of stages.")
-        if not self.stages:
-            raise InputError("a preset without stages cannot refine a map: give at least one stage.")
-        if self.repair is None:
-            return
-        if not isinstance(self.repair, RepairSettings):
+        if self.repair is not None and not isinstance(self.repair, RepairSettings):
             raise InputError(f"repair is {self.repair!r}: give RepairSettings or None.")
-        if not 0 <= self.repair.stage < len(self.stages):
-            raise InputError(
-                f"repair repeats stage {self.repair.stage}, but the stages are 0 to {len(self.stages) - 1}: "
-                "give RepairSettings(stage=...) with one of these numbers."
-            )
-        self.stages[self.repair.stage].with_levels(self.repair.fallback_levels)
+        _check_stages("stages", self.stages, self.repair)
+        if self.large_stages is not None:
+            _check_stages("large_stages", self.large_stages, self.repair)
 
     def fitted(self, number_of_vertices: int) -> Preset:
-        """Return the preset with every stage adapted to a small mesh; see `Stage.fitted`."""
-        return replace(self, stages=tuple(stage.fitted(number_of_vertices) for stage in self.stages))
+        """Return the preset for meshes of a given size.
+
+        The preset has the `large_stages` for a large number of vertices. Every stage is adapted to a small
+        mesh; see `Stage.fitted`.
+
+        **Arguments:**
+
+        - `number_of_vertices`: the number of referenced vertices of the smaller mesh.
+        """
+        stages = self.stages
+        if self.large_stages is not None and number_of_vertices >= _LARGE_FROM:
+            stages = self.large_stages
+        return Preset(tuple(stage.fitted(number_of_vertices) for stage in stages), self.repair)
 
     def without_descriptors(self) -> Preset:
         """Return the preset with stages that use no descriptors."""
-        return replace(self, stages=tuple(stage.without_descriptors() for stage in self.stages))
+
+        def without(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+            return tuple(stage.without_descriptors() for stage in stages)
+
+        large = None if self.large_stages is None else without(self.large_stages)
+        return replace(self, stages=without(self.stages), large_stages=large)
 
     @property
     def number_of_eigenvectors(self) -> int:
@@ -75,18 +88,57 @@ class Preset:
         return max(stage.number_of_samples or 0 for stage in self.stages)
 
 
+# The number of vertices of the smaller mesh from which the `large_stages` of a preset run.
+_LARGE_FROM = 15_000
+
+
+def _check_stages(name: str, stages: tuple[Stage, ...], repair: RepairSettings | None) -> None:
+    """Raise `InputError` if stages cannot run one after another, or if repair cannot repeat its stage."""
+    if not isinstance(stages, tuple) or not all(isinstance(stage, Stage) for stage in stages):
+        raise InputError(f"{name} is {stages!r}: give a tuple of stages.")
+    if not stages:
+        raise InputError("a preset without stages cannot refine a map: give at least one stage.")
+    if stages[-1].ends_on_samples:
+        raise InputError("the last stage ends on samples, but it must match all vertices: use the default.")
+    for position, (stage, following) in enumerate(pairwise(stages), 1):
+        if stage.ends_on_samples and not (
+            following.starts_on_samples
+            and (following.number_of_samples or 0) <= (stage.number_of_samples or 0)
+        ):
+            raise InputError(
+                f"stage {position - 1} matches only {stage.number_of_samples} samples: let stage {position} "
+                "start on at most as many samples (starts_on_samples=True)."
+            )
+    if repair is None:
+        return
+    if not 0 <= repair.stage < len(stages):
+        raise InputError(
+            f"repair repeats stage {repair.stage}, but the stages are 0 to {len(stages) - 1}: "
+            "give RepairSettings(stage=...) with one of these numbers."
+        )
+    stages[repair.stage].with_levels(repair.fallback_levels)
+
+
+_WAVELETS = Stage()
+_REGRESSION = Stage(
+    FeatureRegression(levels=(20, 20, 26, 35)), number_of_descriptors=60, number_of_samples=1000
+)
+_REGISTRATION = Stage(
+    Registration(levels=(35, 60, 100, 200)), number_of_descriptors=30, number_of_samples=1000
+)
+
 PRESETS: dict[PresetName, Preset] = {
     "fast": Preset((Stage(number_of_samples=500),)),
     "paper": Preset((Stage(),)),
     "accurate": Preset(
-        (
-            Stage(),
-            Stage(
-                FeatureRegression(levels=(20, 20, 26, 35)), number_of_descriptors=60, number_of_samples=1000
-            ),
-            Stage(Registration(levels=(35, 60, 100, 200)), number_of_descriptors=30, number_of_samples=1000),
-        ),
+        (_WAVELETS, _REGRESSION, _REGISTRATION),
         RepairSettings(stage=1),
+        # On large meshes, searches that match all vertices take most of the time.
+        large_stages=(
+            replace(_WAVELETS, number_of_samples=1000),
+            replace(_REGRESSION, ends_on_samples=True),
+            replace(_REGISTRATION, starts_on_samples=True),
+        ),
     ),
 }
 """A dictionary from the names of the presets of `jaxsmw.match` to the presets, each a `Preset`.
@@ -94,8 +146,9 @@ PRESETS: dict[PresetName, Preset] = {
 `"paper"` has the settings of the MWP paper: one stage of `WaveletPreservation` with 100 eigenvectors and 3
 iterations. `"fast"` has the same stage with iterations on 500 samples of each shape, as in the fast variant
 of the MWP authors' program. `"accurate"` has three stages and repair: the stage of `"paper"`,
-`FeatureRegression` with up to 35 eigenvectors, and `Registration` with up to 200 eigenvectors.
-`docs/accuracy.md` reports the errors of `"accurate"`.
+`FeatureRegression` with up to 35 eigenvectors, and `Registration` with up to 200 eigenvectors. If both
+meshes have at least 15 000 vertices, the first stage of `"accurate"` iterates on 1000 samples. The third
+stage then starts from the matches of 1000 samples. `docs/accuracy.md` reports the errors of `"accurate"`.
 """
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS
-from jaxsmw.core.refinement import Refinement, refine
+from jaxsmw.core.refinement import Refinement, check_samples_use, refine
 from jaxsmw.core.refiner import Refiner, Samples
 from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -43,9 +43,15 @@ class Stage:
     - `number_of_samples`: the number of samples of each shape on which the refiner iterates. This number must
       be at least the number of eigenvectors. The final nearest-neighbour search then matches all vertices.
       None, the default, means that all iterations use all vertices.
+    - `starts_on_samples`: whether the first functional map uses the matches of the samples only; False by
+      default. A stage after a stage that ends on samples must start on samples.
+    - `ends_on_samples`: whether the stage matches only the samples, for the next stage; False by default. The
+      last stage must match all vertices.
     - `stop_when_unchanged`: whether refinement stops when an iteration changes no match; False by default.
 
     **Raises:** `InputError` if `refiner` is not a `Refiner`, or if there are fewer samples than eigenvectors.
+    `InputError` is also raised if the stage should start or end on samples, but has no samples or has a
+    refiner that cannot do this, such as `WaveletPreservation`.
     `InputError` is also raised if a number of eigenvectors, iterations, descriptors or samples is not an
     integer, is out of range or contradicts the refiner's levels.
     """
@@ -55,6 +61,8 @@ class Stage:
     iterations: int
     number_of_descriptors: int
     number_of_samples: int | None
+    starts_on_samples: bool
+    ends_on_samples: bool
     stop_when_unchanged: bool
 
     def __init__(
@@ -65,6 +73,8 @@ class Stage:
         iterations: int | None = None,
         number_of_descriptors: int = 0,
         number_of_samples: int | None = None,
+        starts_on_samples: bool = False,
+        ends_on_samples: bool = False,
         stop_when_unchanged: bool = False,
     ) -> None:
         if not isinstance(refiner, Refiner):
@@ -82,7 +92,17 @@ class Stage:
         if number_of_samples is not None:
             sizes["number_of_samples"] = number_of_samples
         checked = {name: check_whole_number(name, value) for name, value in sizes.items()}
-        others = {"refiner": refiner, "number_of_samples": None, "stop_when_unchanged": stop_when_unchanged}
+        try:
+            check_samples_use(refiner, number_of_samples is not None, starts_on_samples, ends_on_samples)
+        except ValueError as error:
+            raise InputError(f"{error}.") from None
+        others = {
+            "refiner": refiner,
+            "number_of_samples": None,
+            "starts_on_samples": starts_on_samples,
+            "ends_on_samples": ends_on_samples,
+            "stop_when_unchanged": stop_when_unchanged,
+        }
         for name, value in (others | checked).items():
             object.__setattr__(self, name, value)
         self._check_sizes()
@@ -105,10 +125,12 @@ class Stage:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The refiner, the iterations and `stop_when_unchanged`, as keyword arguments of `jaxsmw.refine`."""
+        """The refiner, the iterations and the Boolean attributes, as keyword arguments of `jaxsmw.refine`."""
         return {
             "refiner": self.refiner,
             "iterations": self.iterations,
+            "starts_on_samples": self.starts_on_samples,
+            "ends_on_samples": self.ends_on_samples,
             "stop_when_unchanged": self.stop_when_unchanged,
         }
 
@@ -146,16 +168,14 @@ class Stage:
 
         - `number_of_vertices`: the number of referenced vertices of the smaller mesh.
         """
-        most = max(1, number_of_vertices // 2)
-        samples = self.number_of_samples
-        if samples is not None and samples >= number_of_vertices:
-            samples = None
+        most, fitted = max(1, number_of_vertices // 2), self
+        if self.number_of_samples is not None and self.number_of_samples >= number_of_vertices:
+            fitted = replace(self, number_of_samples=None, starts_on_samples=False, ends_on_samples=False)
         if self.number_of_eigenvectors <= most:
-            return replace(self, number_of_samples=samples)
+            return fitted
         if self.refiner.levels:
-            stage = self.with_levels(tuple(min(level, most) for level in self.refiner.levels))
-            return replace(stage, number_of_samples=samples)
-        return replace(self, number_of_eigenvectors=most, number_of_samples=samples)
+            return fitted.with_levels(tuple(min(level, most) for level in self.refiner.levels))
+        return replace(fitted, number_of_eigenvectors=most)
 
     def view(
         self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
@@ -195,14 +215,16 @@ class Stage:
         **Arguments:**
 
         - `spectrum_x`, `spectrum_y`: the spectra that `view` returns, of X (m vertices) and Y (n vertices).
-        - `pointwise_map`: the map from which the stage starts (m,), as 0-based vertices of Y.
+        - `pointwise_map`: the map from which the stage starts (m,), as 0-based vertices of Y. If the stage
+          starts on samples, the entries of other vertices are ignored.
         - `samples`: the samples of X and of Y in farthest-point order, as a pair of integer arrays; None if
           the stage uses no samples. Each array contains at least `number_of_samples` vertices.
         - `partial`: whether one of the shapes is a partial shape.
         - `history`: whether to record a `History`; see `jaxsmw.refine`.
 
-        **Returns:** A `Refinement`, whose attribute `pointwise_map` (m,) is the refined map. Its attribute
-        `result` is `RESULTS.successful`, or another member of `RESULTS` after a failure.
+        **Returns:** A `Refinement`, whose attribute `pointwise_map` (m,) is the refined map. If the stage
+        ends on samples, the map contains -1 for all other vertices. The attribute `result` is
+        `RESULTS.successful`, or another member of `RESULTS` after a failure.
         """
         arrays, options = self._arguments(spectrum_x, spectrum_y, pointwise_map, samples)
         settings = {**options, **self.settings, "partial": partial, "history": history}

@@ -105,6 +105,8 @@ def refine(
     refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
     iterations: int = ITERATIONS,
     samples: Samples | None = None,
+    starts_on_samples: bool = False,
+    ends_on_samples: bool = False,
     partial: bool = False,
     stop_when_unchanged: bool = False,
     history: bool = False,
@@ -119,7 +121,9 @@ def refine(
     If samples are given, only the first and the last step use all vertices. The first step computes a
     functional map from the initial map of all vertices. The last step recovers the refined map of all
     vertices. All steps in between use only the samples. The fast variant of the MWP authors' program also
-    iterates on samples.
+    iterates on samples. With `starts_on_samples` or `ends_on_samples`, the first or the last step also uses
+    only the samples. A call that ends on samples and a second call that starts on the same samples then avoid
+    a search that matches all vertices in between.
 
     **Arguments:**
 
@@ -132,6 +136,10 @@ def refine(
     - `samples`: a tuple of two integer arrays: the vertices of X (s_x,) and of Y (s_y,) on which the
       refinement iterates. The samples should be evenly spread and outnumber the eigenvectors. With None, all
       iterations use all vertices.
+    - `starts_on_samples`: whether the first functional map uses the initial map at the samples only. The
+      entries of the other vertices of X are then ignored.
+    - `ends_on_samples`: whether refinement ends without matching all vertices. The refined map then contains
+      -1 for each vertex of X that is not a sample.
     - `partial`: whether one shape is a part of the other. If True, both shapes must have the same unit of
       length.
     - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. Under `jax.vmap`,
@@ -143,30 +151,42 @@ def refine(
     failure, all entries of `pointwise_map` are -1.
 
     **Raises:** `ValueError` if `iterations` is below 1, the initial map does not have shape (m,), `samples`
-    is not a pair, or the two spectra have different float types. `TypeError` if `iterations` or the entries
-    of the initial map are not integers, or if another argument has the wrong type.
+    is not a pair, or the two spectra have different float types. `ValueError` is also raised if refinement
+    should start or end on samples, but there are no samples or the refiner cannot do this. `TypeError` if
+    `iterations` or the entries of the initial map are not integers, or if another argument has the wrong
+    type.
     """
     _check_arguments(spectrum_x, spectrum_y, pointwise_map, refiner, samples)
+    check_samples_use(refiner, samples is not None, starts_on_samples, ends_on_samples)
     pointwise_map = pointwise_map.astype(jnp.int32)
     problem = Problem(spectrum_x, spectrum_y, samples, partial)
     prepared = in_full = refiner.prepare(dataclasses.replace(problem, samples=None))
-    first_map = pointwise_map
+    used, first_map = spectrum_x.mask, pointwise_map
     if samples is not None:
         prepared = refiner.prepare(problem)
         first_map = jnp.full(samples[0].shape, -1, jnp.int32)
     loop = _Loop(refiner, prepared, stop_when_unchanged, history, keeps_maps=history and samples is None)
-    progress = loop.init(in_full, pointwise_map, first_map)
-    if samples is None:
+    if samples is not None and starts_on_samples:
+        used = used & jnp.zeros_like(used).at[samples[0]].set(True)
+        first_map = pointwise_map[samples[0]]
+        progress = loop.init(prepared, first_map, first_map)
+    else:
+        progress = loop.init(in_full, pointwise_map, first_map)
+    if samples is None or ends_on_samples:
         # The last search is a part of the loop. Outside the loop, the search would have to be compiled a
         # second time, and a search takes longer to compile than any other part of the program.
         is_last = jnp.arange(iterations) == iterations - 1
         progress, records = lax.scan(loop.step, progress, is_last)
         refined = progress.pointwise_map
+        if samples is not None:
+            refined = jnp.full(pointwise_map.shape, -1, jnp.int32).at[samples[0]].set(refined)
     else:
         progress, records = lax.scan(loop.step, progress, jnp.zeros(iterations - 1, bool))
         refined, _, objective = loop.search(in_full, progress.state, pointwise_map)
         records = records.completed(progress.energy, objective)
-    result = diagnose(spectrum_x, spectrum_y, pointwise_map, progress.result)
+    if samples is not None and not starts_on_samples:
+        records = records.without_first_change()
+    result = diagnose(spectrum_x, spectrum_y, pointwise_map, progress.result, used)
     successful = result == RESULTS.successful
     return Refinement(
         jnp.where(successful, refined, -1),
@@ -203,16 +223,19 @@ class _Record(NamedTuple):
     def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
         """Append the final search of all vertices to the record of a refinement on samples.
 
-        The first and the last map cannot be compared with an earlier map of the same vertices, so their
-        entries in `changed` become NaN.
+        The last map cannot be compared with an earlier map of the same vertices, so its entry in `changed` is
+        NaN.
         """
-        undefined = jnp.asarray(jnp.nan, self.changed.dtype)
         return _Record(
-            jnp.append(self.changed.at[:1].set(undefined), undefined),
+            jnp.append(self.changed, jnp.asarray(jnp.nan, self.changed.dtype)),
             jnp.append(self.energy, energy),
             jnp.append(self.objective, objective),
             None,
         )
+
+    def without_first_change(self) -> _Record:
+        """Return the record of a refinement whose first map of samples has no earlier map to compare with."""
+        return self._replace(changed=self.changed.at[:1].set(jnp.nan))
 
     def history(self, successful: Bool[Array, ""]) -> History:
         """Return the `History`. If the refinement failed, all entries of its pointwise maps are -1."""
@@ -339,6 +362,25 @@ def _check_arguments(
         )
 
 
+def check_samples_use(refiner: Refiner, sampled: bool, starts: bool, ends: bool) -> None:
+    """Check the arguments `starts_on_samples` and `ends_on_samples` of `refine`.
+
+    **Raises:** `ValueError` if one of them is True, but there are no samples or the refiner matches samples
+    of X with samples of Y.
+    """
+    if not (starts or ends):
+        return
+    if not sampled:
+        raise ValueError(
+            "refinement cannot start or end on samples, because there are no samples: give samples"
+        )
+    if not refiner.matches_samples_with_all:
+        raise ValueError(
+            f"{type(refiner).__name__} matches samples of X with samples of Y, so refinement cannot start or "
+            "end on samples: use FeatureRegression or Registration"
+        )
+
+
 def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
     """Check that both arguments are spectra and have the same float type.
 
@@ -368,7 +410,11 @@ def checked(state: State, result: RESULTS) -> RESULTS:
 
 
 def diagnose(
-    spectrum_x: Spectrum, spectrum_y: Spectrum, matches: Int[Array, "m ..."] | None, result: RESULTS
+    spectrum_x: Spectrum,
+    spectrum_y: Spectrum,
+    matches: Int[Array, "m ..."] | None,
+    result: RESULTS,
+    used: Bool[Array, " m"] | None = None,
 ) -> RESULTS:
     """Check the inputs of a refinement, and return the status code of the refinement.
 
@@ -381,11 +427,13 @@ def diagnose(
     - `matches`: the vertices of Y in the initial map, (m, ...), one or several per vertex of X; None for a
       dense soft map, which contains no vertex indices.
     - `result`: the status code of the refinement loop.
+    - `used`: a mask of the vertices of X whose matches must be valid (m,). The default is the mask of X.
     """
     if matches is not None:
         vertices_y = spectrum_y.mask.shape[0]
         in_range = (matches >= 0) & (matches < vertices_y)
         valid = in_range & spectrum_y.mask[jnp.clip(matches, 0, vertices_y - 1)]
         valid = jnp.all(valid.reshape(valid.shape[0], -1), axis=1)
-        result = where(jnp.all(valid | ~spectrum_x.mask), result, RESULTS.invalid_initial_map)
+        checked_vertices = spectrum_x.mask if used is None else used
+        result = where(jnp.all(valid | ~checked_vertices), result, RESULTS.invalid_initial_map)
     return where(all_finite((spectrum_x, spectrum_y)), result, RESULTS.nonfinite_spectrum)

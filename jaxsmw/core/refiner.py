@@ -111,7 +111,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
       array. `jaxsmw.refine` stores this quantity in `History.energy`.
 
     **Methods that a subclass can override:** `embeddings`, `objective` and `is_settled`, and the properties
-    `levels` and `convention`.
+    `levels`, `convention` and `matches_samples_with_all`.
     """
 
     @abc.abstractmethod
@@ -151,6 +151,15 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         The map sends each vertex of Y to the nearest vertex of X in the `embeddings`. `prepared` must be the
         result of `prepare` for a problem without samples.
         """
+
+    @property
+    def matches_samples_with_all(self) -> bool:
+        """Whether `recover` matches samples of X with all vertices of Y. If False, it uses samples of Y.
+
+        If True, `update` and `recover` use the indices of Y's vertices, also on samples. If False (the
+        default), they use positions in the list of Y's samples.
+        """
+        return False
 
     @abc.abstractmethod
     def energy(self, prepared: PreparedT, state: StateT, pointwise_map: Int[Array, " m"]) -> Float[Array, ""]:

@@ -82,6 +82,8 @@ def refine_pairs(
     refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
     iterations: int = ITERATIONS,
     samples: Sequence[Int[Array, " _"]] | None = None,
+    starts_on_samples: bool = False,
+    ends_on_samples: bool = False,
     partial: bool = False,
     stop_when_unchanged: bool = False,
     history: bool = False,
@@ -111,6 +113,8 @@ def refine_pairs(
     - `iterations`: the number of iterations, an integer of at least 1.
     - `samples`: for each shape, an integer array (s,) of the vertices on which the refiner iterates. The
       number s must be the same for all shapes. If None, all iterations use all vertices.
+    - `starts_on_samples`, `ends_on_samples`: whether the first and the last step of each refinement use only
+      the samples; see `refine`.
     - `partial`: whether one shape of each pair is a partial shape and the other shape is the full shape. If
       True, both shapes must have the same unit of length.
     - `stop_when_unchanged`: whether to stop the refinement of a pair when an iteration changes no match.
@@ -139,7 +143,12 @@ def refine_pairs(
     if batch_size is not None and batch_size < 1:
         raise InputError(f"batch_size is {batch_size}, but a batch needs at least 1 pair")
     settings = _Settings(
-        iterations=iterations, partial=partial, stop_when_unchanged=stop_when_unchanged, history=history
+        iterations=iterations,
+        starts_on_samples=starts_on_samples,
+        ends_on_samples=ends_on_samples,
+        partial=partial,
+        stop_when_unchanged=stop_when_unchanged,
+        history=history,
     )
     devices = jax.devices() if devices is None else devices
     mesh = Mesh(np.array(devices), ("pairs",))
@@ -215,6 +224,8 @@ class _Settings(TypedDict):
     """The arguments of `refine` that are the same for all pairs."""
 
     iterations: int
+    starts_on_samples: bool
+    ends_on_samples: bool
     partial: bool
     stop_when_unchanged: bool
     history: bool

@@ -67,6 +67,11 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
         if any(level < 1 for level in self.levels):
             raise ValueError(f"the levels are {self.levels}, but each level needs at least 1 eigenvector")
 
+    @property
+    def matches_samples_with_all(self) -> bool:
+        """True: samples of X are matched with all vertices of Y."""
+        return True
+
     def active_eigenvectors(
         self, prepared: PreparedT, iteration: Int32[Array, ""]
     ) -> tuple[Bool[Array, " k_x"], Bool[Array, " k_y"]]:
