@@ -13,6 +13,7 @@ from synthetic import random_spectrum
 
 from jaxsmw.core.banks import CubicSpline
 from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
@@ -77,6 +78,14 @@ def test_samples_and_early_stops_give_the_results_of_single_pairs():
         x, y = PAIRS[position]
         alone = refine(spectra[x], spectra[y], starts[position], samples=(samples[x], samples[y]))
         np.testing.assert_array_equal(refined.pointwise_map, alone.pointwise_map)
+    options = dict(refiner=FeatureRegression(), starts_on_samples=True, ends_on_samples=True)
+    found = refine_pairs(spectra, some, its_starts, samples=samples, batch_size=2, **options)
+    for position, refined in found:
+        x, y = PAIRS[position]
+        both = samples[x], samples[y]
+        alone = refine(spectra[x], spectra[y], starts[position], samples=both, **options)
+        np.testing.assert_array_equal(refined.pointwise_map, alone.pointwise_map)
+        assert set(np.flatnonzero(refined.pointwise_map >= 0)) == set(np.asarray(samples[x]).tolist())
     options = dict(iterations=30, stop_when_unchanged=True)
     for position, refined in refine_pairs(spectra, some, its_starts, batch_size=4, **options):
         x, y = PAIRS[position]

@@ -96,6 +96,16 @@ def test_a_map_replaces_the_match(run, pair, tmp_path):
     assert np.quantile(apart, 0.99) < 0.02 * np.sqrt(target.area)
 
 
+def test_a_map_of_other_meshes_is_reported(run, pair, tmp_path):
+    truth = np.loadtxt(pair / "truth.txt", dtype=int)
+    np.savetxt(tmp_path / "other.txt", np.random.default_rng(0).permutation(truth), fmt="%d")
+    files = "transfer", pair / "x.off", pair / "y.ply", "--registered", tmp_path / "r.off", "--map"
+    outcome = run(*files, tmp_path / "other.txt")
+    assert outcome.code == 0, outcome.errors
+    assert "flipped, so the map is probably wrong: check that" in outcome.errors
+    assert "warning" not in run(*files, pair / "truth.txt").errors
+
+
 def test_the_report_shows_a_registered_mesh_that_is_computed_once(run, pair, tmp_path, monkeypatch):
     calls = []
     for name in ("surface_points", "registered_mesh"):
@@ -250,15 +260,19 @@ def test_what_cannot_be_used_is_refused(run, pair, tmp_path, arguments, fault):
         ),
         ("demo --output {t}/d --init landmarks:a.fcsv", "a.fcsv: contains landmarks of one mesh only"),
         ("match {m} --output m --init landmarks:a.PP", "a.PP: contains landmarks of one mesh only"),
+        ("match {m} --output m --init landmarks:{p}/x.csv", "x.csv: contains landmarks of one mesh only"),
+        ("transfer {m} --attributes a.stl", "a.stl: STL files contain only triangles"),
         ("match {m} --output m --init landmarks:a.mps", "a.mps: contains landmarks of one mesh only"),
         ("match {m} --output {t}/m.fcsv", "m.fcsv: maps are written as text, .npy or .mat, not as .fcsv"),
         # A table may contain vertices of both meshes, so the command goes on and reads a mesh.
         ("match {m} --output {t}/m --init landmarks:a.csv", "missing_x.off"),
     ],
 )
-def test_suffixes_of_landmark_files_are_checked_before_the_meshes_are_read(run, tmp_path, arguments, fault):
+def test_suffixes_of_landmark_files_are_checked_before_the_meshes_are_read(
+    run, pair, tmp_path, arguments, fault
+):
     # Both meshes are missing, so a command that reads them first names a mesh.
-    outcome = run(*arguments.format(m="missing_x.off missing_y.off", t=tmp_path).split(), "--quiet")
+    outcome = run(*arguments.format(m="missing_x.off missing_y.off", p=pair, t=tmp_path).split(), "--quiet")
     assert_refused(outcome, naming=fault)
     assert list(tmp_path.iterdir()) == []
 

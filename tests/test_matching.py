@@ -32,7 +32,7 @@ from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.initial_maps import initial_map
 from jaxsmw.matching import match
 from jaxsmw.pair import Pair, paired_spectra
-from jaxsmw.presets import choose_preset
+from jaxsmw.presets import PRESETS, Preset, choose_preset
 from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.runtime import threads as threads_module
 from jaxsmw.runtime.compilation import compiled
@@ -171,7 +171,11 @@ def compilations():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("preset", ["fast", "accurate", replace(STAGE, stop_when_unchanged=True)], ids=str)
+@pytest.mark.parametrize(
+    "preset",
+    ["fast", "accurate", PRESETS["accurate"].large_stages, replace(STAGE, stop_when_unchanged=True)],
+    ids=["fast", "accurate", "large", "stopped"],
+)
 def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
     """Refinement uses the programs that `match` compiles ahead of time."""
     jax.clear_caches()
@@ -484,6 +488,27 @@ def test_presets_match_a_copy_accurately(pair, usual):
     points = accurate.surface_points()
     distances = np.linalg.norm(points.positions(mesh_y) - mesh_y.vertices[truth], axis=1)
     assert np.median(distances) < 0.01 * mesh_y.area**0.5
+
+
+def test_large_meshes_have_stages_of_their_own():
+    accurate, large = PRESETS["accurate"], PRESETS["accurate"].fitted(15_000).stages
+    assert accurate.fitted(14_999).stages == accurate.stages != large == accurate.large_stages
+    assert large[1].ends_on_samples and large[2].starts_on_samples
+    assert large[0].number_of_samples == 1000 and accurate.stages[0].number_of_samples is None
+    assert accurate.without_descriptors().fitted(15_000).number_of_descriptors == 0
+    small = replace(accurate, stages=large).fitted(900).stages
+    assert not any(
+        stage.starts_on_samples or stage.ends_on_samples or stage.number_of_samples for stage in small
+    )
+
+
+@pytest.mark.slow
+def test_the_stages_for_large_meshes_are_as_accurate(pair, usual):
+    mesh_x, mesh_y, truth = pair
+    preset = Preset(PRESETS["accurate"].large_stages)
+    found = match(mesh_x, mesh_y, preset=preset)
+    assert mean_error(mesh_y, found.pointwise_map, truth) < 0.002
+    assert found.iterations == 3 + 4 + 4 and (found.pointwise_map >= 0).all()
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import equinox as eqx
@@ -262,6 +263,61 @@ def test_refinement_iterates_on_samples_and_ends_on_all_vertices(pair):
     assert refined.history.pointwise_maps is None
     with pytest.raises((ValueError, TypeCheckError), match="samples"):
         refine(x, y, initial_map, samples=(samples_x,))
+
+
+def test_refinement_can_start_and_end_on_samples(pair):
+    x, y, initial_map, _ = pair
+    generator = np.random.default_rng(1)
+    samples = tuple(jnp.asarray(generator.choice(M, 60, replace=False)) for _ in range(2))
+    refiner = FeatureRegression((4, 8, K))
+    prepared = refiner.prepare(Problem(x, y, samples))
+    maps, state = [initial_map[samples[0]]], None
+    for _ in range(3):
+        state, _ = refiner.update(prepared, maps[-1], state)
+        maps.append(refiner.recover(prepared, state))
+    options = dict(refiner=refiner, iterations=3, samples=samples, starts_on_samples=True, history=True)
+    others = np.setdiff1d(np.arange(M), samples[0])
+    # The entries of other vertices may be missing.
+    refined = refine(x, y, initial_map.at[others].set(-1), **options)
+    np.testing.assert_allclose(refined.functional_map, state.functional_map, atol=1e-12)
+    changed = [np.mean(after != before) for before, after in pairwise(maps)]
+    np.testing.assert_allclose(refined.history.changed, [*changed[:2], np.nan])
+    everywhere = refiner.recover(refiner.prepare(Problem(x, y)), state)
+    np.testing.assert_array_equal(refined.pointwise_map, everywhere)
+    ended = refine(x, y, initial_map, ends_on_samples=True, **options)
+    np.testing.assert_array_equal(ended.pointwise_map[samples[0]], maps[3])
+    assert (ended.pointwise_map[others] == -1).all() and ended.iterations == 3
+    np.testing.assert_allclose(ended.history.changed, changed)
+    invalid = refine(x, y, initial_map.at[samples[0][5]].set(-1), **options)
+    assert invalid.result == RESULTS.invalid_initial_map
+
+
+def test_refinement_that_starts_in_full_and_ends_on_samples_has_no_first_change(pair):
+    x, y, initial_map, _ = pair
+    samples = (jnp.arange(0, M, 4), jnp.arange(1, M, 4))
+    options = dict(refiner=FeatureRegression(), iterations=3, samples=samples, history=True)
+    ended, usual = (
+        refine(x, y, initial_map, ends_on_samples=True, **options),
+        refine(x, y, initial_map, **options),
+    )
+    np.testing.assert_array_equal(ended.functional_map, usual.functional_map)
+    np.testing.assert_array_equal(ended.pointwise_map[::4], usual.pointwise_map[::4])
+    assert np.isnan(ended.history.changed[0]) and np.isfinite(ended.history.changed[1:]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "fault"),
+    [
+        ({"refiner": FeatureRegression(), "starts_on_samples": True}, "there are no samples"),
+        ({"refiner": FeatureRegression(), "ends_on_samples": True}, "there are no samples"),
+        ({"samples": (jnp.arange(50),) * 2, "ends_on_samples": True}, "WaveletPreservation matches samples"),
+    ],
+    ids=str,
+)
+def test_starting_and_ending_on_samples_is_refused_without_them(pair, options, fault):
+    x, y, initial_map, _ = pair
+    with pytest.raises(ValueError, match=fault):
+        refine(x, y, initial_map, **options)
 
 
 def test_vmap_over_pairs_equals_a_loop():

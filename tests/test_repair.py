@@ -26,6 +26,8 @@ from jaxsmw.stage import Stage
 LEVELS = (20, 20, 40, 40)
 STAGE = Stage(FeatureRegression(LEVELS))
 REPAIR = RepairSettings(stage=0, fallback_levels=LEVELS)
+SAMPLED = replace(STAGE, number_of_samples=90)
+ENDING = replace(SAMPLED, ends_on_samples=True)
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +197,17 @@ def test_default_repair_settings_are_those_of_the_preset_and_documented():
         (lambda: Preset(()), "at least one stage"),
         (lambda: Preset((STAGE,), RepairSettings()), "repair repeats stage 1, but the stages are 0 to 0"),
         (lambda: Preset((Stage(),), REPAIR), "WaveletPreservation has no levels"),
+        (lambda: Preset((SAMPLED, ENDING)), "the last stage ends on samples"),
+        (
+            lambda: Preset((STAGE,), large_stages=(ENDING, SAMPLED)),
+            "stage 0 matches only 90 samples: let stage 1",
+        ),
+        (
+            lambda: Preset((ENDING, replace(SAMPLED, number_of_samples=91, starts_on_samples=True))),
+            "at most as",
+        ),
+        (lambda: Stage(FeatureRegression(LEVELS), ends_on_samples=True), "there are no samples"),
+        (lambda: Stage(number_of_samples=500, starts_on_samples=True), "WaveletPreservation matches samples"),
         (lambda: Stage(FeatureRegression(LEVELS), number_of_eigenvectors=60), "require 40: leave .* out"),
         (lambda: Stage(FeatureRegression(LEVELS), iterations=3), "require 4: leave iterations out"),
         (lambda: Stage(WaveletPreservation()).with_levels((3,)), "has no levels"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 from jaxsmw.choices import IndexBase, MatchInit
@@ -113,9 +114,9 @@ def initial_map_files(init: str) -> list[str]:
 def check_initial_map(init: str) -> None:
     """Check the suffixes of landmark files in a value of `--init`, before any file is read.
 
-    **Raises:** `InputError` if the value names one file with the landmarks of one mesh, but no file with the
-    landmarks of the other mesh. `InputError` is also raised if the value names two files, and the format of
-    one of them is unknown.
+    **Raises:** `InputError` if the value names one file with positions of landmarks on one mesh, but no file
+    with the landmarks of the other mesh. `InputError` is also raised if the value names two files, and the
+    format of one of them is unknown.
     """
     files = initial_map_files(init)
     if not init.startswith("landmarks:"):
@@ -125,12 +126,26 @@ def check_initial_map(init: str) -> None:
     if len(files) > 1:
         for file in files:
             check_readable_suffix(file)
-    # A single file with any other suffix contains a source vertex and a target vertex per line.
-    elif files[0].lower().endswith(LANDMARK_SUFFIXES):
+    # Otherwise a single file contains a source vertex and a target vertex per line.
+    elif files[0].lower().endswith(LANDMARK_SUFFIXES) or _has_positions(files[0]):
         raise InputError(
             f"{files[0]}: contains landmarks of one mesh only: give the landmarks of both meshes, as --init "
             "landmarks:SOURCE_FILE,TARGET_FILE."
         )
+
+
+def _has_positions(file: str) -> bool:
+    """Return whether a table contains positions of landmarks instead of pairs of vertices."""
+    from jaxsmw.io.landmark_files import read_landmark_file
+    from jaxsmw.io.map_files import Table
+
+    for read in (lambda: Table(Path(file), columns=2), lambda: read_landmark_file(file)):
+        try:
+            found = read()
+        except InputError:
+            continue
+        return not isinstance(found, Table)
+    return False
 
 
 def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None) -> Any:

@@ -140,6 +140,16 @@ def run(options: argparse.Namespace) -> None:
         show_quality(correspondence, expected)
     for sentence in registered.sentences():
         show(sentence)
+    if registered.looks_wrong:
+        cure = "look at the registered mesh, or at the map with --report"
+        if options.map:
+            cure = (
+                f"check that {options.map} belongs to these two meshes, in this order, and its --index-base"
+            )
+        say(
+            f"warning: {registered.flipped_faces.mean():.1%} of the triangles are flipped, so the map is "
+            f"probably wrong: {cure}."
+        )
     if options.registered:
         from jaxsmw.transfer.attributes import registered_data
 
@@ -192,10 +202,12 @@ def _check(options: argparse.Namespace) -> None:
     check_initial_map(options.init)
     refuse_without(options, "--map or a file of --init", bool(options.map or init_files), "index_base")
     from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
-    from jaxsmw.io.mesh_data import check_mesh_suffix
+    from jaxsmw.io.mesh_data import check_attribute_suffix, check_mesh_suffix
 
-    for file in filter(None, (options.registered, options.attributes)):
-        check_mesh_suffix(file)
+    if options.registered:
+        check_mesh_suffix(options.registered)
+    if options.attributes:
+        check_attribute_suffix(options.attributes)
     if options.landmarks:
         check_readable_suffix(options.landmarks)
     if options.landmarks_output:

@@ -201,6 +201,19 @@ def check_mesh_suffix(path: str | os.PathLike[str]) -> None:
         )
 
 
+def check_attribute_suffix(path: str | os.PathLike[str]) -> None:
+    """Check that a mesh can be written with attributes in the format of a file's suffix.
+
+    **Raises:** `InputError` if the suffix belongs to no format, or to a format that holds only triangles.
+    """
+    check_mesh_suffix(path)
+    if Path(path).suffix.lower() == ".stl":
+        raise InputError(
+            f"{path}: STL files contain only triangles, so no attribute can be written: choose a name that "
+            "ends in .ply, .vtp or .glb."
+        )
+
+
 def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, ...]:
     """Write a mesh together with all data on its vertices and faces.
 

@@ -49,6 +49,9 @@ class _Round(NamedTuple):
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
 # target, and folds that come back are removed. (Entry R22)
 _ROUNDS = (_Round(6, 0.2, 1), _Round(6, 0.4, 2), _Round(4, 0.4, 1, pull=0.2), _Round(6, 0.4, 1))
+# A map is probably wrong if more than _MANY_FLIPPED of the triangles are flipped, and if angles change by more
+# than _MANY_DEGREES in the mean. (Entry R35)
+_MANY_FLIPPED, _MANY_DEGREES = 0.003, 16.0
 # The residual at which the linear solver stops, relative to the right side.
 _TOLERANCE = 1e-5
 # A deformation keeps positions whose errors are at most this fraction of the stiffness. (Entry R22)
@@ -160,6 +163,12 @@ class RegisteredMesh:
     @cached_property
     def _nearest_of_target(self) -> tuple[SurfacePoints, Float64[np.ndarray, " n"]]:
         return nearest_surface_points(self.mesh_y.vertices, self.mesh)
+
+    @property
+    def looks_wrong(self) -> bool:
+        """Whether the map is probably wrong, because many triangles are flipped and angles change much."""
+        flipped = self.flipped_faces.mean() > _MANY_FLIPPED
+        return bool(flipped and self.angle_distortions.mean() > _MANY_DEGREES)
 
     def sentences(self) -> tuple[str, ...]:
         """Return sentences about the quality of the registered mesh."""
