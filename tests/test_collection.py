@@ -407,6 +407,12 @@ def test_the_command_writes_everything(result_directory):
         )
     modes = np.load(result_directory / "modes.npz")
     assert modes["modes"].shape == (3, len(template.vertices), 3)
+    for row, name in enumerate(names):  # the mean and all modes together describe each shape exactly
+        registered = read_mesh(result_directory / "registered" / f"{name}.ply").vertices
+        moved = registered @ modes["matrices"][row].T + modes["translations"][row]
+        displaced = np.einsum("v,vc,kvc->k", modes["weights"], moved - modes["mean"], modes["modes"])
+        described = modes["mean"] + np.tensordot(displaced, modes["modes"], axes=1)
+        np.testing.assert_allclose(moved, described, atol=1e-5 * np.ptp(moved))
     rows = list(csv.reader((result_directory / "scores.csv").read_text("utf-8").splitlines()))
     assert [row[0] for row in rows] == ["mesh", *names] and len(rows[1]) == 4
     assert read_mesh(result_directory / "mean.ply").vertices.shape == template.vertices.shape

@@ -156,15 +156,17 @@ def write_landmarks(
 def write_model(collection: Collection, model: ShapeModel, directory: Path, suffix: str) -> list[Path]:
     """Write the mean shape, the modes (`modes.npz`) and the scores (`scores.csv`).
 
-    The file `modes.npz` contains `mean` (n, 3), `modes` (k, n, 3), `variances` (k,), `faces` (f, 3) and
-    `weights` (n,). The file `scores.csv` has one row per mesh and one column per mode.
+    The file `modes.npz` contains `mean` (n, 3), `modes` (k, n, 3), `variances` (k,), `faces` (f, 3),
+    `weights` (n,), `matrices` (N, 3, 3) and `translations` (N, 3). In the coordinates of the mean, vertex v
+    of registered mesh i is at `matrices[i] @ v + translations[i]`. The file `scores.csv` has one row per
+    mesh, in the same order, and one column per mode.
 
     **Returns:** The written files.
 
     **Raises:** `InputError` if a file cannot be written.
     """
     template = collection.meshes[collection.template]
-    mean = Mesh(model.mean, template.faces, "mean")
+    mean, motion = Mesh(model.mean, template.faces, "mean"), model.alignment
     write_mesh_data(directory / f"mean{suffix}", MeshData(mean, template.faces))
     with atomic_write(directory / "modes.npz") as temporary:
         np.savez_compressed(
@@ -174,6 +176,8 @@ def write_model(collection: Collection, model: ShapeModel, directory: Path, suff
             variances=model.variances,
             faces=template.faces,
             weights=model.weights,
+            matrices=motion.scales[:, None, None] * motion.rotations * collection.signs[:, None, :],
+            translations=motion.translations,
         )
     with (
         atomic_write(directory / "scores.csv") as temporary,

@@ -206,6 +206,16 @@ class Collection:
         points, _ = nearest_surface_points(images, self.meshes[target])
         return register_mesh(self.meshes[source], self.meshes[target], points)
 
+    @property
+    def signs(self) -> Float64[np.ndarray, "N 3"]:
+        """The factors by which the coordinates of each shape enter the shape model (N, 3).
+
+        The factors are 1, except for shapes of the other hand than the template: their x coordinates change
+        the sign.
+        """
+        other_hand = self.mirrored != self.mirrored[self.template]
+        return np.where(other_hand[:, None], [-1.0, 1.0, 1.0], 1.0)
+
     def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
         """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
 
@@ -220,10 +230,8 @@ class Collection:
 
         **Returns:** A `ShapeModel` with n vertices.
         """
-        other_hand = self.mirrored != self.mirrored[self.template]
-        signs = np.where(other_hand[:, None], [-1.0, 1.0, 1.0], 1.0)
         return shape_model(
-            [one.vertices * sign for one, sign in zip(self.registered, signs, strict=True)],
+            [one.vertices * sign for one, sign in zip(self.registered, self.signs, strict=True)],
             scale=scale,
             weights=self.meshes[self.template].vertex_areas,
             reference=self.template,

@@ -49,8 +49,8 @@ class _Round(NamedTuple):
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
 # target, and folds that come back are removed. (Entry R22)
 _ROUNDS = (_Round(6, 0.2, 1), _Round(6, 0.4, 2), _Round(4, 0.4, 1, pull=0.2), _Round(6, 0.4, 1))
-# A map is probably wrong if more than _MANY_FLIPPED of the triangles are flipped, and if angles change by more
-# than _MANY_DEGREES in the mean. (Entry R35)
+# A map is probably wrong if more than this share of the triangles is flipped, and if angles change by more
+# than this number of degrees in the mean. (Entry R35)
 _MANY_FLIPPED, _MANY_DEGREES = 0.003, 16.0
 # The residual at which the linear solver stops, relative to the right side.
 _TOLERANCE = 1e-5
