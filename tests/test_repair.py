@@ -142,6 +142,19 @@ def test_stages_run_again_for_shapes_that_differ_in_form(body, init, non_isometr
     assert changed == bool(passes)
 
 
+def test_passes_do_not_clear_the_suspicion(body, identity):
+    """Passes lower the distortion of a wrong map, but the map stays wrong."""
+    settings = replace(
+        REPAIR, suspicious=1.001, suspicious_area=1.0, doubtful=10.0, non_isometric=0.0, passes=1
+    )
+    mesh, spectrum = body
+    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, identity, identity)
+    once = refine_in_stages(prepared, [STAGE], None)
+    for suspicious in (True, False):
+        found = refine_further(prepared, [STAGE], settings, once._replace(suspicious=suspicious))
+        assert found.suspicious == suspicious and len(found.refinements) == 1 and found.distortion < 10
+
+
 def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity):
     def none():
         raise AssertionError("an alternative initial map was computed")

@@ -113,8 +113,9 @@ def refine_further(
     - `outcome`: an outcome of `refine_in_stages`.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
-    **Returns:** The `Outcome` of the last pass. The given outcome is returned if `repair` is None, if no
-    passes are needed, or if the given outcome or a pass failed.
+    **Returns:** The `Outcome` of the last pass, which is suspicious if the given outcome is suspicious. The
+    given outcome is returned if `repair` is None, if no passes are needed, or if the given outcome or a pass
+    failed.
     """
     if repair is None or not outcome.successful:
         return outcome
@@ -132,9 +133,9 @@ def refine_further(
         further = _Repairer(one, judge, repair).repeated(further)
         if not further.successful:
             return outcome
-    further = judge.judged(further)
-    # A map that looked right before stays near that map, so it does not become suspicious.
-    return further._replace(suspicious=outcome.suspicious and not judge.looks_right(further))
+    # Passes lower the distortion of wrong maps as well, and stay near the given map. Therefore they do not
+    # change whether the map is suspicious. (Table R32)
+    return judge.judged(further)._replace(suspicious=outcome.suspicious)
 
 
 _View = tuple[Spectrum, Spectrum]
