@@ -34,6 +34,8 @@ class Outcome(NamedTuple):
     - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed yet.
     - `deformation`: `jaxsmw.repair.proxies.deformation` of the final map; 0 if it was not computed.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
+    - `rivals`: the outcomes of the next best scores if repair did not find a map that looks right, the best
+      first. Further passes can make a rival better than the outcome itself.
     """
 
     refinements: list[Refinement]
@@ -41,6 +43,7 @@ class Outcome(NamedTuple):
     distortion: float | None = None
     deformation: float = 0.0
     suspicious: bool = False
+    rivals: tuple[Outcome, ...] = ()
 
     @property
     def successful(self) -> bool:

@@ -101,6 +101,9 @@ def refine_further(
 ) -> Outcome:
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
+    If repair did not find a map that looks right, its rivals are refined as well. The map with the best score
+    after the passes is returned.
+
     The repeated stage and all later stages run `repair.passes` more times. If the shapes differ very much, or
     if the initial map of full shapes is `"aligned"`, coarse passes with the levels `repair.coarse_levels` and
     one usual pass run instead.
@@ -114,8 +117,8 @@ def refine_further(
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Returns:** The `Outcome` of the last pass, which is suspicious if the given outcome is suspicious. The
-    given outcome is returned if `repair` is None, if no passes are needed, or if the given outcome or a pass
-    failed.
+    given outcome is returned if `repair` is None, if no passes are needed, or if the given outcome or all
+    passes failed.
     """
     if repair is None or not outcome.successful:
         return outcome
@@ -128,14 +131,17 @@ def refine_further(
     runners = [runner] * repair.passes
     if change >= repair.coarse_from or aligned:
         runners = [*map(runner.coarse, repair.coarse_levels), runner]
-    further = outcome
-    for one in runners:
-        further = _Repairer(one, judge, repair).repeated(further)
-        if not further.successful:
-            return outcome
+    refined = []
+    for further in (outcome, *outcome.rivals):
+        for one in runners:
+            if further.successful:
+                further = _Repairer(one, judge, repair).repeated(further)
+        if further.successful:
+            refined.append(judge.judged(further))
+    best = min(refined, key=judge.score, default=outcome)
     # Passes lower the distortion of wrong maps as well, and stay near the given map. Therefore they do not
     # change whether the map is suspicious. (Table R32)
-    return judge.judged(further)._replace(suspicious=outcome.suspicious)
+    return best._replace(suspicious=outcome.suspicious)
 
 
 _View = tuple[Spectrum, Spectrum]
@@ -217,6 +223,8 @@ class _Repairer:
             mended = [other for other in map(self._by_rounds, faulty) if not self.judge.faults(other)]
             best = min([self._by_rounds(best), *mended], key=self.judge.score)
         best = best._replace(suspicious=not self.judge.looks_right(best))
+        if best.suspicious:
+            best = best._replace(rivals=tuple(others[: self.settings.rivals]))
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)
         return best

@@ -194,6 +194,8 @@ class RepairSettings:
       that start from `"aligned"` (entry R24).
     - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass. If
       the refiner of the last stage has no levels, coarse passes are usual passes.
+    - `rivals` (Table R36): the number of further outcomes of the repair that passes refine, if the best
+      outcome still looks wrong. The best outcome after the passes is chosen.
     - `aligned_preference` (entry R24): a number from 0. With `init="auto"`, asymmetric shapes are matched
       from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean expected
       error is below this multiple of the other map's mean expected error. Both expected errors are computed
@@ -221,12 +223,13 @@ class RepairSettings:
     passes: int = 2
     coarse_from: float = 0.3
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60))
+    rivals: int = 2
     aligned_preference: float = 0.9
     alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
 
     def __post_init__(self) -> None:
-        for name in ("stage", "rounds", "finalists", "passes"):
+        for name in ("stage", "rounds", "finalists", "passes", "rivals"):
             check_whole_number(name, getattr(self, name), 0)
         for name in ("suspicious_area", "negligible_area", "excessive_area"):
             check_number(name, getattr(self, name), most=1.0)
