@@ -140,7 +140,7 @@ def refine_further(
             refined.append(judge.judged(further))
     best = min(refined, key=judge.score, default=outcome)
     # Passes lower the distortion of wrong maps as well, and stay near the given map. Therefore they do not
-    # change whether the map is suspicious. (Table R32)
+    # change whether the map is suspicious. (Table R36)
     return best._replace(suspicious=outcome.suspicious)
 
 
