@@ -30,9 +30,7 @@ the tables to `speed.md`, all measurements to `speed.json`, and a plot of the ti
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
-import logging
 import multiprocessing
 import os
 import re
@@ -497,30 +495,19 @@ def peak_memory() -> float:
 
 def matched_from_files(
     files: list[str], preset: PresetName
-) -> tuple[list[tuple[str, float, float]], list[np.ndarray]]:
-    """Match two mesh files, and measure the time and the memory of each stage.
+) -> tuple[dict[str, float], float, list[np.ndarray]]:
+    """Match two mesh files, and measure the time of each step and the peak memory of the process.
 
-    **Returns:** Two lists. The first list contains a tuple of name, seconds and peak memory in GiB for each
-    stage. The second list contains the initial map and the refined map.
+    **Returns:** A dictionary from the name of each step to its seconds, the peak memory in GiB, and a list of
+    the initial map and the refined map.
     """
-    stages = [("start", time.perf_counter(), 0.0)]
-
-    class Watch(logging.Handler):
-        """Records the times of log messages, each of which marks the start of a stage."""
-
-        def emit(self, record: logging.LogRecord) -> None:
-            if not record.args:  # log messages with arguments do not mark the start of a stage
-                stages.append((record.getMessage(), time.perf_counter(), peak_memory()))
-
-    logger = logging.getLogger("jaxsmw")
-    logger.addHandler(Watch())
-    logger.setLevel(logging.INFO)
-    logger.info("reading")
+    start = time.perf_counter()
     meshes = [read_mesh(file) for file in files]
+    seconds = {"reading": time.perf_counter() - start}
     result = match(*meshes, preset=preset)
-    logger.info("end")
-    timed = [(name, end - start, peak) for (name, start, _), (_, end, peak) in itertools.pairwise(stages[1:])]
-    return timed, [result.initial_map, result.pointwise_map]
+    other = time.perf_counter() - start - sum(seconds.values()) - sum(result.seconds.values())
+    seconds |= {**result.seconds, "other": other}
+    return seconds, peak_memory(), [result.initial_map, result.pointwise_map]
 
 
 def scale(options: argparse.Namespace) -> Iterator[Part]:
@@ -541,15 +528,13 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
             for file, mesh in zip(files, meshes, strict=True):
                 write_mesh(Path(file), mesh)
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
-                timed, maps = executor.submit(matched_from_files, files, preset).result()
+                seconds, peak, maps = executor.submit(matched_from_files, files, preset).result()
         errors = [truth.error(pointwise_map, meshes[1]) for pointwise_map in maps]
-        seconds = {name: taken for name, taken, _ in timed}
-        peaks = {name: peak for name, _, peak in timed}
-        measured.append({"vertices": size, "seconds": seconds, "peak_gib": peaks, "errors": errors})
+        measured.append({"vertices": size, "seconds": seconds, "peak_gib": peak, "errors": errors})
         rows.append(
             [str(size)]
             + [f"{taken:.1f}" for taken in seconds.values()]
-            + [f"{sum(seconds.values()):.1f}", f"{max(peaks.values()):.2f}", *(f"{e:.1f}" for e in errors)]
+            + [f"{sum(seconds.values()):.1f}", f"{peak:.2f}", *(f"{e:.1f}" for e in errors)]
         )
     columns = [*measured[0]["seconds"], "in all, seconds", "peak GiB", "initial error", "refined error"]
 
@@ -560,7 +545,7 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
     if len(measured) > 2:
         stages = [exponent([m["seconds"][name] for m in measured]) for name in measured[0]["seconds"]]
         total = exponent([sum(m["seconds"].values()) for m in measured])
-        memory = exponent([max(m["peak_gib"].values()) for m in measured])
+        memory = exponent([m["peak_gib"] for m in measured])
         rows.append(["exponent", *stages, total, memory, "", ""])
     return (
         f"Scale, {preset}",
@@ -735,8 +720,7 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
                 curves.setdefault(name, []).append((int(np.max(measured["vertices"])), seconds))
     for measured in numbers["scale"][0]["measured"] if numbers.get("scale") else ():
         curves = panels.setdefault("From files to map", {})
-        peak = max(measured["peak_gib"].values())
-        for name, value in {**measured["seconds"], "peak memory, GiB": peak}.items():
+        for name, value in {**measured["seconds"], "peak memory, GiB": measured["peak_gib"]}.items():
             curves.setdefault(name, []).append((measured["vertices"], value))
     if not panels:
         return

@@ -51,6 +51,16 @@ def test_each_part_of_the_speed_benchmark_measures_positive_times(part, monkeypa
         assert min(numbers["seconds"].values()) > 0
 
 
+def test_the_steps_of_a_match_from_files_add_up(tmp_path):
+    files = [str(tmp_path / f"{pose}.ply") for pose in ("rest", "stand")]
+    for file, pose in zip(files, ("rest", "stand"), strict=True):
+        write_mesh(file, creature(vertices=900, pose=pose))
+    seconds, peak, maps = benchmark_speed.matched_from_files(files, "paper")
+    assert list(seconds) == ["reading", "eigenbases", "mirror test", "initial map", "refinement", "other"]
+    assert min(seconds.values()) > 0 and peak > 0.1
+    assert [len(one) for one in maps] == [900, 900]
+
+
 def test_maps_of_a_collection_are_compared_with_direct_maps(tmp_path, monkeypatch, capsys):
     for folder in ("off", "corres"):
         (tmp_path / "tiny" / folder).mkdir(parents=True)
