@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -112,7 +113,7 @@ def initial_map_files(init: str) -> list[str]:
 
 
 def check_initial_map(init: str) -> None:
-    """Check the suffixes of landmark files in a value of `--init`, before any file is read.
+    """Check the landmark files in a value of `--init`, before any mesh is read.
 
     **Raises:** `InputError` if the value names one file with positions of landmarks on one mesh, but no file
     with the landmarks of the other mesh. `InputError` is also raised if the value names two files, and the
@@ -139,12 +140,12 @@ def _has_positions(file: str) -> bool:
     from jaxsmw.io.landmark_files import read_landmark_file
     from jaxsmw.io.map_files import Table
 
-    for read in (lambda: Table(Path(file), columns=2), lambda: read_landmark_file(file)):
-        try:
-            found = read()
-        except InputError:
-            continue
-        return not isinstance(found, Table)
+    with suppress(InputError):
+        Table(Path(file), columns=2)
+        return False
+    with suppress(InputError):
+        read_landmark_file(file)
+        return True
     return False
 
 
