@@ -189,7 +189,7 @@ class Correspondence:
         **Arguments:**
 
         - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map with
-          shorter wavelengths is smoothed. The default is 0.003.
+          shorter wavelengths is smoothed. The default is 0.005.
 
         **Returns:** A `RegisteredMesh`, whose attribute `vertices` (m, 3) contains positions on Y, in the
         unit of Y. `jaxsmw.transfer` transfers landmarks and attributes with a registered mesh.

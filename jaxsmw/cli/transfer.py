@@ -85,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="LENGTH",
         type=_positive,
         help="length below which noise of the map is smoothed, in units of the square root of the target's "
-        "area (default: 0.003)",
+        "area (default: 0.005)",
     )
     parser.add_argument(
         "--report",

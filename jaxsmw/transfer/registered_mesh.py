@@ -20,7 +20,7 @@ from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 from jaxsmw.wording import count_of
 
-DEFAULT_STIFFNESS = 0.003
+DEFAULT_STIFFNESS = 0.005
 """The default stiffness of a registered mesh, a length in units of the square root of the target's area."""
 
 # The stiffness with which `points_of_map` smooths a map to vertices. (Entry R22)
@@ -36,8 +36,9 @@ class _Round(NamedTuple):
       is flipped.
     - `factor`: the factor by which weights at flipped faces and at their neighbours are multiplied.
     - `neighbors`: the largest distance to these neighbours, in edges.
-    - `pull`: if positive, the round moves regions with reduced weights to their nearest points of the target.
-      The number is the weight of these points, relative to the weight of the map elsewhere.
+    - `pull`: if positive, the round moves regions with reduced weights to their nearest points of the target,
+      and along the target halfway back to their points of the map. The number is the weight of these
+      positions, relative to the weight of the map elsewhere.
     """
 
     deformations: int
@@ -48,7 +49,7 @@ class _Round(NamedTuple):
 
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
 # target, and folds that come back are removed. (Entry R22)
-_ROUNDS = (_Round(6, 0.2, 1), _Round(6, 0.4, 2), _Round(4, 0.4, 1, pull=0.2), _Round(6, 0.4, 1))
+_ROUNDS = (_Round(6, 0.2, 1), _Round(6, 0.4, 2), _Round(4, 0.4, 1, pull=0.4), _Round(6, 0.4, 1))
 # A map is probably wrong if more than this share of the triangles is flipped, and if angles change by more
 # than this number of degrees in the mean. (Entry R35)
 _MANY_FLIPPED, _MANY_DEGREES = 0.003, 16.0
@@ -199,15 +200,15 @@ def register_mesh(
     The positions minimise a sum of two terms: the squared distances to the points of the map, and the squared
     stiffness times the squared changes of edge vectors. Before the changes are measured, the edge vectors of
     X are rotated and scaled with their neighbourhoods. The rotations are those of as-rigid-as-possible
-    deformation (Sorkine, Alexa 2007); jaxsmw adds the scales. Where faces would flip, vertices follow
-    the nearest points of Y instead.
+    deformation (Sorkine, Alexa 2007); jaxsmw adds the scales. Where faces would flip, the map has less
+    weight, and vertices are also drawn to the nearest points of Y.
 
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y, each a `Mesh`.
     - `points`: the map X -> Y, as `SurfacePoints` on Y with m entries; see `Correspondence.surface_points`.
     - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map is smoothed if
-      its wavelength is shorter than the stiffness. The default is 0.003. A stiffness of 0.03 makes the
+      its wavelength is shorter than the stiffness. The default is 0.005. A stiffness of 0.03 makes the
       registered mesh of a noisy map smooth, but moves it farther away from the target.
     - `scale`: the factor by which X is first scaled. With None (the default), X is scaled to the area of Y.
       Give 1 for a partial shape and a full shape in the same unit of length.
@@ -230,12 +231,12 @@ def register_mesh(
     root = np.sqrt(mesh_y.area)
     # Positions are relative to the middle of Y, because large coordinates would lose digits.
     middle = mesh_y.vertices[mesh_y.referenced_vertices].mean(axis=0)
-    targets = points.positions(mesh_y) - middle
+    mapped = points.positions(mesh_y) - middle
     around = Neighborhoods(mesh_x, root / np.sqrt(mesh_x.area) if scale is None else scale)
     areas = around.size**2 * mesh_x.vertex_areas
     # A vertex of no or little area still follows the map.
     areas = np.maximum(areas, 0.1 * np.median(areas[areas > 0]))
-    positions, similarities = targets, around.similarities(targets)
+    targets, positions, similarities = mapped.copy(), mapped, around.similarities(mapped)
     weights, number = areas.copy(), 0
     normals = _normals(mesh_x.vertices, mesh_x)
     for of_round in _ROUNDS:
@@ -246,7 +247,7 @@ def register_mesh(
         for _ in range(of_round.deformations):
             if of_round.pull:
                 nearest, _ = surface.nearest(positions[loose] + middle)
-                targets[loose] = nearest.positions(mesh_y) - middle
+                targets[loose] = _halfway(nearest, mapped[loose] + middle, mesh_y) - middle
             positions = _follow(around, similarities, weights, targets, stiffness * root, positions)
             similarities = around.similarities(positions)
             number += 1
@@ -341,6 +342,23 @@ def _follow(
                 )
             moved[rows, axis] += found
     return moved
+
+
+def _halfway(
+    nearest: SurfacePoints, mapped: Float64[np.ndarray, "p 3"], mesh_y: Mesh
+) -> Float64[np.ndarray, "p 3"]:
+    """Move points of Y halfway to other positions, in the planes of their triangles.
+
+    The nearest point alone would let a vertex slide along the surface, away from its point of the map.
+    """
+    positions = nearest.positions(mesh_y)
+    normals = mesh_y.area_vectors[nearest.faces]
+    squares = (normals**2).sum(axis=1, keepdims=True)
+    offsets = mapped - positions
+    along = (offsets * normals).sum(axis=1, keepdims=True)
+    # A triangle without area has no normal, and its points move halfway in space.
+    offsets -= normals * np.divide(along, squares, out=np.zeros_like(along), where=squares > 0)
+    return positions + 0.5 * offsets
 
 
 def _flipped_faces(
