@@ -53,7 +53,7 @@ class SampledShape(NamedTuple):
 
     @classmethod
     def make(cls, mesh: Mesh, samples: SurfaceSamples | None, spectrum: Spectrum) -> SampledShape:
-        """Make a sampled shape from the spectrum at all n vertices of a mesh.
+        """Make a sampled shape from a mesh and its spectrum, which has all n vertices of the mesh.
 
         **Raises:** `InputError` if the spectrum has another number of vertices than the mesh.
         """

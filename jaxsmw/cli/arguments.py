@@ -119,7 +119,7 @@ def add_index_base(parser: argparse.ArgumentParser) -> None:
 def add_partial(
     parser: argparse.ArgumentParser, *, condition: str = "; both must have the same unit of length"
 ) -> None:
-    """Add `--partial`. The help text ends with a condition on the two meshes."""
+    """Add `--partial`. `condition` is the end of its help text."""
     parser.add_argument(
         "--partial",
         action="store_true",

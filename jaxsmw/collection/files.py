@@ -157,9 +157,9 @@ def write_model(collection: Collection, model: ShapeModel, directory: Path, suff
     """Write the mean shape, the modes (`modes.npz`) and the scores (`scores.csv`).
 
     The file `modes.npz` contains `mean` (n, 3), `modes` (k, n, 3), `variances` (k,), `faces` (f, 3),
-    `weights` (n,), `matrices` (N, 3, 3) and `translations` (N, 3). In the coordinates of the mean, vertex v
-    of registered mesh i is at `matrices[i] @ v + translations[i]`. The file `scores.csv` has one row per
-    mesh, in the same order, and one column per mode.
+    `weights` (n,), `matrices` (N, 3, 3) and `translations` (N, 3). A vertex of registered mesh i at position
+    v has the position `matrices[i] @ v + translations[i]` in the coordinates of the mean. The file
+    `scores.csv` has one row per mesh, in the same order, and one column per mode.
 
     **Returns:** The written files.
 
@@ -259,8 +259,8 @@ def check_replaceable(directory: Path, names: Sequence[str]) -> None:
     - `directory`: the directory of the results, which need not exist.
     - `names`: the names of the meshes of the collection.
 
-    **Raises:** `InputError` if the directory contains files with the names of results but no results, or
-    results of a collection without any of these meshes.
+    **Raises:** `InputError` if a file of the directory has the name of a result but is not a result of this
+    program, or if the directory contains the results of a collection without any of these meshes.
     """
     if not (directory / "provenance.json").exists():
         if taken := [name for name in RESULT_FILES + RESULT_DIRECTORIES if (directory / name).exists()]:

@@ -410,7 +410,7 @@ def _numbers(name: str, values: object) -> Float64[np.ndarray, "*shape"]:
 
 
 def _checked_numbers(numbers: Sequence[int], most: int, reason: str) -> tuple[int, ...]:
-    """Return numbers of modes as a tuple."""
+    """Check a list of numbers of modes, and return the numbers as a tuple."""
     if not isinstance(numbers, Iterable):
         raise InputError(f"numbers_of_modes is {numbers!r}: give a list of whole numbers.")
     checked = tuple(check_whole_number("the number of modes", number) for number in numbers)

@@ -40,8 +40,8 @@ def nearest_rotations(
         value = (square - 2) * square - 8 * determinants * trace + constant
         trace -= value / np.maximum(slope, np.finfo(float).tiny)
     half = 0.5 * (trace**2 - 1)
-    # The divisor is the product of all sums of two singular values. The last singular value has the sign of
-    # the determinant here.
+    # The divisor is (s1 + s2)(s2 + s3)(s3 + s1), where s1, s2 and s3 are the singular values. Here s3 has the
+    # sign of the determinant.
     divisor = half * trace - determinants
     unique = divisor > _AMBIGUOUS
     gram = np.einsum("ian,jan->ijn", m, m)

@@ -148,9 +148,9 @@ def _describe(
     - `positions`: the positions of all vertices, in units of the square root of the area.
     - `normals`: the unit normals of all vertices.
     - `block`: the vertices to describe.
-    - `center`, `neighbor`, `distance`: all pairs of a vertex in the block and one of its neighbours. `center`
-      contains indices into `block`, `neighbor` contains vertices, and `distance` contains the distances
-      between them.
+    - `center`, `neighbor`, `distance`: arrays with one entry for each pair of a vertex in the block and one
+      of its neighbours. `center` contains indices into `block`, `neighbor` contains vertices, and `distance`
+      contains the distances between them.
     - `radius`: the radius of the neighbourhoods, in the unit of the positions.
     """
     offsets = positions.take(neighbor, axis=0) - positions[block].take(center, axis=0)
@@ -207,8 +207,8 @@ def _local_frames(
     def towards_majority(axis: np.ndarray) -> np.ndarray:
         height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
         majority = np.bincount(center, np.sign(height), size)
-        # Ties occur on regular meshes. Weighted heights decide them, because the signs of the eigenvectors
-        # are arbitrary.
+        # On regular meshes, both signs of an axis can have equally many points. The signs of eigenvectors are
+        # arbitrary, so the weighted heights of the points decide.
         tied = majority == 0
         majority[tied] = np.bincount(center, weight * height, size)[tied]
         return np.where(majority >= 0, 1.0, -1.0)[:, None] * axis

@@ -247,9 +247,10 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
     **Returns:** A sentence for each landmark whose distance to the surface is above 2 % of the diagonal of
     the box around the mesh.
 
-    **Raises:** `InputError` if the mean distance of the landmarks to the surface is above 5 % of the
-    diagonal, but would be below 2 % in the other coordinate system. `InputError` is also raised if the median
-    distance is above 3 % of the diagonal. The message names the factor if another unit explains the distance.
+    **Raises:** `InputError` if the median distance of the landmarks to the surface is above 3 % of the
+    diagonal. `InputError` is also raised if their mean distance is above 5 % of the diagonal, but would be
+    below 2 % in the other coordinate system. The message names the factor if another unit explains the
+    distance.
     """
     diagonal = bounding_box_diagonal(mesh)
     distances = distances_to_surface(landmarks.positions, mesh)

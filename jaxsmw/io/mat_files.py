@@ -100,8 +100,8 @@ def read_matrix(
 
     - `path`: the file.
     - `name`: the name of the matrix to read if the file contains several suitable matrices.
-    - `columns`: the number of columns. Matrices with another number of columns are not suitable. If
-      `columns` is 1, only a list (a single row or column) is suitable. None accepts any number of columns.
+    - `columns`: the number of columns. Matrices with another number of columns are not suitable. If `columns`
+      is 1, only a list (a single row or column) is suitable. With `None`, any number of columns is suitable.
 
     **Returns:** The matrix (rows, columns), float64.
 

@@ -154,7 +154,7 @@ class Alternatives:
 
         **Arguments:**
 
-        - `shot`: the squared differences of SHOT between samples of X (s,) and of Y (t,).
+        - `shot`: the squared differences of SHOT (s, t) between the s samples of X and the t samples of Y.
         """
         settings = self.settings.alternatives
         ends = extremities(self.x, settings.extremities), extremities(self.y, settings.extremities)

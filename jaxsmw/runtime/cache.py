@@ -175,7 +175,7 @@ def cache_compiled_programs() -> None:
     except OSError:
         return  # `cached` will warn
     if not os.access(directory, os.W_OK):
-        return  # JAX would warn about every program
+        return  # JAX would issue a warning for each program that it cannot store
     settings = {
         "JAX_COMPILATION_CACHE_DIR": str(directory),
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(int(min(2**28, _limit()))),
@@ -210,8 +210,8 @@ def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
     digest = hashlib.sha256()
     for value in (_FORMAT, kind, *inputs):
         array = np.asarray(value)
-        # The header determines the number of bytes that follow, so different lists of inputs give different
-        # bytes.
+        # The header contains the size of each array. Without it, different arrays in a row could give the
+        # same bytes.
         digest.update(f"{type(value).__name__} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()

@@ -178,7 +178,7 @@ def _temporary(target: Path) -> Path:
 
 
 def _check_target(path: str | os.PathLike[str], target: Path) -> None:
-    """Refuse a target that cannot become a regular file.
+    """Refuse an output path at which no regular file can be written.
 
     **Raises:** `InputError` if the target cannot be written as a regular file; `OSError` if the operating
     system does not accept the name.

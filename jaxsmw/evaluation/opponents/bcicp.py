@@ -84,7 +84,7 @@ class _Surface:
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> _Surface:
-        """Return the surface of a mesh, without unreferenced vertices and vertices masked by the spectrum.
+        """Return the surface of a mesh without unreferenced vertices and without masked vertices.
 
         **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """
@@ -145,8 +145,8 @@ def bcicp(
       decreases to 1 in the last iteration. If `smoothing` is 0, no map is smoothed.
 
     **Returns:** The maps X -> Y and Y -> X, with the same lengths as the initial maps. Unreferenced and
-    masked vertices keep their initial images. The images of all other vertices are referenced, unmasked
-    vertices.
+    masked vertices keep their initial images. All other vertices are sent to vertices that are referenced and
+    not masked.
 
     **Raises:** `InputError` if `iterations` or `smoothing` is too small, if the arguments do not fit each
     other, or if an initial map sends a vertex to an unreferenced, masked or missing vertex.

@@ -123,7 +123,7 @@ class SurfaceGradient(eqx.Module):
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> SurfaceGradient:
-        """Return the gradient operator of a mesh. Lengths are in the unit of length of the spectrum.
+        """Return the gradient operator of a mesh, in the spectrum's unit of length.
 
         **Arguments:**
 
