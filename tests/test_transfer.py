@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
 
@@ -12,6 +13,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry import SurfacePoints
 from jaxsmw.geometry.rotations import nearest_rotations
 from jaxsmw.geometry.surface_distance import (
+    distances_to_surface,
     nearest_facing_points,
     nearest_points_of_triangles,
     nearest_surface_points,
@@ -24,6 +26,7 @@ from jaxsmw.transfer import (
     transfer_attributes,
     transfer_landmarks,
 )
+from jaxsmw.transfer.coverage import UncoveredVertices
 from jaxsmw.transfer.neighborhoods import Neighborhoods
 from jaxsmw.transfer.registered_mesh import _follow
 
@@ -52,6 +55,13 @@ def on_same_numbering(mesh_x: Mesh, mesh_y: Mesh) -> RegisteredMesh:
 def by_position(mesh_x: Mesh, mesh_y: Mesh) -> RegisteredMesh:
     """Register a mesh on a mesh with (almost) the same shape at the same place."""
     return register_mesh(mesh_x, mesh_y, nearest_surface_points(mesh_x.vertices, mesh_y)[0])
+
+
+def spiked_sphere() -> Mesh:
+    """A unit sphere with a round spike of height 0.4 at its north pole."""
+    vertices, faces = sphere_mesh(4)
+    distances = np.arccos(np.clip(vertices[:, 2], -1, 1))
+    return make_mesh(vertices * (1 + 0.4 * np.exp(-((distances / 0.25) ** 2)))[:, None], faces)
 
 
 def in_percent(offsets: np.ndarray, mesh: Mesh) -> np.ndarray:
@@ -137,6 +147,58 @@ class TestRegisteredMesh:
             offsets.append(in_percent((registered.vertices - mesh_y.vertices)[used], mesh_y).max())
         assert scales[0] < 1e-4 and offsets[0] < 1e-3
         assert scales[1] > 0.1  # the size of the whole would be the size of the part
+
+    def test_tips_are_reached_that_the_map_misses(self):
+        mesh_y = spiked_sphere()
+        height = mesh_y.vertices[:, 2]
+        low = np.flatnonzero(height < 1.15)
+        points = at_vertices(mesh_y, low[KDTree(mesh_y.vertices[low]).query(mesh_y.vertices)[1]])
+        tip = height > 1.2
+        mapped = replace(mesh_y, vertices=points.positions(mesh_y))
+        before = distances_to_surface(mesh_y.vertices[tip], mapped)
+        registered = register_mesh(mesh_y, mesh_y, points)
+        assert registered.target_distances[tip].mean() < 0.6 * before.mean()
+        assert not registered.flipped_faces.any()
+
+    def test_a_part_is_not_drawn_to_what_it_lacks(self):
+        mesh_y = spiked_sphere()
+        below = (mesh_y.vertices[mesh_y.faces, 2] < 1.02).all(axis=1)
+        mesh_x = make_mesh(mesh_y.vertices, mesh_y.faces[below])
+        points = nearest_surface_points(mesh_x.vertices, mesh_y)[0]
+        used = mesh_x.referenced_vertices
+        for scale in (None, 1.0):
+            registered = register_mesh(mesh_x, mesh_y, points, scale=scale)
+            assert in_percent((registered.vertices - mesh_y.vertices)[used], mesh_y).max() < 1e-3
+
+    def test_uncovered_vertices_draw_their_nearest_points(self):
+        mesh_y = spiked_sphere()
+        positions = np.minimum(mesh_y.vertices, [9, 9, 1.15])
+        uncovered, strengths = UncoveredVertices(mesh_y, mesh_y), np.full(len(positions), 0.5)
+        attraction = uncovered.attraction(positions, strengths)
+        deformed = replace(mesh_y, vertices=positions)
+        distances = distances_to_surface(mesh_y.vertices, deformed) / np.sqrt(mesh_y.area)
+        expected = (distances > 0.005) & (distances < 0.1)
+        assert 5 < expected.sum() == len(attraction.weights)
+        np.testing.assert_array_equal(attraction.positions, mesh_y.vertices[expected])
+        np.testing.assert_allclose(attraction.weights, 0.5 * mesh_y.vertex_areas[expected])
+        nearest = attraction.interpolation @ positions
+        np.testing.assert_allclose(
+            np.linalg.norm(nearest - attraction.positions, axis=1) / np.sqrt(mesh_y.area), distances[expected]
+        )
+        # The quadratic form is the weighted sum of squared distances, up to a constant.
+        moved_up = positions + np.array([0, 0, 0.1])
+        energies = [
+            0.5 * np.sum(p * (attraction.matrix() @ p)) - np.sum(p * attraction.right_side())
+            for p in (positions, moved_up)
+        ]
+        squares = [
+            0.5
+            * attraction.weights
+            @ ((attraction.interpolation @ p - attraction.positions) ** 2).sum(axis=1)
+            for p in (positions, moved_up)
+        ]
+        assert energies[1] - energies[0] == pytest.approx(squares[1] - squares[0])
+        assert uncovered.attraction(mesh_y.vertices, strengths) is None
 
     @pytest.mark.parametrize("flatness", [1, 1e-2, 1e-6, 0])
     def test_the_nearest_rotations_are_those_of_the_singular_value_decomposition(self, flatness):

@@ -17,6 +17,7 @@ from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surfac
 from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced
 from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_facing_points, nearest_surface_points
 from jaxsmw.runtime.threads import one_blas_thread
+from jaxsmw.transfer.coverage import Attraction, UncoveredVertices
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 from jaxsmw.wording import count_of
 
@@ -39,17 +40,26 @@ class _Round(NamedTuple):
     - `pull`: if positive, the round moves regions with reduced weights to their nearest points of the target,
       and along the target halfway back to their points of the map. The number is the weight of these
       positions, relative to the weight of the map elsewhere.
+    - `cover`: if positive, the round draws the source to vertices of the target that it does not reach. The
+      number is the weight of these vertices, relative to the weight of the map elsewhere.
     """
 
     deformations: int
     factor: float
     neighbors: int
     pull: float = 0.0
+    cover: float = 0.0
 
 
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
-# target, and folds that come back are removed. (Entry R22)
-_ROUNDS = (_Round(6, 0.2, 1), _Round(6, 0.4, 2), _Round(4, 0.4, 1, pull=0.4), _Round(6, 0.4, 1))
+# target, and folds that come back are removed. The last round covers the target. (Entries R22 and R37)
+_ROUNDS = (
+    _Round(6, 0.2, 1),
+    _Round(6, 0.4, 2),
+    _Round(4, 0.4, 1, pull=0.4),
+    _Round(6, 0.4, 1),
+    _Round(8, 0.4, 1, cover=0.3),
+)
 # A map is probably wrong if more than this share of the triangles is flipped, and if angles change by more
 # than this number of degrees in the mean. (Entry R35)
 _MANY_FLIPPED, _MANY_DEGREES = 0.003, 16.0
@@ -201,7 +211,8 @@ def register_mesh(
     stiffness times the squared changes of edge vectors. Before the changes are measured, the edge vectors of
     X are rotated and scaled with their neighbourhoods. The rotations are those of as-rigid-as-possible
     deformation (Sorkine, Alexa 2007); jaxsmw adds the scales. Where faces would flip, the map has less
-    weight, and vertices are also drawn to the nearest points of Y.
+    weight, and vertices are also drawn to the nearest points of Y. Where the deformation does not reach Y,
+    such as at the tips of ears, its nearest points are drawn to Y.
 
     **Arguments:**
 
@@ -239,29 +250,38 @@ def register_mesh(
     targets, positions, similarities = mapped.copy(), mapped, around.similarities(mapped)
     weights, number = areas.copy(), 0
     normals = _normals(mesh_x.vertices, mesh_x)
+    # A part does not cover a full shape.
+    part = scale is not None and around.size**2 * mesh_x.area < mesh_y.area
     for of_round in _ROUNDS:
         loose = weights < areas
+        if part if of_round.cover else number and not loose.any():
+            continue
         if of_round.pull:
             weights = np.where(loose, of_round.pull * areas, weights)
             surface = SurfaceTree(mesh_y)
+        if of_round.cover:
+            uncovered = UncoveredVertices(mesh_x, replace(mesh_y, vertices=mesh_y.vertices - middle))
+        before, attraction = weights, None
         for _ in range(of_round.deformations):
             if of_round.pull:
                 nearest, _ = surface.nearest(positions[loose] + middle)
                 targets[loose] = _halfway(nearest, mapped[loose] + middle, mesh_y) - middle
-            positions = _follow(around, similarities, weights, targets, stiffness * root, positions)
+            if of_round.cover:
+                attraction = uncovered.attraction(positions, of_round.cover * weights / before)
+            positions = _follow(
+                around, similarities, weights, targets, stiffness * root, positions, attraction
+            )
             similarities = around.similarities(positions)
             number += 1
             flipped = _flipped_faces(mesh_x, normals, positions, similarities)
             # The first deformation uses transformations that are fitted to the map itself, which is noisy.
-            if not (of_round.pull or flipped.any()) and number > 1:
+            if not (of_round.pull or attraction or flipped.any()) and number > 1:
                 break
             near = np.zeros(len(weights))
             near[mesh_x.faces[flipped]] = 1
             for _ in range(of_round.neighbors):
                 near = around.averaging @ near
             weights = np.where(near > 0, of_round.factor * weights, weights)
-        if not (weights < areas).any():
-            break
     similarities = Similarities(similarities.rotations, around.size * similarities.scales)
     return RegisteredMesh(mesh_x, mesh_y, *_with_unreferenced(mesh_x, positions + middle, similarities))
 
@@ -308,19 +328,23 @@ def _follow(
     targets: Float64[np.ndarray, "m 3"],
     stiffness: float,
     positions: Float64[np.ndarray, "m 3"],
+    attraction: Attraction | None = None,
 ) -> Float64[np.ndarray, "m 3"]:
     """Return the positions that follow weighted targets and edge vectors in the least-squares sense.
 
-    The edge vectors are those of X, transformed by `similarities`. The linear system is solved for the
+    The edge vectors are those of X, transformed by `similarities`. An attraction adds the weighted squared
+    distances between its points and its vertices of the target. The linear system is solved for the
     vertices at which the given positions are not accurate, and for their neighbours. All other vertices stay
     where they are. If their positions are no longer accurate then, the next deformation moves them.
     """
     system = csr_array(diags_array(weights) + stiffness**2 * around.laplacian)
     right = stiffness**2 * around.divergence(similarities) + weights[:, None] * targets
+    if attraction is not None:
+        system, right = system + attraction.matrix(), right + attraction.right_side()
     residual = right - system @ positions
-    # The row sums of the system are `weights`, and all entries off the diagonal are negative. Therefore the
-    # error of every position is at most the largest quotient of a residual and its weight. The criterion
-    # stays correct where small weights make the system ill-conditioned.
+    # Without an attraction, the row sums of the system are `weights`, and all entries off the diagonal are
+    # negative. Therefore the error of every position is at most the largest quotient of a residual and its
+    # weight. The criterion stays correct where small weights make the system ill-conditioned.
     moving = (np.abs(residual).max(axis=1) > _KEPT * stiffness * weights).astype(float)
     rows = np.flatnonzero(around.averaging @ moving)
     if not len(rows):

@@ -1,0 +1,97 @@
+"""Vertices of the target that a deformed source should reach but does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.sparse import csr_array, diags_array
+
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_distance import nearest_surface_points
+
+# A vertex of the target is uncovered if its distance from the source lies between these two lengths, in units
+# of the square root of the target's area. At a larger distance, the source probably lacks this part of the
+# body. (Entry R37 of docs/research_log.md)
+_UNCOVERED, _MISSING = 0.005, 0.1
+
+
+class Attraction(NamedTuple):
+    """Points of the source (c,) that are drawn to vertices of the target.
+
+    **Attributes:**
+
+    - `interpolation`: the barycentric weights of the points at the vertices of the source, a matrix (c, m).
+    - `weights`: the weights of the vertices of the target (c,).
+    - `positions`: the positions of the vertices of the target (c, 3).
+    """
+
+    interpolation: csr_array
+    weights: Float64[np.ndarray, " c"]
+    positions: Float64[np.ndarray, "c 3"]
+
+    def matrix(self) -> csr_array:
+        """Return the matrix (m, m) of the squared distances as a quadratic form of the source's vertices."""
+        return csr_array(self.interpolation.T @ (diags_array(self.weights) @ self.interpolation))
+
+    def right_side(self) -> Float64[np.ndarray, "m 3"]:
+        """Return the linear term of the squared distances."""
+        return self.interpolation.T @ (self.weights[:, None] * self.positions)
+
+
+class UncoveredVertices:
+    """The vertices of Y that a deformation of X does not reach, such as the tips of ears and fingers.
+
+    A vertex is not uncovered if its nearest triangle touches a boundary of X. Otherwise a hole of X would
+    close, or its edge would be drawn to a part of the body that X lacks.
+
+    **Arguments:**
+
+    - `mesh_x`: the source X (m vertices).
+    - `mesh_y`: the target Y, in the coordinates of the deformation.
+    """
+
+    def __init__(self, mesh_x: Mesh, mesh_y: Mesh) -> None:
+        self._mesh = mesh_x
+        self._root = np.sqrt(mesh_y.area)
+        used = mesh_y.referenced_vertices
+        self._positions, self._areas = mesh_y.vertices[used], mesh_y.vertex_areas[used]
+        self._on_boundary = np.zeros(len(mesh_x.vertices), bool)
+        self._on_boundary[mesh_x.boundary_edges] = True
+        self._first = True
+
+    def attraction(
+        self, positions: Float64[np.ndarray, "m 3"], strengths: Float64[np.ndarray, " m"]
+    ) -> Attraction | None:
+        """Draw the nearest points of a deformation of X to the uncovered vertices of Y.
+
+        After the first call, only vertices near or above the limit of uncovered vertices are considered.
+
+        **Arguments:**
+
+        - `positions`: the positions of the vertices of X.
+        - `strengths`: a factor for each vertex of X. The weight of an uncovered vertex of Y is its area times
+          the factor at its nearest point.
+
+        **Returns:** An `Attraction`, or None if no vertex is uncovered.
+        """
+        deformed = replace(self._mesh, vertices=positions)
+        points, distances = nearest_surface_points(self._positions, deformed)
+        if self._first:
+            near = np.flatnonzero(distances > 0.5 * _UNCOVERED * self._root)
+            self._positions, self._areas = self._positions[near], self._areas[near]
+            points, distances, self._first = points[near], distances[near], False
+        corners = self._mesh.faces[points.faces]
+        rows = (distances > _UNCOVERED * self._root) & (distances < _MISSING * self._root)
+        rows &= ~self._on_boundary[corners].any(axis=1)
+        if not rows.any():
+            return None
+        corners, weights = corners[rows], points.weights[rows]
+        starts = np.arange(0, weights.size + 1, 3)
+        shape = len(weights), len(positions)
+        interpolation = csr_array((weights.ravel(), corners.ravel(), starts), shape=shape)
+        return Attraction(
+            interpolation, self._areas[rows] * (interpolation @ strengths), self._positions[rows]
+        )
