@@ -44,7 +44,7 @@ from tqdm import tqdm
 from jaxsmw import geodesic_error, make_mesh, match, read_ground_truth, read_mesh
 from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection import Collection, CollectionSettings, match_collection
-from jaxsmw.collection.synchronization import vertex_map_between
+from jaxsmw.collection.synchronization import vertex_map_between, vertices_as_points
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.intervals import mean_interval
 from jaxsmw.geometry import nearest_surface_points
@@ -226,10 +226,9 @@ def _measure_landmarks(found: Collection, files: list[Path], i: int, j: int, sin
     names = [name for name in marks_x.names if name in set(marks_y.names)]
     marks_x, marks_y = marks_x.select(names), marks_y.select(names)
     if single is None:
-        on_template, _ = nearest_surface_points(marks_x.positions, found.registered[i].mesh)
-        images = found.registered[j].carry(on_template)
-        points, _ = nearest_surface_points(images, found.meshes[j])
-        carried = points.positions(found.meshes[j])
+        on_source, _ = nearest_surface_points(marks_x.positions, found.meshes[i])
+        on_target = found.registered[j].project(found.registered[i].project_back(on_source))
+        carried = on_target.positions(found.meshes[j])
     else:
         carried = transfer_landmarks(marks_x, single.registered_mesh()).landmarks.positions
     distances = np.linalg.norm(carried - marks_y.positions, axis=1)
@@ -248,12 +247,11 @@ def _cycles(found: Collection) -> dict[str, float]:
         i, j, k = generator.choice(number, 3, replace=False)
         mesh = found.meshes[i]
         vertex = generator.choice(np.flatnonzero(mesh.referenced_vertices), 20)
-        position, before = mesh.vertices[vertex], i
-        for after in (j, k, i):
-            points, _ = nearest_surface_points(position, found.registered[before].mesh)
-            points, _ = nearest_surface_points(found.registered[after].carry(points), found.meshes[after])
-            position, before = points.positions(found.meshes[after]), after
-        errors.append(np.linalg.norm(position - mesh.vertices[vertex], axis=1).mean() / mesh.area**0.5)
+        points = vertices_as_points(mesh)[vertex]
+        for before, after in ((i, j), (j, k), (k, i)):
+            points = found.registered[after].project(found.registered[before].project_back(points))
+        offsets = points.positions(mesh) - mesh.vertices[vertex]
+        errors.append(np.linalg.norm(offsets, axis=1).mean() / mesh.area**0.5)
     graph = found.cycle_errors or (np.array([]), np.array([]))
     parts = (("template", errors), ("graph_first", graph[0]), ("graph_final", graph[1]))
     found = {name: float(1e3 * np.mean(values)) if len(values) else float("nan") for name, values in parts}

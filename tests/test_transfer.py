@@ -27,7 +27,7 @@ from jaxsmw.transfer import (
     transfer_landmarks,
 )
 from jaxsmw.transfer.coverage import UncoveredVertices
-from jaxsmw.transfer.neighborhoods import Neighborhoods
+from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 from jaxsmw.transfer.registered_mesh import _follow
 
 TURN = Rotation.from_euler("zyx", [40, -70, 110], degrees=True).as_matrix()
@@ -118,9 +118,40 @@ class TestRegisteredMesh:
         offsets = registered.vertices - pair.truth.positions(pair.target)
         assert np.quantile(in_percent(offsets, pair.target), 0.99) < 0.5
         back = registered.points_of_target.positions(registered.mesh)
-        assert np.allclose(
-            np.linalg.norm(back - pair.target.vertices, axis=1), registered.target_distances, atol=1e-12
+        distances = np.linalg.norm(back - pair.target.vertices, axis=1)
+        same = np.isclose(distances, registered.target_distances, rtol=0, atol=1e-12)
+        assert same.mean() > 0.99  # nearest points on triangles that face away are replaced
+        assert (distances > registered.target_distances)[~same].all()
+
+    @pytest.mark.parametrize("matrix", [2.5 * TURN, MIRROR])
+    def test_points_return_from_the_other_mesh(self, matrix):
+        mesh_x = bumpy_mesh(3)
+        registered = on_same_numbering(mesh_x, moved(mesh_x, matrix, turned_over=matrix is MIRROR))
+        generator = np.random.default_rng(0)
+        faces = generator.integers(len(mesh_x.faces), size=50)
+        points = SurfacePoints(faces, generator.dirichlet([1, 1, 1], size=50))
+        there = registered.project(points)
+        expected = points.positions(mesh_x) @ matrix.T + SHIFT
+        assert np.allclose(there.positions(registered.mesh_y), expected, atol=1e-4)
+        back = registered.project_back(there)
+        assert np.allclose(back.positions(mesh_x), points.positions(mesh_x), atol=1e-4)
+
+    def test_points_stay_on_their_side_of_touching_layers(self):
+        vertices, faces = grid_mesh(9, 9)
+        n = len(vertices)
+        gap = np.array([0, 0, 1e-3])
+        layers = make_mesh(
+            np.vstack([vertices + gap, vertices - gap]), np.vstack([faces, faces[:, ::-1] + n])
         )
+        # At one edge, the layers cross each other, as the registered meshes of two touching thighs can.
+        edge = layers.vertices[:, 0] < np.quantile(layers.vertices[:, 0], 0.15)
+        crossed = np.where(edge[:, None], layers.vertices * [1, 1, -1], layers.vertices)
+        one = Similarities(np.tile(np.eye(3), (2 * n, 1, 1)), np.ones(2 * n))
+        registered = RegisteredMesh(layers, layers, crossed, one)
+        points = SurfacePoints(np.arange(len(layers.faces)), np.full((len(layers.faces), 3), 1 / 3))
+        for project in (registered.project, registered.project_back):
+            same = project(points).positions(layers)[:, 2] == points.positions(layers)[:, 2]
+            assert same.all()
 
     def test_units_and_places_do_not_matter(self):
         pair = creature_pair(vertices=700)

@@ -14,7 +14,6 @@ from jaxsmw.descriptors import DescriptorAxes
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.transfer.registered_mesh import RegisteredMesh, register_mesh
 from jaxsmw.wording import count_of
 
@@ -187,9 +186,10 @@ class Collection:
         **Raises:** `InputError` if a number is not the number of a shape.
         """
         self._check_number(source, target)
-        images = self.registered[target].carry(self.registered[source].points_of_target)
-        mesh = self.meshes[target]
-        return nearest_surface_points(images, mesh)[0].nearest_corners(mesh)
+        return self._surface_points(source, target).nearest_corners(self.meshes[target])
+
+    def _surface_points(self, source: int, target: int) -> SurfacePoints:
+        return self.registered[target].project(self.registered[source].points_of_target)
 
     def registered_mesh(self, source: int, target: int) -> RegisteredMesh:
         """Register one shape on another, by the map through the template; see `register_mesh`.
@@ -202,8 +202,7 @@ class Collection:
         self._check_number(source, target)
         if source == self.template:
             return self.registered[target]
-        images = self.registered[target].carry(self.registered[source].points_of_target)
-        points, _ = nearest_surface_points(images, self.meshes[target])
+        points = self._surface_points(source, target)
         return register_mesh(self.meshes[source], self.meshes[target], points)
 
     @property

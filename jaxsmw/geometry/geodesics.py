@@ -51,7 +51,8 @@ class SurfacePoints:
     """Points on the faces of a mesh, given by barycentric weights.
 
     `len(points)` is the number p of points. `points[rows]` selects points by an array `rows` of 0-based
-    indices. The method `positions(mesh)` returns the positions (p, 3) of the points. The method
+    indices. The method `positions(mesh)` returns the positions (p, 3) of the points, and
+    `interpolate(values, mesh)` returns the values of a function at the points. The method
     `nearest_corners(mesh)` returns for each point the nearest corner of its face, as 0-based vertex indices
     (p,). The constructor checks nothing. Functions that receive `SurfacePoints` check them.
 
@@ -73,7 +74,11 @@ class SurfacePoints:
 
     def positions(self, mesh: Mesh) -> Float64[np.ndarray, "p 3"]:
         """Return the positions (p, 3) of the points in space, in the unit of their mesh."""
-        return np.einsum("pk,pkx->px", self.weights, mesh.vertices[mesh.faces[self.faces]])
+        return self.interpolate(mesh.vertices, mesh)
+
+    def interpolate(self, values: Float64[np.ndarray, "n x"], mesh: Mesh) -> Float64[np.ndarray, "p x"]:
+        """Return the values at the points (p, x), given the values at the n vertices of the mesh."""
+        return np.einsum("pk,pkx->px", self.weights, values[mesh.faces[self.faces]])
 
     def nearest_corners(self, mesh: Mesh) -> Int64[np.ndarray, " p"]:
         """Return for each point the nearest corner of its face, as an array of vertices (p,)."""

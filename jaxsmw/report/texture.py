@@ -41,7 +41,7 @@ def write_textured_pair(
     **Raises:** `InputError` if a file cannot be written.
     """
     on_target = _projection(mesh_y)
-    on_source = np.einsum("pk,pku->pu", points.weights, on_target[mesh_y.faces[points.faces]])
+    on_source = points.interpolate(on_target, mesh_y)
     picture, material, target, source = (Path(directory) / name for name in TEXTURE_FILES)
     with atomic_write(picture) as temporary:
         imsave(temporary, _checkered(), origin="lower")

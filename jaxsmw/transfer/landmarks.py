@@ -70,7 +70,7 @@ def transfer_landmarks(
         )
     notes = check_frame(landmarks, mesh_x)
     points, distances = nearest_surface_points(landmarks.positions, mesh_x)
-    images, _ = nearest_surface_points(registered.carry(points), mesh_y)
+    images = registered.project(points)
     errors = None
     if expected_error is not None:
         at_corners = expected_error[mesh_x.faces[points.faces]]

@@ -104,9 +104,17 @@ class RegisteredMesh:
 
         Triangles of Y that face away from a vertex are left out; see `nearest_facing_points`.
         """
-        hand = np.sign(np.linalg.det(self.similarities.rotations[0]))
-        normals = hand * self.mesh.vertex_normals
-        return nearest_facing_points(self.vertices, normals, self._nearest[0], self.mesh_y)
+        return nearest_facing_points(self.vertices, self._normals, self._nearest[0], self.mesh_y)
+
+    @cached_property
+    def _normals(self) -> Float64[np.ndarray, "m 3"]:
+        """The normals of the registered mesh, on the side of the normals of Y."""
+        return self._hand * self.mesh.vertex_normals
+
+    @property
+    def _hand(self) -> float:
+        """1, or -1 if X and Y are of opposite hands."""
+        return float(np.sign(np.linalg.det(self.similarities.rotations[0])))
 
     @cached_property
     def distances(self) -> Float64[np.ndarray, " m"]:
@@ -158,13 +166,52 @@ class RegisteredMesh:
         """
         return check_surface_points(points, self.mesh_x, "points").positions(self.mesh)
 
+    def project(self, points: SurfacePoints) -> SurfacePoints:
+        """Map points on X to points on Y.
+
+        Each point moves with its triangle to the registered mesh, and then to the nearest point of Y.
+        Triangles of Y that face away are left out, as in `surface_points`.
+
+        **Arguments:**
+
+        - `points`: `SurfacePoints` on X with p entries.
+
+        **Returns:** `SurfacePoints` on Y with p entries.
+
+        **Raises:** `InputError` if a point is not on X.
+        """
+        positions = self.carry(points)
+        nearest, _ = nearest_surface_points(positions, self.mesh_y)
+        normals = points.interpolate(self._normals, self.mesh_x)
+        return nearest_facing_points(positions, normals, nearest, self.mesh_y)
+
+    def project_back(self, points: SurfacePoints) -> SurfacePoints:
+        """Map points on Y to points on X.
+
+        Each point moves to the nearest point of the registered mesh, whose triangles are those of X.
+        Triangles that face away are left out, as in `surface_points`.
+
+        **Arguments:**
+
+        - `points`: `SurfacePoints` on Y with p entries.
+
+        **Returns:** `SurfacePoints` on X with p entries.
+
+        **Raises:** `InputError` if a point is not on Y.
+        """
+        positions = check_surface_points(points, self.mesh_y, "points").positions(self.mesh_y)
+        nearest, _ = nearest_surface_points(positions, self.mesh)
+        normals = self._hand * points.interpolate(self.mesh_y.vertex_normals, self.mesh_y)
+        return nearest_facing_points(positions, normals, nearest, self.mesh)
+
     @cached_property
     def points_of_target(self) -> SurfacePoints:
         """The point of X for each vertex of Y, a map Y -> X: `SurfacePoints` on X with n entries.
 
-        Each vertex of Y is projected onto the registered mesh, which has the faces of X.
+        Each vertex of Y is projected onto the registered mesh, as by `project_back`.
         """
-        return self._nearest_of_target[0]
+        normals = self._hand * self.mesh_y.vertex_normals
+        return nearest_facing_points(self.mesh_y.vertices, normals, self._nearest_of_target[0], self.mesh)
 
     @cached_property
     def target_distances(self) -> Float64[np.ndarray, " n"]:
