@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, get_args
 
 from jaxsmw.choices import CoordinateSystem
@@ -17,7 +18,7 @@ from jaxsmw.cli.arguments import (
     path,
     refuse_without,
 )
-from jaxsmw.cli.conclusion import estimate_error, show_quality, write_match_report
+from jaxsmw.cli.conclusion import show_quality, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_maps, report_mesh
 from jaxsmw.cli.method import add_method, check_preset, given_method, match_meshes
@@ -132,11 +133,8 @@ def run(options: argparse.Namespace) -> None:
                 "skin or other data) for --attributes: leave the option out, or give a source that has some."
             )
         landmarks = _read_landmarks(options, source) if options.landmarks else None
-    correspondence, registered = _register(options, source, target, stopwatch)
-    expected = None
+    correspondence, registered, expected = _register(options, source, target, stopwatch)
     if correspondence is not None:
-        if landmarks or options.report:
-            expected = estimate_error(correspondence, stopwatch)
         show_quality(correspondence, expected)
     for sentence in registered.sentences():
         show(sentence)
@@ -255,9 +253,14 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
 
 def _register(
     options: argparse.Namespace, source: MeshData, target: MeshData, stopwatch: Stopwatch
-) -> tuple[Correspondence | None, RegisteredMesh]:
-    """Return the match and the registered mesh. If a map is given, the match is None."""
+) -> tuple[Correspondence | None, RegisteredMesh, Float[np.ndarray, " m"] | None]:
+    """Return the match, the registered mesh and the expected error of each match (m,).
+
+    If a map is given, the match and the expected error are None. The expected error is also None if neither
+    landmarks nor a report need it.
+    """
     from jaxsmw.pair import Pair
+    from jaxsmw.runtime.threads import one_blas_thread
     from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, points_of_map, register_mesh
 
     meshes, index_base = (source.mesh, target.mesh), options.index_base
@@ -271,16 +274,26 @@ def _register(
             scale=options.scale,
             index_base=index_base,
         )
-        report_progress("registered mesh ...")
-        with stopwatch.step("registered mesh"):
-            return correspondence, correspondence.registered_mesh(stiffness=stiffness)
+        if not (options.landmarks or options.report):
+            report_progress("registered mesh ...")
+            with stopwatch.step("registered mesh"):
+                return correspondence, correspondence.registered_mesh(stiffness=stiffness), None
+        report_progress("registered mesh and expected error ...")
+        with (
+            stopwatch.step("registered mesh and expected error"),
+            one_blas_thread(),
+            ThreadPoolExecutor(1) as executor,
+        ):
+            expected = executor.submit(correspondence.expected_error)
+            registered = correspondence.registered_mesh(stiffness=stiffness)
+            return correspondence, registered, expected.result()
     report_progress("registered mesh ...")
     with stopwatch.step("registered mesh"):
         (pointwise_map,) = read_maps([options.map], *meshes, index_base=index_base).values()
         pair = Pair.make(*meshes, partial=options.partial, scale=options.scale or 1.0)
         scale = pair.scale if pair.partial else None
         points = points_of_map(*meshes, pointwise_map, scale=scale)
-        return None, register_mesh(*meshes, points, stiffness=stiffness, scale=scale)
+        return None, register_mesh(*meshes, points, stiffness=stiffness, scale=scale), None
 
 
 def _transfer_landmarks(

@@ -58,7 +58,7 @@ _ROUNDS = (
     _Round(6, 0.4, 2),
     _Round(4, 0.4, 1, pull=0.4),
     _Round(6, 0.4, 1),
-    _Round(8, 0.4, 1, cover=0.3),
+    _Round(5, 0.4, 1, cover=0.3),
 )
 # A map is probably wrong if more than this share of the triangles is flipped, and if angles change by more
 # than this number of degrees in the mean. (Entry R35)
