@@ -52,13 +52,12 @@ class _Round(NamedTuple):
 
 
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
-# target, and folds that come back are removed. The last round covers the target. (Entries R22 and R37)
+# target. The last round covers the target, and removes folds that come back. (Entries R22 and R37)
 _ROUNDS = (
     _Round(6, 0.2, 1),
     _Round(6, 0.4, 2),
-    _Round(4, 0.4, 1, pull=0.4),
-    _Round(6, 0.4, 1),
-    _Round(5, 0.4, 1, cover=0.3),
+    _Round(4, 0.4, 1, pull=0.2),
+    _Round(6, 0.4, 1, cover=0.3),
 )
 # A map is probably wrong if more than this share of the triangles is flipped, and if angles change by more
 # than this number of degrees in the mean. (Entry R35)
@@ -309,11 +308,11 @@ def register_mesh(
         if of_round.cover:
             uncovered = UncoveredVertices(mesh_x, replace(mesh_y, vertices=mesh_y.vertices - middle))
         before, attraction = weights, None
-        for _ in range(of_round.deformations):
+        for step in range(of_round.deformations):
             if of_round.pull:
                 nearest, _ = surface.nearest(positions[loose] + middle)
                 targets[loose] = _halfway(nearest, mapped[loose] + middle, mesh_y) - middle
-            if of_round.cover:
+            if of_round.cover and step % 2 == 0:  # the search takes as long as a deformation
                 attraction = uncovered.attraction(positions, of_round.cover * weights / before)
             positions = _follow(
                 around, similarities, weights, targets, stiffness * root, positions, attraction
