@@ -54,9 +54,9 @@ class _Round(NamedTuple):
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
 # target. The last round covers the target, and removes folds that come back. (Entries R22 and R37)
 _ROUNDS = (
-    _Round(6, 0.2, 1),
-    _Round(6, 0.4, 2),
-    _Round(4, 0.4, 1, pull=0.2),
+    _Round(5, 0.2, 1),
+    _Round(5, 0.4, 2),
+    _Round(3, 0.4, 1, pull=0.2),
     _Round(6, 0.4, 1, cover=0.3),
 )
 # A map is probably wrong if more than this share of the triangles is flipped, and if angles change by more
