@@ -182,13 +182,13 @@ class TestRegisteredMesh:
     def test_tips_are_reached_that_the_map_misses(self):
         mesh_y = spiked_sphere()
         height = mesh_y.vertices[:, 2]
-        low = np.flatnonzero(height < 1.15)
+        low = np.flatnonzero(height < 1.3)
         points = at_vertices(mesh_y, low[KDTree(mesh_y.vertices[low]).query(mesh_y.vertices)[1]])
-        tip = height > 1.2
+        tip = height > 1.3
         mapped = replace(mesh_y, vertices=points.positions(mesh_y))
         before = distances_to_surface(mesh_y.vertices[tip], mapped)
         registered = register_mesh(mesh_y, mesh_y, points)
-        assert registered.target_distances[tip].mean() < 0.6 * before.mean()
+        assert registered.target_distances[tip].mean() < 0.7 * before.mean()
         assert not registered.flipped_faces.any()
 
     def test_a_part_is_not_drawn_to_what_it_lacks(self):
@@ -208,7 +208,7 @@ class TestRegisteredMesh:
         attraction = uncovered.attraction(positions, strengths)
         deformed = replace(mesh_y, vertices=positions)
         distances = distances_to_surface(mesh_y.vertices, deformed) / np.sqrt(mesh_y.area)
-        expected = (distances > 0.005) & (distances < 0.1)
+        expected = (distances > 0.005) & (distances < 0.03)
         assert 5 < expected.sum() == len(attraction.weights)
         np.testing.assert_array_equal(attraction.positions, mesh_y.vertices[expected])
         np.testing.assert_allclose(attraction.weights, 0.5 * mesh_y.vertex_areas[expected])

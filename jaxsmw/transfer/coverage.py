@@ -13,9 +13,9 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 
 # A vertex of the target is uncovered if its distance from the source lies between these two lengths, in units
-# of the square root of the target's area. At a larger distance, the source probably lacks this part of the
-# body. (Entry R37 of docs/research_log.md)
-_UNCOVERED, _MISSING = 0.005, 0.1
+# of the square root of the target's area. Vertices at larger distances would stretch single triangles into
+# spikes. (Entry R37 of docs/research_log.md)
+_UNCOVERED, _MISSING = 0.005, 0.03
 
 
 class Attraction(NamedTuple):
