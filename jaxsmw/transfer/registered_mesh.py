@@ -288,7 +288,8 @@ def register_mesh(
     root = np.sqrt(mesh_y.area)
     # Positions are relative to the middle of Y, because large coordinates would lose digits.
     middle = mesh_y.vertices[mesh_y.referenced_vertices].mean(axis=0)
-    mapped = points.positions(mesh_y) - middle
+    target = replace(mesh_y, vertices=mesh_y.vertices - middle)
+    mapped = points.positions(target)
     around = Neighborhoods(mesh_x, root / np.sqrt(mesh_x.area) if scale is None else scale)
     areas = around.size**2 * mesh_x.vertex_areas
     # A vertex of no or little area still follows the map.
@@ -304,14 +305,14 @@ def register_mesh(
             continue
         if of_round.pull:
             weights = np.where(loose, of_round.pull * areas, weights)
-            surface = SurfaceTree(mesh_y)
+            surface = SurfaceTree(target)
         if of_round.cover:
-            uncovered = UncoveredVertices(mesh_x, replace(mesh_y, vertices=mesh_y.vertices - middle))
+            uncovered = UncoveredVertices(mesh_x, target)
         before, attraction = weights, None
         for step in range(of_round.deformations):
             if of_round.pull:
-                nearest, _ = surface.nearest(positions[loose] + middle)
-                targets[loose] = _halfway(nearest, mapped[loose] + middle, mesh_y) - middle
+                nearest, _ = surface.nearest(positions[loose])
+                targets[loose] = _halfway(nearest, mapped[loose], target)
             if of_round.cover and step % 2 == 0:  # the search takes as long as a deformation
                 attraction = uncovered.attraction(positions, of_round.cover * weights / before)
             positions = _follow(
