@@ -66,13 +66,14 @@ class Correspondence:
     - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
       hands, such as a left and a right tooth. Whether X is mirrored or not, entry i of `pointwise_map` is the
       match of vertex i of X.
-    - `mirror_evidence`: a logarithm that is positive if the mirror image of X seems to match Y better than X
-      itself does; None if `match` did not compare the two. The distance error of a coarse map of X itself is
-      at least `exp(mirror_evidence)` times the distance error of a coarse map of the mirror image
-      (`jaxsmw.repair.chirality.Hands`). If X and Y differ enough from their own mirror images, a value of at
-      least 0.05 leads to `mirrored=True`. Most correct decisions with `mirrored=True` have values above 0.3.
-    - `seconds`: a dictionary from the name of each step to its wall time in seconds. The first refinement of
-      meshes of a given size includes the time of compilation.
+    - `mirror_evidence`: the evidence that the mirror image of X, and not X itself, corresponds to Y; None if
+      `match` computed no evidence. The evidence is the logarithm of a ratio: the distance error of a coarse
+      map of X itself, divided by the distance error of a coarse map of the mirror image. `match` compares up
+      to two pairs of coarse maps and keeps the smaller evidence (`jaxsmw.repair.chirality.Hands`). If X and Y
+      differ enough from their own mirror images, a value of at least 0.05 leads to `mirrored=True`. Most
+      correct decisions with `mirrored=True` have values above 0.3.
+    - `seconds`: a dictionary from the name of each step to its wall time in seconds. If meshes of a certain
+      size are refined for the first time, the time includes compilation.
     """
 
     pair: Pair
@@ -138,7 +139,7 @@ class Correspondence:
     def reverse_surface_points(self) -> SurfacePoints:
         """Compute the match of every vertex of Y as a point on a triangle of X.
 
-        The map Y -> X comes from the same embeddings as `surface_points`, and needs no second match.
+        The method uses the same embeddings as `surface_points`, so `match` is not called again.
 
         **Returns:** A `SurfacePoints` with n points on X, one for each vertex of Y. An unreferenced vertex of
         Y receives the point of the nearest referenced vertex.
@@ -148,7 +149,7 @@ class Correspondence:
         return self._points_near(self.pair.reversed(), self.reverse_map(), queries, embedded_x)
 
     def reverse_map(self) -> Int64[np.ndarray, " n"]:
-        """Compute the map Y -> X from the embeddings of the last stage, without a second match.
+        """Compute the map Y -> X from the embeddings of the last stage, without a second call of `match`.
 
         **Returns:** The match of every vertex of Y (n,), as a 0-based vertex of X. An unreferenced vertex of
         Y receives the match of the nearest referenced vertex.
@@ -188,8 +189,8 @@ class Correspondence:
 
         **Arguments:**
 
-        - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map with
-          shorter wavelengths is smoothed. The default is 0.005.
+        - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map is smoothed
+          if its wavelength is shorter than the stiffness. The default is 0.005.
 
         **Returns:** A `RegisteredMesh`, whose attribute `vertices` (m, 3) contains positions on Y, in the
         unit of Y. `jaxsmw.transfer` transfers landmarks and attributes with a registered mesh.
@@ -214,8 +215,8 @@ class Correspondence:
 
         **Returns:** The map X -> Y (m,), as 0-based vertices of Y.
 
-        **Raises:** `InputError` if X has more referenced vertices than Y, or if X's number of referenced
-        vertices times Y's number of referenced vertices is above 20 000².
+        **Raises:** `InputError` if X has more referenced vertices than Y, or if the product of the numbers of
+        referenced vertices of X and Y is above 20 000².
         """
         queries, database = self._embeddings()
         used = self.mesh_x.referenced_vertices
@@ -226,13 +227,14 @@ class Correspondence:
         """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
 
         `SoftMap.pull_back` transfers functions smoothly from Y to X. `SoftMap.pointwise_map` covers more of Y
-        than `Correspondence.pointwise_map`. On four remeshed FAUST pairs, `SoftMap.pointwise_map` covers 76
-        to 82 % of Y's vertices, and `Correspondence.pointwise_map` covers 69 to 75 %. Compared with
-        `Correspondence.pointwise_map`, the errors of `SoftMap.pointwise_map` range from 4 % smaller to 2 %
-        larger. One iteration takes 0.2 seconds for 5000 vertices, and 20 iterations are needed.
+        than `Correspondence.pointwise_map`. Both maps were compared on four remeshed FAUST pairs.
+        `SoftMap.pointwise_map` covers 76 to 82 % of Y's vertices, depending on the pair, and
+        `Correspondence.pointwise_map` covers 69 to 75 %. The error of `SoftMap.pointwise_map` is up to 4 %
+        smaller or up to 2 % larger than the error of `Correspondence.pointwise_map`. One iteration takes 0.2
+        seconds for 5000 vertices, and 20 iterations are needed.
 
         An unreferenced vertex of X is mapped like the nearest referenced vertex. The method issues a
-        `UserWarning` if the share of misplaced area is larger than `tolerance` after the last iteration.
+        `UserWarning` if the iterations end before they reach the tolerance.
 
         **Arguments:**
 
@@ -241,9 +243,10 @@ class Correspondence:
           vertices of Y. A temperature of 0.1 gives a sharper map than 0.3 and needs more iterations. A
           temperature of 1 gives a softer map than 0.3.
         - `iterations`: the maximum number of iterations, an integer of at least 1.
-        - `tolerance`: the share of misplaced area, from 0 to 1, at which iterations stop. Misplaced area is
-          the area that vertices of Y receive in excess of their own areas. Between two different bodies, a
-          tolerance below a few hundredths costs further iterations but does not improve the map.
+        - `tolerance`: a number from 0 to 1. The iterations stop when the misplaced area is at most this share
+          of the total area. Misplaced area is the area that vertices of Y receive in excess of their own
+          areas. If X and Y are different bodies, a tolerance below a few hundredths costs further iterations
+          but does not improve the map.
 
         **Returns:** A `SoftMap` from the m vertices of X to the n vertices of Y. Its method `pull_back` takes
         p functions on Y (n, p) to functions on X (m, p), and its method `pointwise_map` returns a map X -> Y
@@ -308,7 +311,7 @@ class Correspondence:
         return self.estimate_error(ExpectedErrorSettings())
 
     def estimate_error(self, settings: ExpectedErrorSettings) -> Float[np.ndarray, " m"]:
-        """Return the `expected_error` with other settings (m,), divided by the square root of Y's area."""
+        """Return what `expected_error` returns (m,), but computed with the given settings."""
         expected = expected_error(
             self.pair.mirrored() if self.mirrored else self.pair,
             self.pointwise_map,

@@ -26,7 +26,7 @@ from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 # distinguish two vertices that are a few hundredths of the square root of the area apart. Therefore 10 000
 # samples are dense enough.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
-# On meshes with at least `_FINE` vertices, a neighbourhood of the smaller radius contains about ten or more
+# On meshes with at least `_FINE` vertices, a neighbourhood of the smaller radius contains at least about ten
 # vertices.
 _FINE, _FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
 # Descriptors with a radius above `SHOT_RADIUS` vary slowly over the surface. Therefore they are computed at
@@ -35,7 +35,7 @@ _SPREAD = 2000
 
 
 class SampledShape(NamedTuple):
-    """A shape with the vertices at which its descriptors are compared (the compared vertices).
+    """A shape, and the vertices at which its descriptors are compared (the compared vertices).
 
     On a large mesh, descriptors are compared only at samples. On any other mesh, they are compared at all
     vertices.
@@ -55,7 +55,7 @@ class SampledShape(NamedTuple):
     def make(cls, mesh: Mesh, samples: SurfaceSamples | None, spectrum: Spectrum) -> SampledShape:
         """Make a sampled shape from a mesh and its spectrum, which has all n vertices of the mesh.
 
-        **Raises:** `InputError` if the spectrum has another number of vertices than the mesh.
+        **Raises:** `InputError` if the spectrum and the mesh have different numbers of vertices.
         """
         if (rows := spectrum.eigenvectors.shape[0]) != (n := len(mesh.vertices)):
             raise InputError(
@@ -113,7 +113,7 @@ def sample_pair(pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> Sampl
 
     **Returns:** The sampled pair.
 
-    **Raises:** `InputError` if a spectrum has another number of vertices than its mesh.
+    **Raises:** `InputError` if a spectrum and its mesh have different numbers of vertices.
     """
     samples_x, samples_y = side_by_side(compared_samples, *pair.meshes)
     return SampledPair(
@@ -155,7 +155,7 @@ def describe(
     function issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
 
     **Raises:** `InputError` if `number_of_descriptors` is not from 1 to 352, if a mesh is too coarse for SHOT
-    at more than half of its vertices, or if a spectrum has another number of vertices than its mesh.
+    at more than half of its vertices, or if a spectrum and its mesh have different numbers of vertices.
     """
     if not 1 <= number_of_descriptors <= SHOT_DIMENSION:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The exception for input that cannot be used, and checks of arguments that raise it."""
+"""The exception for input that cannot be used, and functions that check arguments."""
 
 import math
 from numbers import Integral, Real
@@ -52,9 +52,9 @@ def check_number(name: str, value: Any, *, most: float = math.inf, positive: boo
     - `name`: the name of the argument.
     - `value`: the value of the argument.
     - `most`: the largest valid number.
-    - `positive`: whether zero is not valid.
+    - `positive`: True if the number must be greater than zero.
 
-    **Raises:** `InputError` if the value is not a finite number within these limits.
+    **Raises:** `InputError` if the value is not a finite number, or lies outside these limits.
     """
     wanted = "a positive finite number" if positive else "a finite number of at least 0"
     if math.isfinite(most):

@@ -61,9 +61,8 @@ def match(
 ) -> Correspondence:
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
-    The function issues a `UserWarning` if the map looks wrong (after repair, if the preset has repair), if X
-    and its mirror image match Y about equally well, or if a mesh is too coarse for the descriptors of the
-    preset.
+    The function issues a `UserWarning` if the final map looks wrong, if X and its mirror image match Y about
+    equally well, or if a mesh is too coarse for the descriptors of the preset.
 
     **Arguments:**
 
@@ -71,9 +70,10 @@ def match(
       argument is a `Mesh`, a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
       `make_mesh`.
     - `preset`: the method of refinement, which is one of the following. The number of eigenvectors of a
-      preset (a name or a `Preset`) is limited to half the number of vertices of the smaller mesh. If a mesh
-      does not have more vertices than the preset has samples, the preset uses all vertices instead of
-      samples. If you give stages instead of a preset, `match` uses the stages unchanged.
+      preset (a name or a `Preset`) is limited to half the number of vertices of the smaller mesh. If the
+      number of samples of a preset is at least the number of vertices of the smaller mesh, the preset uses
+      all vertices instead of samples. If you give stages instead of a preset, `match` uses the stages
+      unchanged.
 
         - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
@@ -84,11 +84,11 @@ def match(
 
     - `init`: the initial map, which is one of the following.
 
-        - `"auto"` (the default): `"shot"`. The initial map `"aligned"` is refined as well if `partial` is
-          False, the preset has repair, and both shapes differ from their own mirror images, as teeth do. The
-          map from `"aligned"` is then chosen unless the mean expected error of the map from `"shot"` is at
-          least 10 % smaller. Both expected errors are computed without the factor for the difference of the
-          shapes.
+        - `"auto"` (the default): `"shot"`. For shapes that differ from their own mirror images, such as
+          teeth, the initial map `"aligned"` is refined as well. This happens only if `partial` is False and
+          the preset has repair. The map from `"aligned"` is then chosen unless the mean expected error of the
+          map from `"shot"` is more than 10 % smaller. Both expected errors are computed with
+          `ExpectedErrorSettings(area_weight=0)`.
         - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
           with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, repair also tries alternative maps.
@@ -149,7 +149,7 @@ def match(
 
     automatic = isinstance(init, str) and init == "auto"
     first_init = DEFAULT_INITIAL_MAP if automatic else init
-    check_initial_map(pair, first_init)  # before the eigenbases, which take longer
+    check_initial_map(pair, first_init)  # first, because the eigenbases take longer
     compiling = _compile_ahead(pair, chosen, history)
     seconds: dict[str, float] = {}
     with timed("eigenbases", seconds):
@@ -157,7 +157,7 @@ def match(
             pair, chosen.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
         )
     decision = Decision(mirror == "yes")
-    aligns = automatic and chosen.repair is not None  # if the shapes are asymmetric
+    aligns = automatic and chosen.repair is not None  # used only for asymmetric shapes
     if (mirror == "auto" or aligns) and not partial:
         with timed("mirror test", seconds):
             decision = Hands(pair, *spectra).decide(mirror)
@@ -227,8 +227,8 @@ def match_prepared(
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `starts`: one prepared pair for each initial map: a single one, or one with `"shot"` and one with
-      `"aligned"`, in this order. If `decision.mirrored` is True, the prepared pairs contain the mirror image
+    - `starts`: a prepared pair for each initial map. If there are two initial maps, the first is `"shot"` and
+      the second is `"aligned"`. If `decision.mirrored` is True, the prepared pairs contain the mirror image
       of X instead of X.
     - `preset`: the stages and the repair.
     - `decision`: the decision between X and its mirror image.
@@ -237,8 +237,8 @@ def match_prepared(
       and no progress is reported.
     - `compiling`: background compilations that refinement waits for.
     - `alternatives`: whether repair tries alternative maps.
-    - `refined`: for each start, the outcome of all stages if the stages already ran; see
-      `jaxsmw.repair.batches`.
+    - `refined`: the outcome of all stages for each element of `starts`, or None where the stages have not run
+      yet; see `jaxsmw.repair.batches`. An empty sequence (the default) means that no stages have run yet.
 
     **Returns:** The `Match`.
 
@@ -282,9 +282,10 @@ def match_prepared(
 
 
 def _inconsistency(found: Match) -> float:
-    """Return the mean expected error of a map, without the factor for the difference of the shapes.
+    """Return the mean expected error of a map, with `area_weight` 0.
 
-    The factor depends on the shapes, not on the quality of the map. (Entry R24 of docs/research_log.md)
+    The weight adds a factor that depends on the shapes, not on the quality of the map. (Entry R24 of
+    docs/research_log.md)
     """
     settings = ExpectedErrorSettings(area_weight=0.0)
     return float(found.correspondence.mesh_x.average(found.correspondence.estimate_error(settings)))
@@ -303,8 +304,8 @@ def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[obj
     """Compile the programs of all stages in the background.
 
     Nothing is compiled for partial pairs, because their numbers of eigenvectors are not known yet. Nothing is
-    compiled either if a mesh has no more vertices than the preset has eigenvectors, because `prepare` then
-    raises an error.
+    compiled either if a mesh has too few vertices for the eigenvectors of the preset, because
+    `paired_spectra` then raises an error.
     """
     if pair.partial or preset.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
         return []

@@ -73,8 +73,8 @@ class Pair:
 
         **Raises:** `InputError` if `jaxsmw.make_mesh` refuses a mesh, or `partial` is not a Boolean.
         `InputError` is also raised if the scale is neither positive nor `"unknown"`, if full shapes have a
-        scale, or if the scale cannot be estimated. For a partial pair, `InputError` is raised if one mesh is
-        closed and is clearly smaller than the other mesh.
+        scale, or if the scale cannot be estimated. For a partial pair, `InputError` is also raised if
+        one mesh is closed, the other mesh is open, and the closed mesh has a clearly smaller area.
         """
         if not isinstance(partial, bool | np.bool):
             raise InputError(f"partial is {partial!r}: give True or False.")
@@ -110,14 +110,17 @@ class Pair:
 
     @property
     def areas(self) -> tuple[float, float]:
-        """The areas of X and of Y in `units_of_length`: 1 for full shapes and for the larger shape."""
+        """The areas of X and of Y in `units_of_length`.
+
+        Two full shapes each have area 1. In a partial pair, the larger shape has area 1.
+        """
         unit_x, unit_y = self.units_of_length
         return self.mesh_x.area / unit_x**2, self.mesh_y.area / unit_y**2
 
     def _check_areas(self) -> None:
-        """Check that a closed mesh, which cannot be the partial shape, is not the smaller mesh.
+        """Check that a closed full shape is not clearly smaller than its open part.
 
-        **Raises:** `InputError` if it is.
+        **Raises:** `InputError` if the closed mesh has clearly less area than the open mesh.
         """
         sides = zip(self.meshes, self.areas, map(relative_boundary, self.meshes), strict=True)
         (closed, small, hole), (other, large, boundary) = sorted(sides, key=lambda side: side[2])
@@ -195,14 +198,15 @@ def paired_spectra(
 
     Two full shapes are each scaled to area 1, which compensates for a difference in size. The shapes of a
     partial pair are scaled by one common factor, so that the larger shape has area 1. For a partial pair, the
-    spectra are then cut at a common limit: the smaller of the two shapes' largest eigenvalues. Eigenpairs
-    with eigenvalues above this limit are removed, so k_X and k_Y usually differ for a partial pair.
+    spectra are then cut at a common limit. The limit is the largest eigenvalue of X or the largest eigenvalue
+    of Y, whichever is smaller. Eigenpairs with eigenvalues above this limit are removed, so k_X and k_Y
+    usually differ for a partial pair.
 
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
-    - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh, at least 1 and
-      less than the number of referenced vertices.
+    - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh. It must be at
+      least 1, and less than the number of referenced vertices of each mesh.
     - `laplacian`: the discretization of the Laplacian. `"cotangent"` is the usual discretization. `"robust"`
       also handles non-manifold and badly shaped meshes. `"auto"` chooses `"robust"` for a mesh with
       degenerate triangles or edges with more than two faces, else `"cotangent"`.
@@ -254,10 +258,11 @@ def check_eigenvalues(mesh: Mesh, spectrum: Spectrum) -> None:
 
 
 def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
-    """Cut two spectra at a common limit, the smaller of the two shapes' largest eigenvalues.
+    """Cut two spectra at a common limit.
 
-    Eigenpairs with eigenvalues above this limit are removed. The MWP paper truncates the spectra of partial
-    shapes in the same way.
+    The limit is the largest eigenvalue of X or the largest eigenvalue of Y, whichever is smaller. Eigenpairs
+    with eigenvalues above this limit are removed. The MWP paper truncates the spectra of partial shapes in
+    the same way.
 
     **Arguments:**
 

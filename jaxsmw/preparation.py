@@ -1,4 +1,4 @@
-"""The computation of the spectra, the initial map, the descriptors and the samples of a pair."""
+"""Prepares a pair for refinement: computes its spectra, initial map, descriptors and samples."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ class PreparedPair:
       spectra contain descriptors if descriptors were requested.
     - `init`: the argument `init` of `prepare`, from which the initial map was computed.
     - `initial_map`: T: X -> Y (m,), as 0-based vertices of Y.
-    - `samples`: a pair of arrays, the samples of X (s,) and of Y (s,) as 0-based vertices in farthest-point
+    - `samples`: the samples of X (s,) and of Y (s,), a pair of arrays of 0-based vertices in farthest-point
       order; None if no samples were requested.
-    - `sampled`: the `SampledPair` at whose vertices descriptors were compared; None if no descriptors were
-      compared.
+    - `sampled`: the `SampledPair` with the vertices at which descriptors are compared; None if `init` is not
+      a name and no descriptors were requested.
     - `seconds`: a dictionary from the name of each step of the preparation to its wall time in seconds.
     """
 
@@ -69,7 +69,9 @@ class PreparedPair:
     seconds: dict[str, float] = field(default_factory=dict)
 
     def started_from(self, init: InitialMap) -> PreparedPair:
-        """Return the prepared pair with another initial map. Its `seconds` contain only this step.
+        """Return the prepared pair with another initial map.
+
+        The `seconds` of the result contain only the time of the new initial map.
 
         **Raises:** `InputError` or `ArithmeticError` if `jaxsmw.initial_map` cannot compute the map.
         """
@@ -95,7 +97,10 @@ class PreparedPair:
         return jax.device_put(padded)
 
     def view(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
-        """Return the padded spectra with the eigenvectors and descriptors of a stage; see `Stage.view`."""
+        """Return the padded spectra, restricted to the eigenvectors and descriptors that a stage uses.
+
+        See `Stage.view`.
+        """
         return stage.view(*self.padded, partial=self.pair.partial)
 
 
@@ -127,13 +132,13 @@ def prepare(
       matching vertex of Y, both 0-based.
     - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
-    - `descriptors_required`: whether a mesh that is too coarse for descriptors causes an error. If False, the
-      function issues a `UserWarning` instead, and the spectra contain no descriptors.
+    - `descriptors_required`: whether to raise `InputError` if a mesh is too coarse for descriptors. If False,
+      the function issues a `UserWarning` instead, and the spectra contain no descriptors.
     - `spectra`: the result of `jaxsmw.pair.paired_spectra` for this pair, if it was already computed.
 
     **Returns:** A `PreparedPair` with the attributes `spectrum_x`, `spectrum_y`, `initial_map` (m,) and
-    `samples`. The initial map contains 0-based vertices of Y. The samples are a pair of arrays of 0-based
-    vertices, those of X and those of Y; None if no samples were requested.
+    `samples`. The initial map contains 0-based vertices of Y. The samples are a pair of arrays, which contain
+    0-based vertices of X and of Y. They are None if no samples were requested.
 
     **Raises:** `InputError` if a spectrum cannot be computed, if all requested eigenvalues of a mesh are
     zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required
@@ -141,7 +146,8 @@ def prepare(
     """
     seconds: dict[str, float] = {}
     if spectra is None:
-        check_initial_map(pair, init)  # before the eigenbases, which take longer
+        # This check comes first, because the eigenbases take longer.
+        check_initial_map(pair, init)
         with timed("eigenbases", seconds):
             spectra = paired_spectra(
                 pair, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver

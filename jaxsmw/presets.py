@@ -31,10 +31,10 @@ class Preset:
       None (the default) to run `stages` on meshes of any size.
 
     **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage has the
-    position `repair.stage`. `InputError` is also raised if the last stage ends on samples, or if the stage
-    after a stage that ends on samples does not start on these samples. `InputError` is also raised for the
-    stage that repair repeats: if its refiner has no levels, or if the stage has fewer samples than the
-    largest of `repair.fallback_levels`.
+    position `repair.stage`. `InputError` is also raised if one of three rules is broken. The last stage must
+    not end on samples. After a stage that ends on samples, the next stage must start on at most as many
+    samples. The stage that repair repeats must have levels, and must not have fewer samples than the largest
+    of `repair.fallback_levels`.
     """
 
     stages: tuple[Stage, ...]
@@ -51,8 +51,8 @@ class Preset:
     def fitted(self, number_of_vertices: int) -> Preset:
         """Return the preset for meshes of a given size.
 
-        The preset has the `large_stages` for a large number of vertices. Every stage is adapted to a small
-        mesh; see `Stage.fitted`.
+        With at least 15 000 vertices, the `stages` of the result are the `large_stages` of this preset, if
+        there are any. For a small number of vertices, every stage is adapted; see `Stage.fitted`.
 
         **Arguments:**
 
@@ -88,7 +88,7 @@ class Preset:
         return max(stage.number_of_samples or 0 for stage in self.stages)
 
 
-# The number of vertices of the smaller mesh from which the `large_stages` of a preset run.
+# If the smaller mesh has at least this number of vertices, the `large_stages` of a preset run.
 _LARGE_FROM = 15_000
 
 

@@ -40,18 +40,18 @@ class Stage:
       argument out, because each level is one iteration.
     - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
       352; 0 by default.
-    - `number_of_samples`: the number of samples of each shape on which the refiner iterates. This number must
-      be at least the number of eigenvectors. The final nearest-neighbour search then matches all vertices.
-      None, the default, means that all iterations use all vertices.
+    - `number_of_samples`: the number of samples of each shape, at least the number of eigenvectors. The
+      iterations match only the samples, and a final nearest-neighbour search matches all vertices. With None
+      (the default), all iterations use all vertices.
     - `starts_on_samples`: whether the first functional map uses the matches of the samples only; False by
-      default. A stage after a stage that ends on samples must start on samples.
-    - `ends_on_samples`: whether the stage matches only the samples, for the next stage; False by default. The
-      last stage must match all vertices.
+      default. This argument must be True if the previous stage ends on samples.
+    - `ends_on_samples`: whether the stage matches the samples only; False by default. This argument must be
+      False for the last stage.
     - `stop_when_unchanged`: whether refinement stops when an iteration changes no match; False by default.
 
     **Raises:** `InputError` if `refiner` is not a `Refiner`, or if there are fewer samples than eigenvectors.
-    `InputError` is also raised if the stage should start or end on samples, but has no samples or has a
-    refiner that cannot do this, such as `WaveletPreservation`.
+    `InputError` is also raised if `starts_on_samples` or `ends_on_samples` is True, but the stage has no
+    samples, or its refiner does not support this option. `WaveletPreservation` does not support it.
     `InputError` is also raised if a number of eigenvectors, iterations, descriptors or samples is not an
     integer, is out of range or contradicts the refiner's levels.
     """
@@ -183,8 +183,9 @@ class Stage:
         """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
 
         The two spectra of a partial pair end at a common limit. If the stage leaves out eigenvectors of a
-        partial pair, the limit is chosen again. The new limit is the smaller of the two largest eigenvalues
-        that remain. Eigenpairs with eigenvalues above this limit are removed (`jaxsmw.pair.common_range`).
+        partial pair, the limit is chosen again. The new limit is the largest remaining eigenvalue of X or of
+        Y, whichever is smaller. Eigenpairs with eigenvalues above this limit are removed
+        (`jaxsmw.pair.common_range`).
 
         **Arguments:**
 
@@ -214,7 +215,7 @@ class Stage:
 
         **Arguments:**
 
-        - `spectrum_x`, `spectrum_y`: the spectra that `view` returns, of X (m vertices) and Y (n vertices).
+        - `spectrum_x`, `spectrum_y`: the spectra of X (m vertices) and Y (n vertices), as returned by `view`.
         - `pointwise_map`: the map from which the stage starts (m,), as 0-based vertices of Y. If the stage
           starts on samples, the entries of other vertices are ignored.
         - `samples`: the samples of X and of Y in farthest-point order, as a pair of integer arrays; None if

@@ -11,7 +11,7 @@ def count_of(number: int, noun: str) -> str:
 
 
 def percentage(probability: float) -> str:
-    """Return a probability as text: a whole number of per cent, or a bound near 0 and 1."""
+    """Return a probability as text, for example `12 %`, `below 1 %` or `above 99 %`."""
     if probability < 0.01:
         return "below 1 %"
     return "above 99 %" if probability > 0.99 else f"{100 * probability:.0f} %"

@@ -8,11 +8,11 @@
     python scripts/benchmark_collection.py DATA_DIRECTORY faust_r --growth 35 70 140 280
 
 Each data set is matched as one collection. `SET/CLASS` selects the shapes whose names begin with CLASS. The
-script draws random ordered pairs (seed 0). On these pairs, the script compares the errors of the maps through
-the template with the errors of `jaxsmw.match`. Errors are mean geodesic distances to the ground truth, in
-thousandths of the square root of the target's area. For sets with landmarks, the error is the mean distance
-of carried landmarks to manual landmarks. The unit is then a thousandth of the diagonal of the target's
-bounding box. On these sets, the registered mesh of `match` carries the landmarks, as in
+script draws random ordered pairs (seed 0). For each pair, the script measures the error of the map through
+the template, and the error of the map that `jaxsmw.match` returns. Errors are mean geodesic distances to the
+ground truth, in thousandths of the square root of the target's area. For sets with landmarks, the error is
+the mean distance of carried landmarks to manual landmarks. The unit is then a thousandth of the diagonal of
+the target's bounding box. On these sets, the registered mesh of `match` carries the landmarks, as in
 `scripts/benchmark_transfer.py`.
 
 `--growth` measures the time and the memory of collections with the given numbers of shapes. The script
@@ -236,9 +236,10 @@ def _measure_landmarks(found: Collection, files: list[Path], i: int, j: int, sin
 
 
 def _cycles(found: Collection) -> dict[str, float]:
-    """Return the cycle errors of random triangles through the template and of the graph, in thousandths.
+    """Return cycle errors of a collection, in thousandths of the square root of the area.
 
-    The dictionary contains the mean of each kind of error. For the triangles, it also contains the median.
+    The dictionary contains the mean cycle errors of the graph. It also contains the mean and the median cycle
+    error of random triples of shapes, with maps through the template.
     """
     generator = np.random.default_rng(0)
     number = len(found.meshes)

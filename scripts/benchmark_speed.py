@@ -16,15 +16,16 @@
 - `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
   are included if they are installed (`jaxsmw[peers]`).
 - `scale`: the time from two mesh files of up to a million vertices to the refined map. The script measures
-  each size in a new process. The table states times, peak memory and errors. The script also fits power laws
-  in the number of vertices to the times and the memory, and the table states their exponents.
+  each size in a new process. The table states times, peak memory and errors. Power laws in the number of
+  vertices are fitted to the times and the memory. The table states the exponents.
 
-The candidates of a comparison take turns in one process, so that other load affects all candidates.
-Each ratio is computed from median times. The shapes are procedural creatures. To obtain the large shapes, the
-script splits edges of a creature and moves its vertices at random. With `--data`, the parts `peers` and
-`scale` use two people of the remeshed FAUST set instead of creatures. The script writes three files to DIR:
-the tables to `speed.md`, all measurements to `speed.json`, and a plot of the times against the sizes to
-`speed.png`. With `--quick`, the script measures only the smallest sizes, which takes three minutes.
+The candidates of a comparison take turns in one process, so that other load on the machine affects all
+candidates equally. Each ratio is computed from median times. The shapes are procedural creatures. To obtain
+the large shapes, the script splits edges of a creature and moves its vertices at random. With `--data`, the
+parts `peers` and `scale` use two people of the remeshed FAUST set instead of creatures. The script writes
+three files to DIR: the tables to `speed.md`, all measurements to `speed.json`, and a plot of the times
+against the sizes to `speed.png`. With `--quick`, the script measures only the smallest sizes, which takes
+three minutes.
 """
 
 from __future__ import annotations
@@ -498,8 +499,9 @@ def matched_from_files(
 ) -> tuple[dict[str, float], float, list[np.ndarray]]:
     """Match two mesh files, and measure the time of each step and the peak memory of the process.
 
-    **Returns:** A dictionary from the name of each step to its seconds, the peak memory in GiB, and a list of
-    the initial map and the refined map.
+    **Returns:** A tuple of three items. The first item is a dictionary from the name of each step to the
+    seconds of the step. The second item is the peak memory in GiB. The third item is a list of the initial
+    map and the refined map.
     """
     start = time.perf_counter()
     meshes = [read_mesh(file) for file in files]
@@ -730,8 +732,8 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
         colors: dict[str, str] = {}
         for name, points in curves.items():
-            # A dotted line shows a run without our compiler options. The line has the same colour as the line
-            # of the run with these options.
+            # A dotted line shows a run without our compiler options. The solid line of the same colour shows
+            # the run with these options.
             usual = name.removesuffix(XLA_DEFAULTS)
             color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
             style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}

@@ -4,10 +4,10 @@
     python scripts/benchmark_transfer.py DATA_DIRECTORY faust_r tosca_r smal_r --output docs/results/transfer
     python scripts/benchmark_transfer.py DATA_DIRECTORY primate_molars --pairs 40 --init shot
 
-Pairs are drawn with seed 0. If `--pairs` exceeds the number of pairs, the script also matches pairs in the
-reverse direction. Each result is stored in `OUTPUT/DATA_SET.csv` when it is measured. After an interruption,
-the same command continues from the stored results. Distances of landmarks are in thousandths of the diagonal
-of the target's bounding box.
+Pairs are drawn with seed 0. If a data set has fewer pairs than `--pairs`, the script also matches its pairs
+in the reverse direction. Each result is stored in `OUTPUT/DATA_SET.csv` when it is measured. After an
+interruption, the same command continues from the stored results. Distances of landmarks are in thousandths of
+the diagonal of the target's bounding box.
 
 Four methods carry landmarks from the source to the target:
 
@@ -83,7 +83,7 @@ _BODIES = ("faust_r", "tosca_r", "smal_r")
 
 
 def _draw(directory: Path, number: int) -> list[tuple[Path, Path]]:
-    """Return pairs of meshes of a data set in random order, at most `number`.
+    """Return at most `number` pairs of meshes of a data set, in random order.
 
     If there are fewer pairs, all pairs are followed by pairs in the reverse direction.
     """
@@ -181,7 +181,7 @@ def _side(file: Path) -> str:
 def _aligned(
     mesh_x: Mesh, mesh_y: Mesh, marks: Float64[np.ndarray, "l 3"], hand: Float64[np.ndarray, " 3"]
 ) -> dict[str, Float64[np.ndarray, "l 3"]]:
-    """Carry landmarks by rigid alignment, once without and once with subsequent coherent point drift."""
+    """Carry landmarks by rigid alignment, without and with subsequent coherent point drift."""
     samples_x = mesh_x.vertices[farthest_point_samples(mesh_x, _POINTS)] * hand
     samples_y = mesh_y.vertices[farthest_point_samples(mesh_y, _POINTS)]
     (middle_x, size_x), (middle_y, size_y) = map(_placement, (samples_x, samples_y))

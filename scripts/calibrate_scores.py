@@ -8,18 +8,18 @@ and prints four tables:
 
 - The first table compares `Correspondence.expected_error` with the true errors. The table states the rank
   correlation of expected and true errors, and the share of gross errors. A gross error exceeds 0.1 times the
-  square root of the area. The last column states the share of the gross errors that belong to the 10 % of the
-  vertices with the largest expected errors.
+  square root of the area. For each pair, the script selects the 10 % of the vertices with the largest
+  expected errors. The last column states which share of all gross errors lies at the selected vertices.
 - For the second table, the script sorts the vertices of all pairs by expected error, and divides them into
   ten groups of equal size. The table states the true errors of each group.
-- The third table compares `Correspondence.wrong_probability` with the share of wrong maps. At least 2 % of
-  the errors of a wrong map exceed 0.25 times the square root of the area. The note below the table states the
-  coefficients that a logistic regression on these maps gives.
+- The third table compares `Correspondence.wrong_probability` with the share of wrong maps. A map is wrong if
+  at least 2 % of its errors exceed 0.25 times the square root of the area. The note below the table states
+  the coefficients of a logistic regression on the measured maps.
 - The fourth table states on how many pairs each score prefers the result to a mirrored map. The script prints
-  this table only for the preset `accurate`. The table covers only pairs of full shapes with a mirrored ground
-  truth that maps vertices to vertices. To compute the mirrored map, the script starts from the mirrored
-  ground truth, and skips the first stage and the repair. To compute the uncertainty of a map, the script runs
-  a feature regression with this map as its initial map.
+  this table only for the preset `accurate`. The table covers only pairs of full shapes. Their mirrored ground
+  truth must exist, and must map vertices to vertices. To compute the mirrored map, the script starts from the
+  mirrored ground truth, and skips the first stage and the repair. To compute the uncertainty of a map, the
+  script runs a feature regression with this map as its initial map.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
-# A map is wrong if at least this share of its errors exceeds this error.
+# A map is wrong if at least the share WRONG_SHARE of its errors exceeds WRONG_ERROR.
 WRONG_SHARE, WRONG_ERROR = 0.02, 0.25
-# The limits of the groups of probabilities.
+# The third table groups the maps by predicted probability. These numbers are the limits of the groups.
 PROBABILITIES = (0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 1)
 # If stages are given instead of a preset, `match` does not repair maps.
 WITHOUT_REPAIR = PRESETS["accurate"].stages[1:]
@@ -86,7 +86,7 @@ class Measured(NamedTuple):
 def measure(
     pair: DataPair, seed: int, preset: PresetName = "accurate", number_of_samples: int | None = 1000
 ) -> Measured:
-    """Matches a pair, and measures the errors and the scores of the result."""
+    """Match a pair, and measure the errors and the scores of the result."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     found = match(mesh_x, mesh_y, preset=preset, partial=pair.partial)
     truth = pair.ground_truth(mesh_x, mesh_y)
@@ -113,7 +113,7 @@ def measure(
 
 
 def scores_of(found: Correspondence) -> dict[str, float]:
-    """Returns a dictionary from the name of each score to its value for a map. Lower values are better."""
+    """Return a dictionary from the name of each score to its value for a map. Lower values are better."""
     known = found.pair, found.pointwise_map, found.spectrum_x
     regression = match(*found.pair.meshes, init=found.pointwise_map, preset=WITHOUT_REPAIR[0])
     uncertainty = regression.refinement.state.uncertainty
@@ -151,7 +151,7 @@ def calibration(maps: Sequence[Measured], settings: WrongProbabilitySettings) ->
 
 
 def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
-    """Yields the four tables as Markdown."""
+    """Yield the four tables as Markdown."""
     rows = [
         ["", "pairs", "mean error", "mean expected", "rank correlation", "gross errors", "in the worst tenth"]
     ]

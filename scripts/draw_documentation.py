@@ -252,7 +252,7 @@ def draw_another_kind() -> None:
 
 
 def draw_without_repair() -> None:
-    """Draw two different quadrupeds of a collection that was matched twice, by `paper` and by `accurate`."""
+    """Match a collection by `paper` and by `accurate`, and draw its template and one other quadruped."""
     meshes = [creature("quadruped", vertices=800 + 20 * seed, seed=seed) for seed in range(5)]
     found = {
         preset: jaxsmw.match_collection(meshes, preset=preset, template=0, mirror="no")

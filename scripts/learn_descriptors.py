@@ -199,7 +199,7 @@ def layer() -> WaveletPreservationLayer:
 
 
 class Shape(NamedTuple):
-    """The spectrum, with SHOT descriptors, and the positions of the s sampled vertices of a shape."""
+    """A shape at s sampled vertices: the spectrum, which contains SHOT descriptors, and the positions."""
 
     spectrum: Spectrum
     positions: Float[Array, "s 3"]
@@ -239,7 +239,7 @@ def prepared(pair: DataPair) -> TrainingPair:
 
 
 def described(mesh: Mesh) -> Spectrum:
-    """Return the padded spectrum of a mesh of area 1 with SHOT descriptors, for a `DescriptorNetwork`."""
+    """Return the input of a `DescriptorNetwork`: the padded spectrum of a mesh, with SHOT descriptors."""
     spectrum = compute_spectrum(mesh, EIGENVECTORS)
     shot = shot_descriptors(mesh).astype(spectrum.eigenvectors.dtype)
     return padded(spectrum.with_descriptors(jnp.asarray(shot)))
@@ -253,8 +253,8 @@ class Matched(NamedTuple):
     - `by_descriptors`: the soft map that the layer recovers from the descriptors alone.
     - `by_layer`: the soft map that the layer recovers from its functional map.
     - `functional_map`: the functional map of the layer.
-    - `energy`: the wavelet-preservation energy of the functional map for the soft map `by_layer`, divided
-      by the number of eigenvectors.
+    - `energy`: the wavelet-preservation energy of `functional_map` and `by_layer`, divided by the number of
+      eigenvectors.
     """
 
     by_descriptors: SoftMap | SparseSoftMap
@@ -353,7 +353,7 @@ def nearest_descriptors(network: DescriptorNetwork, x: Spectrum, y: Spectrum) ->
 def descriptor_errors(
     pair: DataPair, networks: Mapping[str, DescriptorNetwork], seed: int
 ) -> dict[str, float]:
-    """Return the mean geodesic error x 10³ of each initial map and of the map refined from it."""
+    """Return the mean geodesic error x 10³ of each initial map and of each refined map."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     x, y = described(mesh_x), described(mesh_y)
     m = len(mesh_x.vertices)
@@ -392,7 +392,7 @@ def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Itera
 
 
 def draw(curves: Mapping[str, Trained], path: Path) -> None:
-    """Plot the losses on the training pairs and on pairs of other people against the training steps."""
+    """Plot losses against the training steps, for the training pairs and for pairs of other people."""
     figure, axes = plt.subplots(1, len(curves), figsize=(5 * len(curves), 3.4), layout="constrained")
     for axis, (name, curve) in zip(axes, curves.items(), strict=True):
         axis.plot(*smoothed(curve.losses), label="training pairs, running mean")

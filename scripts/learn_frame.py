@@ -18,11 +18,11 @@ A soft match is a weighted set of points, and its weights are the shares of the 
 distance of a soft match is the weighted root mean square of the distances of these points.
 
 The script then tests the frames on pairs of the other five people of FAUST and on pairs of TOSCA. From the
-same initial map, `jaxsmw.refine` refines each pair with the Meyer frame and with both trained frames. The
-script writes `summary.md` with the errors, and `frames.png` with the filters and losses. The script also
-writes the logits of the trained frames to `frame_labels.npz` and `frame_cycles.npz`. A trained frame is
-`Warped(SoftmaxFrame(logits), Power())`. After an interruption, the same command continues from the saved
-state.
+same initial map, `jaxsmw.refine` refines each pair with the Meyer frame, with the untrained frame and with
+both trained frames. The script writes `summary.md` with the errors, and `frames.png` with the filters and
+losses. The script also writes the logits of the trained frames to `frame_labels.npz` and `frame_cycles.npz`.
+A trained frame is `Warped(SoftmaxFrame(logits), Power())`. After an interruption, the same command continues
+from the saved state.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def bank_of(frame: SoftmaxFrame) -> FilterBank:
 
 
 def like_meyer() -> SoftmaxFrame:
-    """Return the frame from which training starts: close to the Meyer frame, with positive filters only."""
+    """Return the initial frame of training. It resembles the Meyer frame, but has positive filters."""
     return SoftmaxFrame.like(Warped(Meyer(FILTERS), Power(2.0)), KNOTS, floor=FLOOR)
 
 

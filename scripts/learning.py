@@ -45,10 +45,10 @@ class Data(NamedTuple):
 
     **Attributes:**
 
-    - `seen`: those pairs in the pair list of FAUST in which both shapes belong to the first `TRAINING_PEOPLE`
-      people.
-    - `seen_further`: all other pairs of these people that have ground truth.
-    - `unseen`: the pairs of the other people in the pair list of FAUST, for evaluation.
+    - `seen`: the pairs of the first `TRAINING_PEOPLE` people in FAUST's pair list, for training.
+    - `seen_further`: further pairs of the same people. These pairs have ground truth, but are not in the pair
+      list.
+    - `unseen`: the pairs of the other people in FAUST's pair list, for evaluation.
     - `animals`: the pairs of TOSCA, for evaluation.
     """
 
@@ -105,9 +105,8 @@ def root_mean_square(
 
     **Arguments:**
 
-    - `carried`: a function that pulls functions back by one soft map, or by several soft maps one after the
-      other.
-    - `positions`: the vertex positions of the shape from which `carried` pulls functions back.
+    - `carried`: a function that pulls functions back by one soft map, or by several soft maps in succession.
+    - `positions`: the vertex positions of the shape on which these functions are defined.
     - `wanted`: the target position of each point.
     """
     found = carried(jnp.concatenate([positions, jnp.sum(positions**2, axis=1, keepdims=True)], axis=1))
@@ -132,8 +131,9 @@ class Trained(NamedTuple):
 
     - `model`: the trained model.
     - `losses`: the loss of every step.
-    - `steps`: the numbers of completed steps after which the loss on the watched pairs was evaluated.
-    - `watched`: the mean loss on the watched pairs after each number of steps in `steps`.
+    - `steps`: the step numbers at which the loss on the watched pairs was evaluated. Step 0 is the start of
+      training.
+    - `watched`: the mean loss on the watched pairs at each step number in `steps`.
     """
 
     model: Any
@@ -172,8 +172,8 @@ def train(
     - `steps`: the number of training steps.
     - `seed`: the seed of the random draws.
     - `directory`: an existing directory for the saved state.
-    - `unit`: a function that takes a prepared pair, and returns the number by which the pair's recorded loss
-      is divided. The division makes losses of different pairs comparable. If `unit` is None, `train` records
+    - `unit`: a function that takes a prepared pair, and returns a number. The recorded loss of the pair is
+      divided by this number, so losses of different pairs are comparable. If `unit` is None, `train` records
       the losses undivided.
     - `watched`: pairs whose mean loss is recorded at regular intervals. These pairs do not influence
       training.
@@ -253,7 +253,9 @@ def _evaluate(
 
 @contextmanager
 def reading(path: Path) -> Iterator[BinaryIO]:
-    """Open a file of arrays that equinox wrote, for a `with` statement whose block reads the whole file.
+    """Open a file that equinox wrote, and yield it to a `with` block.
+
+    The block must read the whole file.
 
     **Raises:** `InputError` if the file cannot be opened, if the block raises an error, or if the block ends
     before the end of the file is reached.

@@ -14,8 +14,8 @@ experiment uses only the data sets that suit it:
 - `fig9`: targets with other triangulations and resolutions, and other initial maps;
 - `nonisometric`: pairs of different classes, compared with published results. Refinement starts from
   published initial maps if the data set contains such maps, and from SHOT otherwise;
-- `settings`: MWP and the other methods with settings that differ from the published settings, on the data
-  sets of `table1`.
+- `settings`: MWP and other methods, with the published settings and with other settings, on the data sets of
+  `table1`.
 
 In the output directory, the script creates one directory for each run. This directory contains the same files
 that `jaxsmw benchmark` writes. The script writes all tables to `README.md`. After an interruption, the same
@@ -52,8 +52,8 @@ from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.workers import open_executor
 
 FIG9_METHODS = ("initial", "mwp", "mwp-sampled", "zoomout")
-# The number of pairs in `fig9` is the value of `--pairs` divided by this number, but at least 2. Without
-# `--pairs`, 40 is divided by this number.
+# The number of pairs in `fig9` is `--pairs` / FIG9_SHARE, but at least 2. Without `--pairs`, the number of
+# pairs is 40 / FIG9_SHARE.
 FIG9_SHARE = 4
 INITIAL_MAPS = ("shot", "wks", "hks", "wavelet", "functional")
 # These initial maps come from descriptors that cannot distinguish left from right. The maps "shot" and
@@ -157,7 +157,8 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
         if is_isometric(data_set) or data_set.layout != "a remeshed set":
             continue
         directories = published(data_set)
-        # Results that other methods refined from maps/NAME are in a directory whose name begins with NAME.
+        # The directory maps/NAME contains initial maps. Other methods refined these initial maps, and their
+        # results are in directories whose names begin with NAME.
         initial = [path for path in directories if not path.startswith(tuple(set(directories) - {path}))]
         for init in initial or ["shot"]:
             finished = {
@@ -172,7 +173,7 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
 
 
 def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
-    """Yield the runs with settings that differ from the published settings."""
+    """Yield the runs with the published settings and with other settings."""
     for data_set in filter(is_isometric, data_sets):
         pairs = chosen(data_set, options)
         yield Run("settings", data_set.name, data_set, pairs, other_settings(), same(options))
@@ -272,7 +273,7 @@ MESHINGS: dict[str, Callable[[Mesh], Remeshed]] = {"finer": finer, "coarser": co
 
 
 def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[Mesh], Remeshed]) -> DataSet:
-    """Write a data set with the sources of the pairs and their remeshed targets, and open this data set."""
+    """Write and open a data set, with the sources of the pairs and remeshed versions of their targets."""
     listing = directory / "test_pairs.txt"
     if not listing.exists():
         shapes, truths = make_directory(directory / "off"), make_directory(directory / "corres")
@@ -304,7 +305,7 @@ def perform(run: Run, output: Path, executor: Executor) -> tuple[Results, dict[s
 
 
 def overview(found: Mapping[tuple[str, str], Mapping[str, MethodSummary]]) -> str:
-    """Return a table for each experiment, with the mean error and the seconds of each method in each run."""
+    """Return a table for each experiment. Each cell contains the mean error and the seconds of one method."""
     parts = [
         "# The paper's comparisons",
         "Each cell contains the mean error x 10⁻³ √area, and the seconds from the initial map to the result.",

@@ -119,7 +119,7 @@ def add_index_base(parser: argparse.ArgumentParser) -> None:
 def add_partial(
     parser: argparse.ArgumentParser, *, condition: str = "; both must have the same unit of length"
 ) -> None:
-    """Add `--partial`. `condition` is the end of its help text."""
+    """Add `--partial`. The help text of the option ends with `condition`."""
     parser.add_argument(
         "--partial",
         action="store_true",
@@ -139,9 +139,9 @@ def add_partial_of_any_scale(parser: argparse.ArgumentParser) -> None:
 
 
 def _scale(text: str) -> float | Scale:
-    """Return a scale as a number, or the name of an unknown scale.
+    """Return the number in a value of `--scale`, or `unknown` if this is the value.
 
-    **Raises:** `argparse.ArgumentTypeError` if the text is neither.
+    **Raises:** `argparse.ArgumentTypeError` if the value is neither a positive number nor `unknown`.
     """
     (unknown,) = get_args(Scale)
     if text == unknown:

@@ -188,8 +188,8 @@ def run(options: argparse.Namespace) -> None:
 def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
     """Return a dictionary from the name of each mesh file of a collection to its path, in alphabetical order.
 
-    **Raises:** `InputError` if the directory cannot be read, contains fewer than two mesh files, or does not
-    contain an excluded file.
+    **Raises:** `InputError` if the directory cannot be read or contains fewer than two mesh files, or if a
+    file of `--exclude` is not in the directory.
     """
     from jaxsmw.io.mesh_data import MESH_SUFFIXES
     from jaxsmw.wording import count_of
@@ -386,7 +386,7 @@ def _executor(options: argparse.Namespace) -> Iterator[Executor | None]:
 
 
 def _provenance(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """Return the settings and versions that all runs with the same output must share."""
+    """Return the settings and versions that must be equal in all runs with the same output directory."""
     from jaxsmw.runtime.provenance import code_digest, measured_code, versions
 
     settings = {name: getattr(options, name) for name in ("preset", "mirror", "weld", "seed")}
@@ -394,7 +394,7 @@ def _provenance(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
 
 def _names(data: Mapping[str, MeshData]) -> list[str]:
-    """Return a different name for each mesh. The name is the file name without suffix if possible.
+    """Return a unique name for each mesh. The name is the file name without suffix if possible.
 
     If two of these names are equal, dots in the file names are replaced by underscores instead. If two of the
     resulting names are also equal, the complete file names are used.
@@ -539,7 +539,10 @@ def _write(
 
 
 def _number(collection: Collection, name: str, file: str) -> int:
-    """Return the number of the mesh with the given name. The mesh was read from `file`."""
+    """Return the number of the mesh `name`.
+
+    **Raises:** `InputError` if the collection left this mesh out. The message names its `file`.
+    """
     if name not in collection.names:
         raise InputError(f"{file}: was left out of the collection: choose another mesh.")
     return collection.names.index(name)

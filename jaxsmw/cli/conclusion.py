@@ -36,8 +36,8 @@ def measure_match(
     - `truth`: the ground truth, or None.
     - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
     - `stopwatch`: the stopwatch to which the time of the measurement is added.
-    - `others`: a dictionary from names to further maps that are measured. The initial map and the refined map
-      are always measured.
+    - `others`: further maps to measure, a dictionary with the names of the maps as keys. The initial map and
+      the refined map are always measured.
 
     **Returns:** A dictionary from the name of each map to its errors. The names are `initial`, the names in
     `others`, and `refined`. The dictionary is empty if there is no ground truth.
@@ -104,7 +104,7 @@ def write_match_report(
     - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
     - `registered`: the registered mesh if it was already computed; None otherwise.
-    - `landmarks`: the landmarks on the source and on the target with which the page opens.
+    - `landmarks`: the landmarks on the source and on the target. The page shows them when it is opened.
     """
     from jaxsmw.report.summary import write_report
 

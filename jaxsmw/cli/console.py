@@ -17,8 +17,8 @@ _logger = logging.getLogger("jaxsmw")
 def show(text: str) -> None:
     """Print a result on standard output.
 
-    **Raises:** `InputError` if standard output cannot be written; `BrokenPipeError` if the program that
-    reads the pipe has closed it.
+    **Raises:** `BrokenPipeError` if standard output is a pipe that its reader has closed. `InputError` if
+    standard output cannot be written for any other reason.
     """
     with _writing_output():
         print(text, flush=True)
@@ -27,8 +27,8 @@ def show(text: str) -> None:
 def flush_output() -> None:
     """Flush the buffer of standard output.
 
-    **Raises:** `InputError` if standard output cannot be written; `BrokenPipeError` if the program that
-    reads the pipe has closed it.
+    **Raises:** `BrokenPipeError` if standard output is a pipe that its reader has closed. `InputError` if
+    standard output cannot be written for any other reason.
     """
     with _writing_output():
         if sys.stdout is not None:

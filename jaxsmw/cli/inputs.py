@@ -35,7 +35,7 @@ def read_mesh_file(file: str, *, weld: bool) -> Mesh:
 
 
 def report_mesh(file: str, mesh: Mesh) -> None:
-    """Print the size, the notes and the unusual elements of a mesh as progress messages, each in one line."""
+    """Print the size, the notes and the unusual elements of a mesh as progress messages."""
     from jaxsmw.geometry.mesh import diagnose
 
     size, *unusual = diagnose(mesh).brief_sentences()
@@ -115,9 +115,9 @@ def initial_map_files(init: str) -> list[str]:
 def check_initial_map(init: str) -> None:
     """Check the landmark files in a value of `--init`, before any mesh is read.
 
-    **Raises:** `InputError` if the value names one file with positions of landmarks on one mesh, but no file
-    with the landmarks of the other mesh. `InputError` is also raised if the value names two files, and the
-    format of one of them is unknown.
+    **Raises:** `InputError` if the value names only one file and this file contains positions of landmarks,
+    because landmarks on both meshes are needed. `InputError` is also raised if the value names two files and
+    one of them has an unknown format.
     """
     files = initial_map_files(init)
     if not init.startswith("landmarks:"):
@@ -127,7 +127,7 @@ def check_initial_map(init: str) -> None:
     if len(files) > 1:
         for file in files:
             check_readable_suffix(file)
-    # Otherwise a single file contains a source vertex and a target vertex per line.
+    # A single file must contain a source vertex and a target vertex per line.
     elif files[0].lower().endswith(LANDMARK_SUFFIXES) or _has_positions(files[0]):
         raise InputError(
             f"{files[0]}: contains landmarks of one mesh only: give the landmarks of both meshes, as --init "

@@ -40,7 +40,7 @@ _SOLUTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 _PAPER_SOLUTION = next(iter(_SOLUTIONS))
 
-# These attributes of the parsed options belong to the options that change the method of the MWP paper.
+# The options that change the method of the MWP paper, as attributes of the parsed options.
 _CHANGES = (
     "eigenvectors",
     "bank",
@@ -167,7 +167,7 @@ def preset_name(options: argparse.Namespace) -> PresetName:
 
 
 def given_method(options: argparse.Namespace) -> list[str]:
-    """Return the names of the given options that have an effect only on a match, such as `--preset`."""
+    """Return the names of the given options that matter only if meshes are matched, such as `--preset`."""
     given = _changes(options)
     given += ["--preset"] if options.preset else []
     defaults = {"init": DEFAULT_MATCH_INIT, "mirror": DEFAULT_MIRROR}

@@ -22,7 +22,7 @@ def run_command(arguments: Sequence[str]) -> int:
             _run(arguments)
         finally:
             flush_output()
-    except SystemExit as ending:  # raised by the parser after the help and for bad arguments
+    except SystemExit as ending:  # the parser exits after the help and after bad arguments
         return int(ending.code or 0)
     except InputError as error:
         say(f"jaxsmw: {error}")

@@ -1,4 +1,4 @@
-"""Wrong maps of a collection, found by the cycles of its graph."""
+"""Estimates of the errors of a collection's maps, from cycles in the graph of matched pairs."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def cycle_error(
     positions: Float64[np.ndarray, "i 3"],
     samples: Int64[np.ndarray, " s"],
 ) -> float:
-    """Return how far a cycle of three maps carries samples away from themselves.
+    """Return the mean distance between samples and their images after a cycle of three maps.
 
     **Arguments:**
 
@@ -84,8 +84,7 @@ def cycle_error(
     - `positions`: the positions of the vertices of shape i (i, 3), in units of the square root of the area.
     - `samples`: the samples (s,), vertices of shape i.
 
-    **Returns:** The mean Euclidean distance between samples and their images, in the same unit. Distances
-    above 0.5 count as 0.5.
+    **Returns:** The mean Euclidean distance, in the unit of `positions`. Distances above 0.5 count as 0.5.
     """
     images = third[second[first[samples]]]
     distances = np.linalg.norm(positions[images] - positions[samples], axis=1)
@@ -114,7 +113,7 @@ def edge_errors(
     **Returns:** The estimated errors (e,), in the unit of `errors`. An edge without cycles keeps its prior.
     """
     number = prior.shape[0]
-    # Each cycle sends one message to each of its edges, from the two other edges.
+    # Each cycle sends its error to each of its three edges. The two other edges determine the weight.
     receiver = cycles.T.reshape(-1)
     others = jnp.concatenate([cycles[:, [1, 2]], cycles[:, [0, 2]], cycles[:, [0, 1]]])
     message = jnp.tile(errors, 3)
@@ -140,7 +139,7 @@ def estimate_edge_errors(
     **Arguments:**
 
     - `edges`: the edges (i, j).
-    - `maps`: for each edge (i, j), the vertex maps with keys (i, j) and (j, i).
+    - `maps`: the vertex maps of all edges in both directions. The keys of an edge are (i, j) and (j, i).
     - `positions`: the positions of each shape's vertices, in units of the square root of the shape's area.
     - `samples`: samples of each shape, as 0-based vertices.
     - `prior`: the first estimate of each edge's error (e,).

@@ -1,4 +1,4 @@
-"""Maps through a template that agree with the maps of all edges, and the edges that contradict them."""
+"""Consistent maps through a template, and the edges whose maps contradict the consistent maps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jaxsmw.geometry.geodesics import SurfacePoints
 
 @dataclass(frozen=True, eq=False)
 class ConsistentMaps:
-    """The maps from a template to all shapes that agree best with the maps of the edges.
+    """Maps from a template to all shapes, chosen to agree best with the maps of the edges.
 
     **Attributes:**
 
@@ -53,7 +53,7 @@ class ConsistentMaps:
         **Arguments:**
 
         - `shapes`: the N shapes.
-        - `maps`: the map of each edge. The edges connect all shapes.
+        - `maps`: the map of each edge. The edges must connect all shapes.
         - `settings`: the settings of the collection.
         - `template`: the number of the template. The default is the medoid.
         """
@@ -101,9 +101,10 @@ class ConsistentMaps:
         return vertex_map_between(self.points[i], self.points[j], meshes[self.template], meshes[i], meshes[j])
 
     def improvements(self, again: Mapping[Edge, EdgeMap]) -> dict[Edge, EdgeMap]:
-        """Return the new maps that are closer to the consistent maps than the old, and not more distorted.
+        """Return the new maps that are closer to the consistent maps than the old maps of the same edges.
 
-        If the consistent map is wrong, a new map that follows it has a larger distortion than the old map.
+        A new map is left out if its distortion exceeds the old distortion by more than the factor
+        `distortion_tolerance`. It then probably follows a wrong consistent map.
 
         **Arguments:**
 
@@ -151,7 +152,7 @@ def _squared_log_distortions(maps: Mapping[Edge, EdgeMap]) -> Float64[np.ndarray
 
 
 def _cycle_samples(shape: PreparedShape, number: int) -> Int64[np.ndarray, " s"]:
-    """Return about `number` vertices of a shape at which cycles are compared."""
+    """Return about `number` vertices of a shape, from which cycle errors are computed."""
     if shape.samples is None:
         used = np.flatnonzero(shape.mesh.referenced_vertices)
         return used[:: max(1, len(used) // number)]

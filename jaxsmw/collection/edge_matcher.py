@@ -1,4 +1,4 @@
-"""The matches of many edges, which are kept in a store and can run in worker processes."""
+"""Matches many edges, in worker processes if requested, and keeps the finished maps in a store."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class EdgeMatcher:
         **Returns:** The maps, in the order of `inits`. An edge whose match fails is left out and named in the
         log.
         """
-        # Workers finish edges in any order. The order of the maps determines rounding errors.
+        # Workers finish edges in any order, but later rounding errors depend on the order of the maps.
         found = dict(self._found(inits, step))
         return {edge: found[edge] for edge in inits if edge in found}
 
@@ -126,7 +126,7 @@ class EdgeMatcher:
                 yield edges[name], found
 
     def _save_shapes(self, store: Store, edges: Iterable[Edge]) -> dict[int, tuple[str, ...]]:
-        """Save the prepared shapes of edges for workers, and return their keys."""
+        """Save the prepared shapes of edges for workers, and return the key of each shape."""
         keys: dict[int, tuple[str, ...]] = {}
         for number in sorted({shape for edge in edges for shape in edge}):
             arrays = self.shapes[number].arrays()
@@ -144,7 +144,7 @@ class EdgeMatcher:
 
 
 class _StoredTask(NamedTuple):
-    """The match of an edge in a worker, which reads both shapes from a store."""
+    """The task of a worker to match one edge. The worker reads both shapes from a store."""
 
     directory: Path
     keys: tuple[tuple[Any, ...], tuple[Any, ...]]

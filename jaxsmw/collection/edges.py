@@ -1,4 +1,4 @@
-"""The matches of the edges of a collection's graph, each in both directions."""
+"""The maps between the matched pairs of a collection (the edges of its graph), in both directions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jaxsmw.presets import Preset
 
 @dataclass(frozen=True, eq=False)
 class EdgeMap:
-    """The maps between the two shapes of an edge, the source X (m vertices) and the target Y (n vertices).
+    """The maps between the source X (m vertices) and the target Y (n vertices) of an edge.
 
     **Attributes:**
 
@@ -29,7 +29,7 @@ class EdgeMap:
     - `expected_error`: the mean expected error, in units of the square root of the area; see
       `jaxsmw.repair.expected_error`.
     - `distortion`: the distortion of the map; see `jaxsmw.repair.scores.distortion`.
-    - `suspicious`: whether the map looks wrong by itself, without the other shapes.
+    - `suspicious`: whether the map looks wrong, judged without the maps of other edges.
     """
 
     forward: SurfacePoints
@@ -73,14 +73,14 @@ class EdgeMap:
 
 @dataclass(frozen=True, eq=False)
 class EdgeTask:
-    """The match of an edge.
+    """The inputs for the match of one edge.
 
     **Attributes:**
 
     - `x`, `y`: the source X (m vertices) and the target Y, which have the same hand.
     - `init`: the initial map X -> Y (m,), as 0-based vertices of Y; None for `"shot"`.
-    - `aligned`: whether to refine the initial map `"aligned"` as well, and to keep the better map; see
-      `jaxsmw.match`.
+    - `aligned`: whether to refine the initial map `"aligned"` as well and to keep the better map, if `init`
+      is None; see `jaxsmw.match`.
     """
 
     x: PreparedShape
@@ -89,7 +89,7 @@ class EdgeTask:
     aligned: bool = False
 
     def starts(self) -> list[PreparedPair]:
-        """Return the prepared pair, once for each initial map."""
+        """Return one copy of the prepared pair for each initial map."""
         first = prepare_pair(self.x, self.y, self.init)
         return [first, first.started_from("aligned")] if self.aligned and self.init is None else [first]
 

@@ -30,7 +30,8 @@ from jaxsmw.transfer.landmarks import transfer_landmarks
 
 logger = logging.getLogger("jaxsmw")
 
-# The names that `replace_results` replaces. The mean shape is not listed, because users choose its suffix.
+# The files and directories that contain results. The mean shape is not listed, because users choose its
+# suffix.
 RESULT_FILES = ("collection.json", "index.html", "modes.npz", "scores.csv")
 RESULT_DIRECTORIES = ("maps", "registered", "landmarks", "attributes")
 
@@ -58,7 +59,8 @@ def write_maps(collection: Collection, directory: Path) -> list[Path]:
 def write_registered(collection: Collection, template: MeshData, directory: Path, suffix: str) -> list[Path]:
     """Write the registered mesh of each shape: the template's triangulation, with positions on the shape.
 
-    On shapes of the other hand, the corners of the faces are reversed, so that normals point outward.
+    If the hand of a shape differs from that of the template, the corners of each face are listed in reverse
+    order. The normals of the registered mesh then point outward.
 
     **Arguments:**
 
@@ -83,14 +85,14 @@ def write_registered(collection: Collection, template: MeshData, directory: Path
 
 
 def _write_mesh(path: Path, data: MeshData, *, told: bool) -> None:
-    """Write a mesh, and report what its format cannot contain, unless the user was told before."""
+    """Write a mesh. Unless `told` is True, log what the file format cannot contain."""
     warnings = write_mesh_data(path, data)
     for warning in () if told else warnings:
         logger.warning("%s", warning)
 
 
 def _turned(data: MeshData) -> MeshData:
-    """Return the mesh with the corners of all faces reversed, so that mirrored normals point outward."""
+    """Return the mesh with reversed faces, so that the normals of a mirror image point outward."""
     texture = None if data.texture is None else (data.texture[0], data.texture[1][:, ::-1])
     mesh = replace(data.mesh, faces=np.ascontiguousarray(data.mesh.faces[:, ::-1]))
     return replace(data, mesh=mesh, faces=data.faces[:, ::-1], texture=texture)
@@ -99,13 +101,15 @@ def _turned(data: MeshData) -> MeshData:
 def write_attributes(
     collection: Collection, source: int, data: Sequence[MeshData], directory: Path, suffix: str
 ) -> list[Path]:
-    """Write all other meshes with the attributes of one mesh; see `jaxsmw.transfer.transfer_attributes`.
+    """Transfer the attributes of one mesh to all other meshes, and write these meshes.
+
+    See `jaxsmw.transfer.transfer_attributes`.
 
     **Arguments:**
 
     - `collection`: the collection.
     - `source`: the number of the mesh whose attributes are transferred.
-    - `data`: all meshes with their data.
+    - `data`: all meshes with their attributes, in the order of `Collection.meshes`.
     - `directory`: the directory of the results.
     - `suffix`: the suffix of the files.
 
@@ -137,9 +141,9 @@ def write_landmarks(
     - `directory`: the directory of the results.
     - `suffix`: the suffix of the files, such as `.mrk.json`.
 
-    **Returns:** The written files, and sentences about landmarks that are far from the surface.
+    **Returns:** The written files, and a sentence about each landmark far from the surface.
 
-    **Raises:** `InputError` if a landmark is not on the shape, or a file cannot be written.
+    **Raises:** `InputError` if the landmarks do not lie on their shape, or a file cannot be written.
     """
     folder = make_directory(directory / "landmarks")
     written: list[Path] = []
@@ -252,15 +256,16 @@ def write_summary(
 
 
 def check_replaceable(directory: Path, names: Sequence[str]) -> None:
-    """Check that a directory contains nothing that the results of a collection would wrongly replace.
+    """Check that the results of a collection can be written to a directory without loss of other files.
 
     **Arguments:**
 
     - `directory`: the directory of the results, which need not exist.
     - `names`: the names of the meshes of the collection.
 
-    **Raises:** `InputError` if a file of the directory has the name of a result but is not a result of this
-    program, or if the directory contains the results of a collection without any of these meshes.
+    **Raises:** `InputError` if the directory contains a file with the name of a result, but no
+    `provenance.json` of an earlier run. `InputError` is also raised if the directory contains results for
+    other meshes, and none of these meshes is in `names`.
     """
     if not (directory / "provenance.json").exists():
         if taken := [name for name in RESULT_FILES + RESULT_DIRECTORIES if (directory / name).exists()]:
@@ -320,7 +325,7 @@ def _summary(path: Path) -> dict[str, list[Any]]:
     return {}
 
 
-# Only results are removed, and nothing outside the directory of the results.
+# `replace_results` removes only files that match this pattern. They lie in the directory of the results.
 _LISTED = re.compile(rf"(?:(?:{'|'.join(RESULT_DIRECTORIES)})/(?!\.\.)[^/\0]+|mean\.\w+)")
 
 

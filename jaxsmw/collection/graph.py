@@ -68,12 +68,13 @@ def choose_edges(
 
     The graph consists of three parts. The minimum spanning tree connects all shapes through similar shapes.
     Edges to the nearest neighbours of each shape form cycles. The other edges are random. Random edges keep
-    the paths between any two shapes short, and they contradict errors that all similar shapes share.
+    the paths between any two shapes short. They also reveal errors that all similar shapes share.
 
     **Arguments:**
 
     - `distances`: the distances of the shapes (N, N); see `shape_distances`.
-    - `edges_per_shape`: the number of edges divided by N. If there are fewer pairs, all pairs are chosen.
+    - `edges_per_shape`: the number of edges divided by N. If the shapes form fewer pairs than this number of
+      edges, all pairs are chosen.
     - `random_share`: the share of random edges.
     - `given`: edges that are already matched and are kept. If shapes were added to a collection, only edges
       of the added shapes are new.
@@ -137,8 +138,8 @@ def extended_graph(
 ) -> list[Edge]:
     """Choose the pairs of a collection that are matched, and keep them in a store.
 
-    Edges between shapes of an earlier call with the same store are chosen again, even if other shapes were
-    added or removed since.
+    If an earlier call used the same store, settings and seed, its edges are chosen again, except edges of
+    shapes that were removed since. Edges of new shapes are added.
 
     **Arguments:**
 

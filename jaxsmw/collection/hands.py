@@ -27,16 +27,16 @@ def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.nda
     """Divide the shapes of a collection into two hands that agree best with the evidence of all edges.
 
     The evidence of an edge is positive if the two shapes seem to be of opposite hands. A symmetric matrix
-    contains the evidence of all edges with the opposite sign. The signs of the leading eigenvector of this
-    matrix give the first hands (synchronisation over the group of two elements; Singer, "Angular
-    synchronization by eigenvectors and semidefinite programming", 2011). The function then reverses the hands
-    of single shapes, one after another, as long as each reversal improves the agreement with the evidence.
+    contains the negated evidence of each edge. The signs of the leading eigenvector of this matrix give the
+    first hands (synchronisation over the group of two elements; Singer, "Angular synchronization by
+    eigenvectors and semidefinite programming", 2011). The function then reverses the hands of single shapes,
+    one after another, as long as each reversal improves the agreement with the evidence.
 
     **Arguments:**
 
     - `number`: the number N of shapes. The shapes are numbered from 0 to N - 1, in any fixed order.
-    - `decisions`: for each compared edge (i, j), a pair of shape numbers, the `Decision`. Decisions without
-      evidence, and decisions on symmetric shapes, are ignored.
+    - `decisions`: the `Decision` of each compared edge (i, j), where i and j are the numbers of two shapes.
+      Decisions without evidence, and decisions on symmetric shapes, are ignored.
 
     **Returns:** An array (N,), whose entry i is True if the mirror image of shape i is matched. At most half
     of the entries are True.
@@ -70,7 +70,9 @@ def compare_hands(
     store: Store = Store(),  # noqa: B008 (immutable)
     progress: Progress = no_progress,
 ) -> dict[Edge, Decision]:
-    """Compare the hands of similar shapes, and of all shapes along a sparse graph if some are asymmetric.
+    """Compare the hands of a few pairs of shapes, and of further pairs if one of these pairs is asymmetric.
+
+    The pairs are edges of a sparse graph.
 
     **Arguments:**
 
@@ -78,7 +80,7 @@ def compare_hands(
     - `preset`: the preset with which the shapes were prepared.
     - `seed`: the seed of the random edges of the graph.
     - `store`: the store in which decisions are kept.
-    - `progress`: a function that is called after each comparison.
+    - `progress`: a function that is called for each edge of the graph, unless only a few pairs are compared.
 
     **Returns:** The `Decision` of each compared edge; see `jaxsmw.repair.chirality.Hands`.
     """

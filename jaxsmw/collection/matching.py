@@ -48,8 +48,8 @@ def match_collection(
     """Match all shapes of a collection, such that the maps of all pairs agree.
 
     Only the edges of a graph are matched, a few for each shape. Cycles of the graph show which maps are
-    wrong. The maps from a template to all shapes are the robust means of the maps along all edges. Maps that
-    contradict these means are matched again, from the consistent maps.
+    wrong. The maps from a template to all shapes are the robust means of the maps along all edges. If the map
+    of an edge contradicts these means, the edge is matched again from the map through the template.
 
     **Arguments:**
 
@@ -60,8 +60,8 @@ def match_collection(
     - `preset`: see `match`.
     - `template`: the 0-based position of the template in the argument `meshes`. The default is the shape with
       the smallest sum of errors along the best paths to all other shapes (the medoid).
-    - `mirror`: `"auto"` (the default) to recognise shapes of opposite hands, such as left and right teeth,
-      and to match their mirror images. `"no"` to match all meshes as they are.
+    - `mirror`: `"auto"` (the default) recognises shapes of opposite hands, such as left and right teeth, and
+      matches their mirror images. `"no"` matches all meshes as they are.
     - `stiffness`: the stiffness of the registered meshes, a positive length in units of the square root of
       each shape's area; see `register_mesh`.
     - `settings`: the `CollectionSettings`.
@@ -70,12 +70,13 @@ def match_collection(
       directory continues an interrupted call. If meshes are added, only their own edges are matched.
     - `executor`: an executor that matches edges, for example `jaxsmw.runtime.workers.open_executor`. By
       default, edges are matched in this process.
-    - `devices`: the JAX devices that match edges in this process, by default all; see `match_pairs`.
-    - `progress`: a function that is called after each part of a step with the name of the step, the number of
-      finished parts, and the number of parts.
+    - `devices`: the JAX devices that match edges in this process; see `match_pairs`. The default is all
+      devices of the default backend.
+    - `progress`: a function that is called after each part of a step. Its arguments are the name of the step,
+      the number of finished parts, and the number of all parts.
 
     **Returns:** A `Collection`. Meshes that cannot be matched are left out and named in `left_out`. The
-    numbers of shapes in the result are 0-based positions in `Collection.meshes`, the list of the kept meshes.
+    result identifies each shape by its 0-based position in `Collection.meshes`, the list of the kept meshes.
 
     **Raises:** `InputError` if an argument is not valid, if fewer than two meshes can be matched, or if the
     template is left out.
@@ -181,7 +182,8 @@ def _check_usable(
 def _check_connected(maps: Mapping[Edge, EdgeMap], shapes: Sequence[PreparedShape]) -> None:
     """Check that the matched edges connect all shapes.
 
-    **Raises:** `ArithmeticError` if not. The message names the shapes that most shapes cannot reach.
+    **Raises:** `ArithmeticError` if not. The message names the shapes outside the largest connected
+    component.
     """
     component = connected_components(np.array(list(maps)).reshape(-1, 2), len(shapes))[1]
     largest = np.bincount(component).argmax()
@@ -196,7 +198,7 @@ def _check_connected(maps: Mapping[Edge, EdgeMap], shapes: Sequence[PreparedShap
 def _match_contradicted(
     consistent: ConsistentMaps, edges: Sequence[Edge], matcher: EdgeMatcher, template: int | None
 ) -> tuple[ConsistentMaps, set[Edge]]:
-    """Match edges that contradict the consistent maps again, and synchronise the maps again.
+    """Repeat the match of each edge that contradicts the consistent maps, and synchronise all maps again.
 
     The template is chosen again as well, unless its number is given.
 

@@ -21,7 +21,7 @@ from jaxsmw.repair.outcome import Outcome
 from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.compilation import release_programs
 
-# The number of pairs per device that are refined before their maps are judged and repaired.
+# Each device refines this number of pairs before their maps are judged and repaired.
 _PAIRS_PER_DEVICE = 64
 
 
@@ -44,13 +44,14 @@ def match_pairs(
     **Arguments:**
 
     - `meshes`: the meshes of the shapes, each a `Mesh` or a mesh that `make_mesh` accepts.
-    - `pairs`: for each pair, a tuple with the numbers of the source X and the target Y in `meshes`.
+    - `pairs`: a tuple (source X, target Y) for each pair, as 0-based positions in `meshes`.
     - `preset`: the name of a preset, or a `Preset`; see `match`.
     - `alternatives`: whether repair tries alternative maps.
     - `batch_size`: the number of pairs that each device refines at the same time; see `refine_pairs`.
     - `devices`: the JAX devices. The default is all devices of the default backend.
 
-    **Returns:** An iterator over tuples: the number of a pair in `pairs`, and its `Correspondence`.
+    **Returns:** An iterator over tuples. Each tuple contains the 0-based position of a pair in `pairs`, and
+    the `Correspondence` of this pair.
 
     **Raises:** `InputError` if a mesh or an argument cannot be used, or if a pair contains a number that
     belongs to no shape. The iterator raises `ArithmeticError` if the refinement of a pair fails numerically.
@@ -85,8 +86,9 @@ def refined_starts(
 
     **Arguments:**
 
-    - `starts`: for each pair, the prepared pair with one or several initial maps.
-    - `preset`: the preset, whose stages run. For each pair, the preset is adapted to small meshes.
+    - `starts`: for each pair, a list with one `PreparedPair` for each initial map.
+    - `preset`: the preset with the stages of refinement. For each pair, the preset is adapted to small
+      meshes.
     - `batch_size`, `devices`: see `refine_pairs`.
 
     **Returns:** An iterator over tuples, one for each pair in the given order. A tuple contains the prepared

@@ -17,31 +17,33 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.transfer.registered_mesh import RegisteredMesh, register_mesh
 from jaxsmw.wording import count_of
 
-# With a larger share of outliers, the maps are at fault, and not the shapes.
+# If the share of outliers is larger than this, the maps are probably wrong, and not the shapes unusual.
 _MANY_OUTLIERS = 1 / 3
 
 
 @dataclass(frozen=True)
 class MatchedEdge:
-    """An edge of the graph of a collection: two matched shapes, and what became of their map.
+    """An edge of the graph of a collection: a matched pair of shapes, with the errors and the use of its map.
 
     Errors are distances on a shape, in units of the square root of this shape's area.
 
     **Attributes:**
 
     - `source`, `target`: the 0-based numbers of the two shapes in `Collection.meshes`.
-    - `expected_error`: the mean expected error of the map by itself; infinite if the match failed.
+    - `expected_error`: the mean expected error of the map, computed without the other maps; infinite if the
+      match failed.
     - `distortion`: the distortion of the map; infinite if the match failed.
     - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The
       estimate is the error that the cycles of the graph show (`edge_errors`), but at least half of the
       prior. The prior is the expected error plus a term that grows with the distortion
       (`CollectionSettings.distortion_weight`). The same term is then added to the estimate. The estimate is
       infinite if the match failed.
-    - `residual`: the mean distance between the map and the map through the template, in the direction in
-      which this distance is larger; infinite if the match failed.
-    - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. A replaced map was matched again from the
-      consistent map, because the first map contradicted the other maps. A contradicted map still contradicts
-      the other maps, and hardly counts.
+    - `residual`: the mean distance between the map and the map through the template; infinite if the match
+      failed. The mean is computed in both directions, and the larger value is used.
+    - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. `"replaced"` means that the first map
+      contradicted the other maps, and that a second match from the consistent map replaced the first map.
+      `"contradicted"` means that the map contradicts the other maps and has little weight, or that the match
+      failed.
     - `doubtful`: whether the map contradicts the other maps, or its estimated error is at least
       `CollectionSettings.outlier_from`.
     """
@@ -83,12 +85,14 @@ class Collection:
     - `edges`: the matched pairs, each a `MatchedEdge`.
     - `axes`: the axes of the descriptors; None if the preset uses no descriptors.
     - `cycle_errors`: two arrays with the errors of all triangles of the graph. The first array was computed
-      from the first maps of the edges, the second from the final maps. An error is a mean over the three
-      shapes of the triangle, on each shape in units of the square root of its area. `match_collection` always
-      computes `cycle_errors`; None if a `Collection` was made without them.
-    - `outliers`: the numbers of shapes that differ much from all other shapes: all their maps have large
-      errors or distortions. Such a shape may be another kind of body.
-    - `left_out`: a dictionary from the name of each mesh that could not be matched to the reason.
+      from the first maps of the edges, the second from the final maps. Each error is the mean of three
+      values, one for each shape of the triangle, in units of the square root of the area of this shape. The
+      attribute is None if a `Collection` was made without cycle errors; `match_collection` always computes
+      them.
+    - `outliers`: the numbers (positions in `meshes`) of the shapes that differ much from all other shapes.
+      All maps of such a shape have large errors or distortions. The shape may be another kind of body.
+    - `left_out`: a dictionary of the meshes that could not be matched. The keys are the names of the meshes,
+      and the values are the reasons.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds.
     """
 
@@ -178,7 +182,9 @@ class Collection:
         return self.registered[shape].points_of_target.nearest_corners(self.meshes[self.template])
 
     def pointwise_map(self, source: int, target: int) -> Int64[np.ndarray, " m"]:
-        """Return the map from a shape (m vertices) to another through the template, as 0-based vertices (m,).
+        """Return the map from `source` (m vertices) to `target`, as 0-based vertices of `target` (m,).
+
+        The map goes through the template.
 
         The maps of all pairs are consistent: a vertex that is carried around a cycle returns to itself, up to
         the rounding to vertices.
@@ -207,10 +213,10 @@ class Collection:
 
     @property
     def signs(self) -> Float64[np.ndarray, "N 3"]:
-        """The factors by which the coordinates of each shape enter the shape model (N, 3).
+        """The factors (N, 3) by which the shape model multiplies the coordinates of each shape.
 
-        The factors are 1, except for shapes of the other hand than the template: their x coordinates change
-        the sign.
+        All factors are 1, unless the hand of a shape differs from that of the template. The x coordinates of
+        such a shape are multiplied by -1.
         """
         other_hand = self.mirrored != self.mirrored[self.template]
         return np.where(other_hand[:, None], [-1.0, 1.0, 1.0], 1.0)

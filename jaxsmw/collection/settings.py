@@ -25,10 +25,10 @@ class CollectionSettings:
       consistent map.
     - `distortion_weight` (Table R26): the error of an edge grows by this number times the squared logarithm
       of the distortion of its map.
-    - `distortion_tolerance`: a new map replaces the old map of an edge only if its distortion is at most this
-      multiple of the old distortion.
-    - `outlier_from`: a shape is an outlier if the errors of all its edges are at least this value. On sets of
-      one kind of body, the smallest error among the edges of each shape was at most 0.04.
+    - `distortion_tolerance`: a new map replaces the old map of an edge only if the distortion of the new map
+      is at most this multiple of the old distortion.
+    - `outlier_from`: a shape is an outlier if the errors of all its edges are at least this value. In
+      collections of one kind of body, every shape had an edge with an error of at most 0.04.
     - `rounds`: the largest number of times that contradicted edges are matched again.
     - `synchronization`: the settings of `synchronize`.
 

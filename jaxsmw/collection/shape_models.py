@@ -73,8 +73,8 @@ def align(
     Each round moves every shape to the mean, in the least-squares sense, and then updates the mean (Gower,
     "Generalized Procrustes analysis", Psychometrika 1975; Goodall, "Procrustes methods in the statistical
     analysis of shape", JRSS B 1991). The first mean is the reference shape. The rounds end when the mean
-    changes by less than 1e-10 of its size, or after 1000 rounds. A round takes time in proportion to N² and
-    not to n, because all rotations follow from the inner products of the coordinates of the shapes.
+    changes by less than 1e-10 of its size, or after 1000 rounds. The time of a round grows with N² and does
+    not depend on n, because all rotations follow from the inner products of the coordinates of the shapes.
 
     The size of a shape is its centroid size: the square root of the weighted mean of the squared distances
     from the vertices to their weighted centroid.
@@ -82,17 +82,18 @@ def align(
     **Arguments:**
 
     - `shapes`: the positions of n corresponding vertices on N shapes (N, n, 3).
-    - `scale`: whether to remove differences of size. With `scale`, each shape is scaled to fit the mean in
-      the least-squares sense. A common factor then gives the mean the average size of the given shapes.
+    - `scale`: whether to remove differences of size. If True, each shape is scaled to fit the mean in the
+      least-squares sense. All shapes are then scaled by one common factor, so that the mean has the average
+      size of the given shapes.
     - `weights`: non-negative weights of the vertices (n,), such as the vertex areas of the template, so that
-      dense regions of the triangulation do not dominate. None (the default) for equal weights.
+      dense regions of the triangulation do not dominate. With None (the default), all weights are equal.
     - `reference`: the index of the shape whose rotation and centroid do not change.
 
     **Returns:** An `Alignment`.
 
     **Raises:** `InputError` if there is no shape, if shapes have different numbers of vertices, if a
     coordinate is not finite, or if a shape is a single point. `InputError` is also raised if the weights or
-    the reference do not fit the shapes, or `scale` is not a truth value.
+    the reference do not fit the shapes, or `scale` is neither True nor False.
     """
     points = _checked(shapes)
     count, n, _ = points.shape
@@ -112,7 +113,7 @@ def align(
     translations = centroids[reference] - scales[:, None] * np.einsum("icd,id->ic", rotations, centroids)
     aligned = np.empty_like(points)
     for i, shape in enumerate(points):
-        # Centred coordinates keep their digits if a shape is far from the origin.
+        # Centred coordinates have small rounding errors, even if a shape is far from the origin.
         aligned[i] = scales[i] * ((shape - centroids[i]) @ rotations[i].T) + centroids[reference]
     return Alignment(aligned, aligned.mean(axis=0), rotations, translations, scales, shares, scale)
 
@@ -182,7 +183,7 @@ class ShapeModel:
 
         **Arguments:**
 
-        - `scores`: scores of the first j modes (j,), at most k. The scores of further modes are 0.
+        - `scores`: the scores of the first j modes (j,), where j is at most k. All other scores are 0.
 
         **Raises:** `InputError` if there are more scores than modes, or a score is not finite.
         """
@@ -202,7 +203,8 @@ class ShapeModel:
         - `shape`: positions of the n vertices (n, 3), in any coordinate system of the same unit of length. If
           the model removes differences of size, the unit does not matter.
 
-        **Returns:** The scores (k,). For a shape of the collection, they are its row of `scores`.
+        **Returns:** The scores (k,). For a shape of the collection, the result equals the row of this shape
+        in the attribute `scores`.
 
         **Raises:** `InputError` if the shape has another number of vertices, a coordinate is not finite, or
         the shape is a single point.
@@ -235,7 +237,9 @@ class ShapeModel:
         return 1 + self.total_variance * (count - 1) / count / squared_mean
 
     def compactness(self) -> Float64[np.ndarray, " k"]:
-        """Return the shares of the total variance that the first 1, 2, …, k modes have together (k,).
+        """Return the cumulative shares of the total variance (k,).
+
+        Entry i is the share of the first i + 1 modes.
 
         The last share is 1 if the model has all modes.
         """
@@ -255,7 +259,7 @@ class ShapeModel:
 
         - `numbers_of_modes`: numbers of modes, from 0 (the mean alone) to N - 2.
 
-        **Returns:** The mean error of the N shapes for each number, and its standard error.
+        **Returns:** The mean error of the N shapes for each number of modes, and its standard error.
 
         **Raises:** `InputError` if there are fewer than two shapes, or if an entry of `numbers_of_modes` is
         not a whole number from 0 to N - 2.
@@ -283,8 +287,9 @@ class ShapeModel:
         """Measure how much random shapes of the model resemble shapes of the collection.
 
         The scores of a random shape have a normal distribution with the variances of the modes (Davies 2002;
-        Styner et al. 2003). Its distance is the mean distance over the surface to the nearest shape of the
-        collection. The nearest shape is the shape with the smallest root mean square of the distances.
+        Styner et al. 2003). The distance of a random shape is the mean distance over the surface to the
+        nearest shape of the collection. The nearest shape has the smallest root-mean-square distance to the
+        random shape.
 
         **Arguments:**
 
@@ -292,7 +297,7 @@ class ShapeModel:
         - `samples`: the number of random shapes, at least 2.
         - `seed`: the random seed. The random numbers of a mode do not depend on `numbers_of_modes`.
 
-        **Returns:** The mean distance for each number, and its standard error.
+        **Returns:** The mean distance for each number of modes, and its standard error.
 
         **Raises:** `InputError` if `samples` is below 2, if `seed` is negative, or if an entry of
         `numbers_of_modes` is not a whole number from 0 to k.
@@ -301,7 +306,8 @@ class ShapeModel:
         seed = check_whole_number("seed", seed, 0)
         numbers = _checked_numbers(numbers_of_modes, len(self.modes), "the model has")
         coordinates = _coordinates(self.alignment)
-        # The numbers are drawn mode by mode, so further modes do not change the numbers of the first modes.
+        # Random numbers are drawn mode by mode, so further modes do not change the numbers of the first
+        # modes.
         normal = np.random.default_rng(seed).standard_normal((len(self.modes), samples)).T
         drawn = normal * np.sqrt(self.variances)
         distances = []
@@ -348,7 +354,7 @@ def shape_model(
 
     **Returns:** A `ShapeModel`.
 
-    **Raises:** `InputError` as `align` does, or if the number of modes is below 1.
+    **Raises:** `InputError` if `align` raises it, or if the number of modes is below 1.
     """
     if number_of_modes is not None:
         number_of_modes = check_whole_number("number_of_modes", number_of_modes, 1)
@@ -477,24 +483,24 @@ def _blocks(n: int) -> Iterator[slice]:
 
 
 def _displacements(alignment: Alignment) -> Iterator[tuple[slice, Float64[np.ndarray, "N q"]]]:
-    """Yield blocks of vertices, with the displacements of all shapes from the mean in one row per shape."""
+    """Yield each block of vertices with its displacements from the mean, one row per shape."""
     for block in _blocks(len(alignment.mean)):
         yield block, (alignment.aligned[:, block] - alignment.mean[block]).reshape(len(alignment.aligned), -1)
 
 
 def _smallest_norm(alignment: Alignment) -> float:
-    """Return the limit of the norm of a mode's scores below which the mode is a rounding error."""
+    """Return a limit. A mode is a rounding error if the norm of its scores is below this limit."""
     centered = alignment.mean - alignment.weights @ alignment.mean
     size = np.sqrt(alignment.weights @ (centered**2).sum(axis=1))
     return float(_SMALLEST_DEVIATION * size * np.sqrt(max(len(alignment.aligned) - 1, 1)))
 
 
 def _coordinates(alignment: Alignment) -> Float64[np.ndarray, "N r"]:
-    """Return the scores of all modes, the coordinates of the shapes in an orthonormal basis.
+    """Return the scores of all modes. They are the coordinates of the shapes in an orthonormal basis.
 
-    QR decompositions of one block of vertices after another reduce the displacements to an N x N matrix with
-    the same inner products. This matrix keeps small singular values accurate. A matrix of inner products
-    would contain their squares.
+    One QR decomposition per block of vertices reduces the displacements to an N x N matrix, which has the
+    same inner products. The small singular values of this matrix are accurate. A matrix of inner products
+    would contain their squares and lose this accuracy.
     """
     count = len(alignment.aligned)
     reduced = np.zeros((0, count))
@@ -511,7 +517,7 @@ def _coordinates(alignment: Alignment) -> Float64[np.ndarray, "N r"]:
 
 
 def _directions(centered: Float64[np.ndarray, "N r"], smallest: float) -> Float64[np.ndarray, "k r"]:
-    """Return orthonormal directions of decreasing variance, without directions of rounding errors."""
+    """Return orthonormal directions of decreasing variance. Rounding errors are left out."""
     if centered.size == 0:
         return np.zeros((0, centered.shape[1]))
     _, values, right = np.linalg.svd(centered, full_matrices=False)

@@ -1,4 +1,4 @@
-"""The data of each shape of a collection, which all pairs of the shape share."""
+"""The data of a shape that are computed once and shared by all pairs with this shape."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ logger = logging.getLogger("jaxsmw")
 
 
 def _warned_already() -> AbstractContextManager[object]:
-    """Ignore warnings about coarse meshes in the block, because `prepare_shape` has issued them."""
+    """Ignore warnings about coarse meshes in a `with` block. `prepare_shape` has issued them before."""
     return warnings.catch_warnings(action="ignore", category=UserWarning)
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedShape:
-    """A shape of a collection, with the data that the matches of all its pairs need.
+    """A shape of a collection, with the data that are needed to match the shape with any other shape.
 
     **Attributes:**
 
@@ -57,11 +57,11 @@ class PreparedShape:
 
     @property
     def sampled(self) -> SampledShape:
-        """The shape with the vertices at which its descriptors are compared."""
+        """The `SampledShape`, which contains the vertices at which descriptors are compared."""
         return SampledShape.make(self.mesh, self.compared, self.spectrum)
 
     def mirrored(self) -> PreparedShape:
-        """Return the mirror image of a shape without descriptors."""
+        """Return the mirror image of the shape, which must not have descriptors."""
         return replace(self, mesh=self.mesh.mirrored(), spectrum=self.spectrum.reflect())
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -89,13 +89,13 @@ def prepare_shape(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "exact",
 ) -> PreparedShape:
-    """Compute the spectrum and the samples of one shape, without descriptors.
+    """Compute the spectrum and the samples of one shape. The result has no descriptors.
 
     **Arguments:**
 
     - `mesh`: a `Mesh` (n vertices).
-    - `preset`: the preset, whose stages determine the numbers of eigenvectors and samples. The preset is
-      adapted to a small mesh; see `Preset.fitted`.
+    - `preset`: the preset, whose stages determine the numbers of eigenvectors and samples. If the mesh is
+      small, the preset is adapted to the mesh; see `Preset.fitted`.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`. All shapes of a collection need the same
       eigensolver, because their spectra are compared.
 
@@ -120,7 +120,7 @@ def prepare_shape(
 def prepare_usable_shapes(
     meshes: Sequence[Mesh], preset: Preset, progress: Progress = no_progress
 ) -> tuple[dict[int, PreparedShape], dict[str, str]]:
-    """Prepare all shapes that can be matched, without descriptors.
+    """Compute the spectra and samples of all shapes that can be matched. The results have no descriptors.
 
     **Arguments:**
 
@@ -128,8 +128,9 @@ def prepare_usable_shapes(
     - `preset`: see `prepare_shape`.
     - `progress`: a function that is called after each shape.
 
-    **Returns:** A dictionary from the number of each usable mesh to its `PreparedShape`, and a dictionary
-    from the name of each other mesh to the reason.
+    **Returns:** Two dictionaries. The first contains the `PreparedShape` of each usable mesh, and its keys
+    are positions in `meshes`. The second contains the reasons why the other meshes cannot be matched, and its
+    keys are the names of these meshes.
     """
     eigensolver = choose_eigensolver(*meshes) if meshes else "exact"
     shapes, left_out = {}, {}
@@ -144,12 +145,12 @@ def prepare_usable_shapes(
 
 
 def shape_key(shape: PreparedShape, preset: Preset) -> tuple[Any, ...]:
-    """Return the key of a shape without descriptors, for keys of `Store`."""
+    """Return the part of a `Store` key that identifies a shape, apart from its descriptors."""
     return shape.mesh.vertices, shape.mesh.faces, preset.number_of_eigenvectors
 
 
 def preset_key(preset: Preset) -> tuple[Any, ...]:
-    """Return the key of a preset, for keys of `Store`: its text, and the arrays that its text abbreviates."""
+    """Return the part of a `Store` key that identifies a preset: its text and its arrays."""
     refiners = [stage.refiner for stage in preset.stages]
     return repr(preset), *(np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(refiners, eqx.is_array)))
 

@@ -27,7 +27,7 @@ class SynchronizationSettings:
 
     **Attributes:**
 
-    - `iterations` (Table R26): the number of averagings.
+    - `iterations` (Table R26): the number of iterations. Each iteration averages the points on every shape.
     - `robust_scale` (Table R26): the distance at which a point has half of the weight of a point at distance
       zero. Points of wrong maps are much farther away.
     - `discontinuity_distance`: if the matches of a triangle's corners are farther apart than this distance, a
@@ -89,7 +89,7 @@ def robust_mean(
     **Arguments:**
 
     - `candidates`: d candidate positions of each of n points (d, n, 3).
-    - `weights`: the weight of each of the d maps (d,).
+    - `weights`: the weight of each of the d candidates (d,), which is the same for all points.
     - `start`: the first estimate of each position (n, 3).
     - `scale`: the distance at which a candidate has half of its weight.
 
@@ -151,7 +151,7 @@ class Network:
         return csr_array((values, (rows, columns)), shape=(len(self.meshes),) * 2)
 
     def medoid(self) -> int:
-        """Return the number of the shape with the smallest sum of errors along the best paths."""
+        """Return the medoid: the shape whose best paths to all shapes have the smallest sum of errors."""
         return int(np.argmin(dijkstra(self.lengths(), directed=False).sum(axis=1)))
 
     def along_best_paths(self, template: int) -> list[SurfacePoints]:
@@ -221,12 +221,12 @@ class Network:
 
 
 def synchronize(network: Network, template: int) -> list[SurfacePoints]:
-    """Compute maps from the template to all shapes that agree with the maps of all edges.
+    """Compute the maps from the template to all shapes, such that they agree with the maps of all edges.
 
-    The first maps follow the paths with the smallest errors. Each iteration then carries the points on the
-    neighbours of a shape to the shape, along the edges of the graph. The points on the shape move to the
-    robust mean of the carried points. This is the synchronisation of pointwise maps (Huang, Guibas 2013) by
-    iterated averages on the surfaces.
+    The first maps follow the paths with the smallest errors. In each iteration, the points on the neighbours
+    of a shape are carried to this shape, along the edges of the graph. The points on this shape then move to
+    the robust mean of the carried points. This is the synchronisation of pointwise maps (Huang, Guibas 2013)
+    by iterated averages on the surfaces.
 
     **Arguments:**
 
@@ -250,7 +250,7 @@ def vertex_map_between(
 
     **Arguments:**
 
-    - `points_x`, `points_y`: the points of the template's vertices on X and on Y.
+    - `points_x`, `points_y`: the points on X and on Y that correspond to the template's vertices.
     - `template`: the template.
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
 

@@ -118,7 +118,7 @@ def encode(
 
     **Arguments:**
 
-    - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
+    - `pointwise_map`: the map T, given as one vertex of Y per vertex of X (m,) or as a soft map from X to Y.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
       vertices, k_Y eigenvectors).
     - `convention`: the direction of C_0. `"pullback"` (the default) gives `Phi_X^+ P Phi_Y` (k_X, k_Y), which
@@ -128,7 +128,8 @@ def encode(
       the vertex areas. `"least_squares"` uses `Phi^+ = (Phi^T Phi)^-1 Phi^T`, in which all vertices have the
       same weight.
 
-    **Returns:** C_0, (k_X, k_Y) in the pullback convention and (k_Y, k_X) in the pushforward convention.
+    **Returns:** C_0. Its shape is (k_X, k_Y) in the pullback convention and (k_Y, k_X) in the pushforward
+    convention.
 
     **Raises:** `ValueError` for an unknown convention or pseudo-inverse.
     """
@@ -292,7 +293,8 @@ class WaveletProblem(eqx.Module):
 
         **Arguments:**
 
-        - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
+        - `pointwise_map`: the map T, given as one vertex of Y per vertex of X (m,) or as a soft map from X to
+          Y.
         - `dual_out`: the `dual_eigenvectors` (n_out, k_out) of the shape that C maps to.
         """
         _, spectrum_in = self.spectra
@@ -313,7 +315,8 @@ class WaveletProblem(eqx.Module):
 
         **Arguments:**
 
-        - `pointwise_map`: T, one vertex of Y per vertex of X (m,), or a soft map from X to Y.
+        - `pointwise_map`: the map T, given as one vertex of Y per vertex of X (m,) or as a soft map from X to
+          Y.
         - `norm`: `"area"` (the default) weights each vertex of X by its area. `"frobenius"` gives all
           vertices the same weight, as in equation (5) of the MWP paper.
 

@@ -26,22 +26,24 @@ def spectral_embeddings(
     of X are the rows of `Phi_X`, and the points of Y are the rows of `Phi_Y C^T`. In the pushforward
     convention, the points of X are the rows of `Phi_X C^T`, and the points of Y are the rows of `Phi_Y`.
 
-    The convention matters because a filtered functional map shortens the vectors that it maps. In the
-    pushforward convention, C shrinks the queries. A few database points of small norm are then nearest to
-    most queries. In the pullback convention, C shrinks the database, which hardly changes the order of the
-    distances from a query. On real shapes, refinement with filtering therefore succeeds only in the pullback
-    convention.
+    The convention matters because a filtered functional map shortens the vectors that it maps. The search
+    finds the nearest point of Y (the database) for each point of X (a query). In the pushforward convention,
+    C shrinks the queries. A few points of the database with small norms are then nearest to most queries. In
+    the pullback convention, C shrinks the database, which hardly changes the order of the distances from a
+    query. On real shapes, refinement with filtering therefore succeeds only in the pullback convention.
 
     **Arguments:**
 
-    - `functional_map`: C, (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
+    - `functional_map`: C, of shape (k_X, k_Y) in the pullback convention and of shape (k_Y, k_X) in the
+      pushforward convention.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
       vertices, k_Y eigenvectors).
     - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
       X. With `"pushforward"`, C maps functions on X to functions on Y.
 
-    **Returns:** The queries (m, d), one point per vertex of X, and the database (n, d), one point per vertex
-    of Y. The dimension d is the number of rows of C. The coordinates have the unit of the eigenvectors.
+    **Returns:** Two point sets: the queries (m, d) with one point per vertex of X, and the database (n, d)
+    with one point per vertex of Y. The dimension d is the number of rows of C. The coordinates have the unit
+    of the eigenvectors.
 
     **Raises:** `ValueError` for an unknown convention.
     """
@@ -67,7 +69,8 @@ def decode(
 
     **Arguments:**
 
-    - `functional_map`: C, (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
+    - `functional_map`: C, of shape (k_X, k_Y) in the pullback convention and of shape (k_Y, k_X) in the
+      pushforward convention.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
       vertices, k_Y eigenvectors).
     - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
@@ -75,7 +78,8 @@ def decode(
     - `patches`: the result of `search_patches(spectrum_x, spectrum_y)`, which makes the search faster on
       large shapes. With None (the default), the search compares all vertices of X with all vertices of Y.
 
-    **Returns:** T, one vertex of Y per vertex of X, as an int32 array (m,) of indices from 0 to n - 1.
+    **Returns:** The map T, an int32 array (m,). Entry i is the match of vertex i of X, as a 0-based vertex of
+    Y.
 
     **Raises:** `ValueError` for an unknown convention.
     """
@@ -107,16 +111,17 @@ def decode_to_triangles(
 
     **Arguments:**
 
-    - `functional_map`: C, (k_X, k_Y) in the pullback convention, (k_Y, k_X) in the pushforward convention.
+    - `functional_map`: C, of shape (k_X, k_Y) in the pullback convention and of shape (k_Y, k_X) in the
+      pushforward convention.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
       vertices, k_Y eigenvectors).
     - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
       X. With `"pushforward"`, C maps functions on X to functions on Y.
     - `faces_y`: (f, 3), the triangles of Y, as vertex indices from 0 to n - 1.
 
-    **Returns:** Two arrays with one row per vertex of X. The first array (m,), int32, contains the 0-based
-    index of a triangle of Y, a row of `faces_y`. The second array (m, 3) contains the barycentric weights of
-    the triangle's corners, which are not negative and sum to 1.
+    **Returns:** Two arrays with one row per vertex of X. The first array (m,), int32, contains triangles of Y
+    as 0-based rows of `faces_y`. The second array (m, 3) contains barycentric weights of the three corners.
+    The weights are non-negative and sum to 1.
 
     **Raises:** `ValueError` for an unknown convention.
     """

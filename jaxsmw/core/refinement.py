@@ -30,8 +30,8 @@ class History(eqx.Module):
     **Attributes:**
 
     - `changed`: (iterations,), the share of X's vertices whose match changed in each iteration, from 0 to 1.
-      If the refinement uses samples, `changed` is computed from the samples of X only, and its first and last
-      entries are NaN.
+      If the refinement uses samples, `changed` is computed from the samples of X only. The first entry is
+      then NaN unless `starts_on_samples` is True, and the last entry is NaN unless `ends_on_samples` is True.
     - `energy`: (iterations,), the result of `Refiner.energy` in each iteration, computed from the state and
       from the pointwise map that produced this state. For `WaveletPreservation`, this is the energy of
       equation (5) of the MWP paper.
@@ -122,8 +122,8 @@ def refine(
     functional map from the initial map of all vertices. The last step recovers the refined map of all
     vertices. All steps in between use only the samples. The fast variant of the MWP authors' program also
     iterates on samples. With `starts_on_samples` or `ends_on_samples`, the first or the last step also uses
-    only the samples. A call that ends on samples and a second call that starts on the same samples then avoid
-    a search that matches all vertices in between.
+    only the samples. If one call ends on samples and the next call starts on the same samples, the two calls
+    save one search of all vertices.
 
     **Arguments:**
 
@@ -136,10 +136,10 @@ def refine(
     - `samples`: a tuple of two integer arrays: the vertices of X (s_x,) and of Y (s_y,) on which the
       refinement iterates. The samples should be evenly spread and outnumber the eigenvectors. With None, all
       iterations use all vertices.
-    - `starts_on_samples`: whether the first functional map uses the initial map at the samples only. The
-      entries of the other vertices of X are then ignored.
-    - `ends_on_samples`: whether refinement ends without matching all vertices. The refined map then contains
-      -1 for each vertex of X that is not a sample.
+    - `starts_on_samples`: whether the first functional map is computed from the samples only. If True, the
+      initial map of all other vertices of X is ignored.
+    - `ends_on_samples`: whether the last step matches only the samples. If True, the refined map contains -1
+      for each vertex of X that is not a sample.
     - `partial`: whether one shape is a part of the other. If True, both shapes must have the same unit of
       length.
     - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. Under `jax.vmap`,
@@ -152,9 +152,9 @@ def refine(
 
     **Raises:** `ValueError` if `iterations` is below 1, the initial map does not have shape (m,), `samples`
     is not a pair, or the two spectra have different float types. `ValueError` is also raised if refinement
-    should start or end on samples, but there are no samples or the refiner cannot do this. `TypeError` if
-    `iterations` or the entries of the initial map are not integers, or if another argument has the wrong
-    type.
+    should start or end on samples, but there are no samples or the refiner matches samples of X with samples
+    of Y. `TypeError` if `iterations` or the entries of the initial map are not integers, or if another
+    argument has the wrong type.
     """
     _check_arguments(spectrum_x, spectrum_y, pointwise_map, refiner, samples)
     check_samples_use(refiner, samples is not None, starts_on_samples, ends_on_samples)
@@ -234,7 +234,10 @@ class _Record(NamedTuple):
         )
 
     def without_first_change(self) -> _Record:
-        """Return the record of a refinement whose first map of samples has no earlier map to compare with."""
+        """Return the record with NaN as the first entry of `changed`.
+
+        The first map of the samples cannot be compared with an earlier map.
+        """
         return self._replace(changed=self.changed.at[:1].set(jnp.nan))
 
     def history(self, successful: Bool[Array, ""]) -> History:
@@ -263,10 +266,13 @@ class _Loop:
     def init(
         self, in_full: Prepared, pointwise_map: Int32[Array, " m"], first_map: Int32[Array, " s"]
     ) -> _Progress:
-        """Compute the first state from the initial map of all vertices.
+        """Compute the first state from the initial map.
+
+        `pointwise_map` is the initial map of all vertices or, with `starts_on_samples`, of the samples.
 
         The first iteration compares its map with `first_map` to count the changed matches. `first_map` is the
-        initial map or, if the loop runs on samples, an array of -1.
+        initial map of the vertices on which the loop runs. If the loop runs on samples, but does not start on
+        samples, all entries are -1.
         """
         state, result = self.refiner.update(in_full, pointwise_map, None)
         return _Progress(
@@ -424,8 +430,8 @@ def diagnose(
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `matches`: the vertices of Y in the initial map, (m, ...), one or several per vertex of X; None for a
-      dense soft map, which contains no vertex indices.
+    - `matches`: the initial map (m, ...), as one or several vertices of Y per vertex of X; None for a dense
+      soft map, which contains no vertex indices.
     - `result`: the status code of the refinement loop.
     - `used`: a mask of the vertices of X whose matches must be valid (m,). The default is the mask of X.
     """

@@ -154,10 +154,10 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
     @property
     def matches_samples_with_all(self) -> bool:
-        """Whether `recover` matches samples of X with all vertices of Y. If False, it uses samples of Y.
+        """Whether `recover` matches samples of X with all vertices of Y, not only with samples of Y.
 
-        If True, `update` and `recover` use the indices of Y's vertices, also on samples. If False (the
-        default), they use positions in the list of Y's samples.
+        If True, pointwise maps of samples contain vertices of Y. If False (the default), they contain
+        positions in the list of Y's samples.
         """
         return False
 
@@ -180,8 +180,9 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         """Return two point sets in which each vertex of X is close to its match on Y.
 
         For each vertex of X, `jaxsmw.Correspondence.surface_points` searches the triangles around its match.
-        The result is the point of these triangles that is nearest in the embeddings. By default, the
-        embeddings are the `spectral_embeddings` of the functional map in the refiner's `convention`.
+        The result is the point on these triangles whose embedding is nearest to that of the vertex. By
+        default, the embeddings are the `spectral_embeddings` of the functional map in the refiner's
+        `convention`.
 
         **Returns:** Two arrays: one point for each vertex of X to be matched (m, d), and one point for each
         vertex of Y (n, d). Each refiner chooses the dimension d and the unit, which is the same for both

@@ -107,9 +107,9 @@ def in_blocks(
 def _maximum(values: Array, axis: int, parts: int) -> Array:
     """Return the maximum along an axis.
 
-    The function divides the axis into parts of equal width, which may overlap, and computes the elementwise
-    maximum of all parts. The result is the maximum of this narrower array along the axis. On CPUs, this order
-    of operations reduces the time of a search by about 10 %.
+    The function divides the axis into parts of equal width, which may overlap. The elementwise maximum of all
+    parts is a narrower array. The result is the maximum of the narrower array along the axis. On CPUs, this
+    order of operations reduces the time of a search by about 10 %.
     """
     size = values.shape[axis]
     width = -(-size // parts)
@@ -152,11 +152,10 @@ class Patches(eqx.Module):
 
     **Attributes:**
 
-    - `rows`: (p, s), one row per patch: the indices of the patch's points in ascending order, with padding at
-      the end.
+    - `rows`: (p, s), the indices of each patch's points in ascending order, with padding at the end.
     - `mask`: (p, s), False for padding and for masked points, True for all other points.
-    - `variations`: (p, r, s), for each patch, the coefficients of r linear combinations of its s points.
-      These combinations are the r directions along which the points of the patch differ most.
+    - `variations`: (p, r, s), the coefficients of r linear combinations of the s points of each patch. These
+      combinations are the r directions along which the points of the patch differ most.
     """
 
     rows: Int32[Array, "p s"]
@@ -167,8 +166,8 @@ class Patches(eqx.Module):
 def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: int, rank: int) -> Patches:
     """Divide points into patches of equal size by repeated halving.
 
-    Each group of points is halved along one of the first 6 coordinates: the coordinate with the largest
-    variance.
+    The function halves each group of points along the coordinate with the largest variance. Only the first 6
+    coordinates are considered.
 
     **Arguments:**
 
@@ -270,10 +269,10 @@ def nearest_neighbor_in_patches(
     has a radius: the largest distance from a point of the patch to the space that the axes span. The box
     gives a lower bound on the distances from a query to the points of the patch. Computing this bound takes
     only r + 1 scalar products. For each query, the patch with the nearest box gives a first candidate. The
-    queries are divided into patches, too. If a database patch cannot contain a nearer point for any query of
-    a patch, the search skips the database patch for this whole patch of queries. The bounds allow for
-    rounding errors, so no nearest point is skipped. If the points are spread evenly in all dimensions, the
-    search skips no patch, and `nearest_neighbor` is faster.
+    queries are divided into patches, too. For each patch of queries, the search skips the database patches
+    that cannot contain a nearer point for any of these queries. The bounds allow for rounding errors, so no
+    nearest point is skipped. If the points are spread evenly in all dimensions, the search skips no patch,
+    and `nearest_neighbor` is faster.
 
     **Arguments:**
 
@@ -343,9 +342,10 @@ def nearest_vertices(
 class _Boxes(NamedTuple):
     """The bounding boxes of all patches.
 
-    The points of a patch are within `radius` of a box with orthonormal `axes` through the `center` of the
-    patch. `local` contains the coordinates of the points along the axes. `low` and `high` are the smallest
-    and the largest of these coordinates along each axis. `counts` is False for patches without points.
+    The box of a patch has orthonormal `axes` through the `center` of the patch. No point of the patch is
+    farther than `radius` from the box. `local` contains the coordinates of the points along the axes. `low`
+    and `high` are the smallest and the largest of these coordinates along each axis. `counts` is False for
+    patches without points.
     """
 
     points: Float[Array, "p s d"]

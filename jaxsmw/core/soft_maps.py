@@ -2,7 +2,7 @@
 
 A `Recovery` computes a soft map from two point sets. `Softmax` computes the shares of a query from its
 distances to all points. `NearestFew` uses only the points that are nearest to the query. `Sinkhorn` adjusts
-the shares so that the total area that each database point receives equals its own area.
+the shares so that each database point receives a total area equal to its own area.
 """
 
 from __future__ import annotations
@@ -48,8 +48,9 @@ class SoftMap(eqx.Module):
       all queries. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
       computed.
     - `temperature`: the temperature, a scalar array in squared units of the points.
-    - `residual`: the share of the total area that database rows receive in excess of their own areas, from 0
-      to 1. The residual is NaN if `Softmax` computed the map, because `Softmax` computes no residual.
+    - `residual`: the misplaced area divided by the total area, from 0 to 1. Misplaced area is the area that
+      database rows receive in excess of their own areas. The residual is NaN if `Softmax` computed the map,
+      because `Softmax` computes no residual.
     - `converged`: whether the residual is at most the argument `tolerance` of `sinkhorn`; False if the
       residual is NaN.
     - `iterations`: the number of iterations that `sinkhorn` ran; 0 if `Softmax` computed the map.
@@ -261,7 +262,7 @@ class NearestFew(Recovery):
 
     The share of each of the nearest rows is proportional to its area times `exp(-distance² / temperature)`,
     where `distance` is the distance between the query and the row. The shares are differentiable, but
-    derivatives treat the choice of the rows as constant. The result is a `SparseSoftMap`, whose attributes
+    derivatives treat the choice of the rows as constant. The result is a `SparseSoftMap`. Its attributes
     `rows` and `shares` have shape (m, t), where t is the smaller of `number` and n. On CPUs, `NearestFew` is
     slow in float64, because sorting then takes most of the time.
 
@@ -330,8 +331,7 @@ class Sinkhorn(Recovery):
       nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
       maps and need more iterations.
     - `iterations`: the maximum number of iterations of `sinkhorn`, an integer of at least 1.
-    - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
-      is at most the tolerance.
+    - `tolerance`: a positive number. The iterations stop when `SoftMap.residual` is at most the tolerance.
 
     **Raises:** `TypeError` if `iterations` is not an integer; `ValueError` if the temperature is not a single
     positive, finite number, `iterations` is below 1, or `tolerance` is not positive.
@@ -401,13 +401,12 @@ def sinkhorn(
       squared distance from queries to their nearest database rows. The unit is at least `sqrt(eps)` times the
       area-weighted variance of the queries, where eps is the machine epsilon of the float type. Lower
       temperatures give sharper maps and need more iterations. The rounding error of squared distances is eps
-      times the variance. If the temperature is below this error, the error is used as the temperature. In
-      this case, derivatives with respect to the temperature are zero. If the temperature is not positive, the
-      result is NaN.
+      times the area-weighted variance of the queries. If the temperature is below this error, the error is
+      used as the temperature. In this case, derivatives with respect to the temperature are zero. If the
+      temperature is not positive, the result is NaN.
     - `iterations`: the maximum number of iterations, an integer of at least 1. Iterations after convergence
       are skipped. Under `jax.vmap`, iterations after convergence run but change nothing.
-    - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, a share of the total area,
-      is at most the tolerance.
+    - `tolerance`: a positive number. The iterations stop when `SoftMap.residual` is at most the tolerance.
 
     **Returns:** A `SoftMap` from the queries to the database. If the iterations do not converge, or if the
     result is not finite, no error is raised, but the attribute `converged` of the map is False.

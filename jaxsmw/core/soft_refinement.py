@@ -33,9 +33,10 @@ class SoftRefinement(eqx.Module):
     - `functional_map`: the final functional map C (k_out, k_in). By default, C is a pullback (k_X, k_Y),
       which takes functions on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y,
       k_X) takes functions on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
-    - `soft_map`: the soft map from X (m vertices) to Y (n vertices) that the recovery computes from C, a
-      `SoftMap` or a `SparseSoftMap`. Its `pull_back` transfers functions (n, p) on Y to X (m, p). Its
-      `pointwise_map()` returns an integer array (m,), one 0-based vertex of Y per vertex of X.
+    - `soft_map`: the soft map from X (m vertices) to Y (n vertices), a `SoftMap` or a `SparseSoftMap`. The
+      recovery computes the soft map from C. The method `pull_back` of the soft map transfers functions (n, p)
+      on Y to X (m, p). The method `pointwise_map` returns an integer array (m,), one 0-based vertex of Y per
+      vertex of X.
     - `result`: the status code, a member of `RESULTS`. Compare `result` with `RESULTS.successful`.
       `RESULTS[result]` is a sentence that explains the status.
     - `iterations`: the number of functional maps that were computed after the first functional map.
@@ -222,7 +223,7 @@ class WaveletPreservationLayer(eqx.Module):
 
         - `features_x`, `features_y`: d features of each vertex of X (m, d) and of Y (n, d), in the same unit.
           Corresponding vertices should be close to each other in feature space.
-        - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
+        - `spectrum_x`, `spectrum_y`: the spectra of the source X (m vertices) and the target Y (n vertices).
 
         **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in), `soft_map`
         (a soft map from X to Y) and `result`.

@@ -135,7 +135,8 @@ class Spectrum(eqx.Module):
     def excluding(self, vertices: Bool[Array, " n"]) -> Spectrum:
         """Return the spectrum with area zero at the vertices for which the mask (n,) is True.
 
-        The areas of the other vertices grow by one factor, so that the area of the shape stays the same.
+        The areas of the other vertices are multiplied by a common factor, so that the total area stays the
+        same.
         """
         areas = jnp.where(vertices, 0, self.vertex_areas)
         return dataclasses.replace(self, vertex_areas=areas * (jnp.sum(self.vertex_areas) / jnp.sum(areas)))

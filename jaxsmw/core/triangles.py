@@ -107,7 +107,7 @@ def nearest_point_on_candidates(
 
 
 def _weights(s: Float[Array, " m"], t: Float[Array, " m"]) -> Float[Array, "m 3"]:
-    """Return the barycentric weights of the points `a + s u + t v` of triangles with edges u, v from a."""
+    """Return the barycentric weights of points `a + s u + t v` in triangles with corner a and edges u, v."""
     # Rounding errors can make 1 - s - t slightly negative.
     weights = jnp.stack([jnp.maximum(1 - s - t, 0), s, t], axis=1)
     return weights / jnp.sum(weights, axis=1, keepdims=True)

@@ -102,8 +102,8 @@ class DataPair:
 class DataSet:
     """A data set: the shapes and pairs in a directory, as `open_data_set` returns them.
 
-    The property `name` is the name of the directory. The property `shapes` is a dictionary from the name of
-    each shape that occurs in a pair to the path of its mesh file.
+    The property `name` is the name of the directory. The property `shapes` is a dictionary from the names of
+    shapes to the paths of their mesh files. The dictionary contains every shape that occurs in a pair.
 
     **Attributes:**
 
@@ -113,7 +113,8 @@ class DataSet:
     - `pairs`: the pairs to match, as a tuple of `DataPair`. If the data set contains a list of pairs, the
       tuple contains the listed pairs in the order of the list.
     - `others`: a tuple of `DataPair`, with all pairs that have ground truth but are not in `pairs`. In a
-      remeshed set, also the pairs of different classes, which have ground truth in some sets.
+      remeshed set, the tuple also contains the pairs of shapes of different classes. Only some remeshed sets
+      have ground truth for such pairs.
     """
 
     directory: Path
@@ -128,7 +129,7 @@ class DataSet:
 
     @property
     def shapes(self) -> dict[str, Path]:
-        """A dictionary from the name of each shape that occurs in a pair to its mesh file."""
+        """A dictionary from the names of shapes to their mesh files, for all shapes that occur in a pair."""
         found = {}
         for pair in (*self.pairs, *self.others):
             found[pair.source], found[pair.target] = pair.source_file, pair.target_file
@@ -397,7 +398,8 @@ def _remeshed(directory: Path) -> _Pairs | None:
         return DataPair(x, y, shapes[x], shapes[y], (plain[x], plain[y]), mirrored)
 
     pairs, others = _listed_first(pair, _listed_pairs(directory, shapes), _within_classes(shapes))
-    # In some sets, such as SMAL, the rows of all shapes correspond. The files do not show in which sets.
+    # In some sets, such as SMAL, shapes of different classes also correspond row by row. The files do not
+    # tell whether a set is of this kind, so all pairs are allowed.
     present = {one.names for one in (*pairs, *others)}
     return pairs, others + [pair(*names) for names in permutations(shapes, 2) if names not in present]
 

@@ -64,7 +64,7 @@ class GroundTruth:
         return cls(np.arange(len(targets)), targets)
 
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
-        """Extend the ground truth to a map X -> Y (m,) for all vertices of X, with 0-based vertices of Y.
+        """Extend the ground truth to all vertices of X. Return a map X -> Y (m,), as 0-based vertices of Y.
 
         A vertex without ground truth receives the target of the nearest vertex that has ground truth.
         Distances are Euclidean.

@@ -1,4 +1,8 @@
-"""The tasks of a benchmark: the precomputation for one shape, and the measurement of methods on one pair."""
+"""The measurements of a benchmark.
+
+`measure_shape` measures the precomputation for one shape. `measure_pair` measures several methods on one
+pair.
+"""
 
 from __future__ import annotations
 
@@ -137,7 +141,9 @@ class Settings:
         return self.init in INITIAL_MAPS
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """Check, if `init` is a directory, that the directory contains a map for every pair.
+        """Check that the directory `init` contains a map for every pair.
+
+        If `init` is the name of an initial map, nothing is checked.
 
         **Raises:** `InputError` if a file with an initial map is missing.
         """
@@ -207,8 +213,8 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
     - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape. This number must be at
       least as large as the `number_of_eigenvectors` of every method in the task.
 
-    **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. If a method
-    failed, all statistics of its map are NaN.
+    **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. The statistics
+    of a map that contains -1 are NaN. Most methods return such a map after a failure.
 
     **Raises:** `InputError` if a file cannot be read, or if the pair cannot be prepared; `ArithmeticError` if
     the computation of an initial map fails numerically.
@@ -289,7 +295,8 @@ def _evaluate(
     """Evaluate a map with every ground truth, and return the statistics with the smallest mean error.
 
     `truths` is a dictionary with the ground truth `"direct"` and, if requested, the ground truth
-    `"mirrored"`. If the method failed, all statistics are NaN.
+    `"mirrored"`. If the map contains -1, all statistics are NaN. Most methods return such a map after a
+    failure.
     """
     if (pointwise_map < 0).any():
         return dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}

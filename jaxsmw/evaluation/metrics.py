@@ -20,7 +20,7 @@ from jaxsmw.geometry.geodesics import (
 )
 from jaxsmw.geometry.mesh import Mesh
 
-# For each of `THRESHOLDS`, reports contain the share of points with at most this error. Reported
+# Reports contain, for each of `THRESHOLDS`, the share of points with at most this error. Reported
 # correspondence quality curves end at `LARGEST_THRESHOLD`. Thresholds are in units of the square root of the
 # target's area.
 THRESHOLDS = (0.02, 0.05, 0.1)
@@ -35,8 +35,8 @@ class GeodesicError:
     mean of all finite errors, and `median` is the median of all errors. The property `unreachable` is the
     share of infinite errors. The property `within` is a dictionary from each threshold (0.02, 0.05 and 0.1)
     to the share of points with at most this error. The methods `correspondence_quality_curve` and
-    `area_under_curve` compute further statistics. The method `as_dictionary` returns all statistics as a
-    dictionary for JSON.
+    `area_under_curve` compute further statistics. The method `as_dictionary` returns the main statistics and
+    the correspondence quality curve as a dictionary for JSON.
 
     **Attributes:**
 
@@ -59,8 +59,8 @@ class GeodesicError:
     def mean(self) -> float:
         """The mean of all finite errors; inf if no error is finite.
 
-        An error is infinite if the match and the true point are on different connected components of Y.
-        Report the share of infinite errors, `unreachable`, together with this mean.
+        An error is infinite if the match and the true point are on different connected components of Y. The
+        mean leaves out infinite errors, whose share is `unreachable`.
         """
         reachable = self.errors[np.isfinite(self.errors)]
         return float(reachable.mean()) if len(reachable) else np.inf
@@ -160,9 +160,9 @@ def geodesic_error(
     - `pointwise_map`: T: X -> Y (m,), as 0-based vertices of Y or as `SurfacePoints` on Y.
     - `ground_truth`: the `GroundTruth` of X and Y, with the true points on Y of some or all vertices of X.
     - `method`: the method that computes geodesic distances. `"strips"` (the default) finds shortest paths
-      that consist of edges and of straight lines across faces. On bodies, these paths are 0.03 to 0.07 % too
-      long on average. `"exact"` takes about 100 times as long, and works only between vertices of a manifold
-      mesh.
+      that consist of edges and of straight lines across faces. On meshes of bodies, these paths are 0.03 to
+      0.07 % too long on average. `"exact"` takes about 100 times as long, and works only between vertices of
+      a manifold mesh.
     - `number_of_samples`: the number of rows of the ground truth to evaluate, at least 1. These rows are
       drawn at random without replacement. If None (the default), or if the ground truth has fewer rows, all
       rows are evaluated.

@@ -47,15 +47,16 @@ def align_rigidly(
 ) -> Alignment:
     """Find the rigid motion that brings the points x near the points y.
 
-    Iterative closest points (Besl, McKay, "A method for registration of 3-D shapes", PAMI 1992) run from the
-    identity, from the 24 rotations between the principal axes of both sets, and from the 60 rotations of an
-    icosahedron. Each resulting motion is rated by the sum of two mean distances: from x to the nearest points
-    of y, and from y to the nearest points of x. The motion with the smallest sum is chosen.
+    The method of iterative closest points (Besl, McKay, "A method for registration of 3-D shapes", PAMI 1992)
+    runs from the identity, from the 24 rotations between the principal axes of both sets, and from the 60
+    rotations of an icosahedron. Each resulting motion is rated by the sum of two mean distances: from x to
+    the nearest points of y, and from y to the nearest points of x. The motion with the smallest sum is
+    chosen.
 
-    Iterative closest points prevent a nearly round surface from sliding into place, because samples attract
-    each other. If normals are given, further iterations therefore minimise the distances to tangent planes
-    (Chen, Medioni, "Object modelling by registration of multiple range images", 1992). Their result is used
-    only if the shapes fit each other.
+    With closest points, a nearly round surface does not slide into place, because samples attract each other.
+    If normals are given, further iterations therefore minimise the distances to tangent planes (Chen,
+    Medioni, "Object modelling by registration of multiple range images", 1992). The result of these
+    iterations is used only if the shapes fit each other.
 
     **Arguments:**
 
@@ -129,7 +130,7 @@ def _principal_axes(points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "
 
 
 def _rigid_fit(x: Float64[np.ndarray, "p 3"], targets: Float64[np.ndarray, "p 3"]) -> Alignment:
-    """Return the rigid motion that brings the points of x closest to their targets in least squares."""
+    """Return the rigid motion from x to the targets with the least sum of squared distances."""
     middle, middle_of_targets = x.mean(axis=0), targets.mean(axis=0)
     (rotation,), _ = nearest_rotations(((targets - middle_of_targets).T @ (x - middle))[None])
     return Alignment(rotation, middle_of_targets - rotation @ middle)

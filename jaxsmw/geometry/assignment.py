@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.errors import InputError
 
-# The largest allowed product of the numbers of vertices, m n. A computation of this size takes 3 GiB of
-# memory and 15 minutes.
+# The largest allowed value of m n, the product of the numbers of vertices. A computation of this size takes
+# 3 GiB of memory and 15 minutes.
 _LARGEST = 20_000**2
 
 
@@ -34,7 +34,7 @@ def one_to_one_map(
     **Arguments:**
 
     - `embedding_x`, `embedding_y`: points (m, d) and (n, d) in d dimensions, one per vertex of X and of Y, in
-      the same unit. A vertex of X and its match should have points that are close together.
+      the same unit. The map matches vertices whose points are close together.
     - `mask_x`, `mask_y`: Boolean arrays (m,) and (n,), False for vertices that are not matched. If a mask is
       None (the default), all vertices are matched.
 

@@ -209,7 +209,7 @@ class _Body:
 
     @property
     def extent(self) -> float:
-        """The radius of a ball around the origin that contains the body."""
+        """A radius r such that the ball of radius r around the origin contains the body."""
         return max(np.linalg.norm(t.centers, axis=1).max() + t.radii.max() for t in self._tubes)
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -227,8 +227,8 @@ class _Body:
 
         `pose` lists joints with up to three angles in degrees, for rotations about the x, y and z axes. At
         the head, positive angles turn the nose down (x), turn the nose to the left (y), and raise the left
-        side (z). A joint name without `left_` or `right_` rotates the joints on both sides, mirrored on the
-        right side.
+        side (z). The name of a paired joint without `left_` or `right_` stands for both joints. The rotation
+        of the right joint is then mirrored.
         """
         angles = np.zeros((len(self.parents), 3))
         for name, *turn in (entry.split() for entry in pose.split(";")):

@@ -49,8 +49,8 @@ def compute_spectrum(
     so that its entry of largest absolute value is positive. The eigenpairs of each connected component are
     computed separately and then merged.
 
-    The exact solver is a shift-invert Lanczos method, which checks the number of eigenvalues, the residuals
-    and the orthonormality. If the Lanczos method fails, ARPACK computes the eigenpairs.
+    The exact solver is a shift-invert Lanczos method. The number of eigenvalues, the residuals and the
+    orthonormality are checked. If the Lanczos method fails, ARPACK computes the eigenpairs.
 
     The approximate solver is the Rayleigh–Ritz method in a smooth subspace of far fewer dimensions
     (`jaxsmw.geometry.coarsening`). The approximate eigenvectors are also orthonormal, up to rounding errors.
@@ -256,7 +256,7 @@ def _dense(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple[np.nd
 
 def _factorized(stiffness: sp.csc_matrix, mass: sp.csc_matrix, shift: float) -> SuperLU:
     """Return the LU factors of W - shift A."""
-    # Without symmetric mode, this ordering would make the factorization orders of magnitude slower.
+    # Without symmetric mode, the ordering `MMD_AT_PLUS_A` makes the factorization orders of magnitude slower.
     return splu(
         (stiffness - shift * mass).tocsc(),
         permc_spec="MMD_AT_PLUS_A",
@@ -312,8 +312,8 @@ def _lanczos(
     than ARPACK's restarts.
 
     Blocks of b vectors find at most b copies of a multiple eigenvalue. If the result lacks some eigenvalues,
-    the method is repeated with larger blocks. An eigenpair has converged when its relative residual, computed
-    as an eigenpair of the inverse, is at most `tolerance`.
+    the method is repeated with larger blocks. Residuals are computed for the inverse. An eigenpair has
+    converged when its relative residual is at most `tolerance`.
 
     **Raises:** `RuntimeError` if the method does not converge.
     """

@@ -7,8 +7,8 @@ as long as the method of this module.
 This module runs Dijkstra's algorithm on a graph of mesh edges and of straight lines across faces. Strips of
 triangles around each vertex are unfolded into the plane. If a straight line within a strip joins two
 vertices, the graph contains an edge with the length of this line. Paths in this graph are paths on the
-surface, so computed distances are never too short. On bodies, computed distances are too long by 0.03 to 0.07
-% on average.
+surface, so computed distances are never too short. On meshes of bodies, computed distances are too long by
+0.03 to 0.07 % on average.
 """
 
 from __future__ import annotations
@@ -100,11 +100,11 @@ class _Sides(NamedTuple):
     head: Int64[np.ndarray, " s"]
     apex: Int64[np.ndarray, " s"]
     length: Float64[np.ndarray, " s"]
-    # The position of the apex as a complex number, after the side was mapped to the segment from 0 to 1. The
-    # apex is never below the real axis.
+    # The position of the apex as a complex number, in the frame in which the side leads from 0 to 1. The apex
+    # is never below the real axis.
     shape: Complex128[np.ndarray, " s"]
-    # A line that leaves a triangle by side i continues in each other triangle at the same edge. The line
-    # enters these triangles by the sides across[first[i]:first[i + 1]].
+    # If a line leaves a triangle by side i, it continues in all other triangles at this edge. It enters these
+    # triangles by the sides across[first[i]:first[i + 1]].
     first: Int64[np.ndarray, " s1"]
     across: Int64[np.ndarray, " c"]
 
@@ -184,8 +184,8 @@ def _unfold(
     - `depth`: the number of sides to cross.
 
     **Returns:** An iterator with `depth` pairs (beams, corners). The beams of pair i have crossed i + 1
-    sides. The last side that a beam has crossed belongs to the triangle that the beam is now in. The beam's
-    entry in `corners` is the position of the corner opposite this side, in the same triangle.
+    sides. Each beam is then inside one triangle, which it entered by the last crossed side. The beam's entry
+    in `corners` is the position of the corner of this triangle opposite that side.
     """
     right, left = -position * sides.length[side], (1 - position) * sides.length[side]
     beams = _Beams(origin, side, right, left, right, left)
@@ -255,10 +255,10 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
 
     - `mesh`: the surface with n vertices. Boundaries, several connected components and non-manifold edges are
         allowed.
-    - `depth`: the maximum number of edges that a straight line may cross, at least 1. On bodies, the shortest
-        paths in a graph of depth 6 are too long by 0.1 to 0.2 % on average. The shortest paths in a graph of
-        depth 10 are too long by 0.03 to 0.07 % on average. Searches in a graph of depth 10 take 1.4 times as
-        long as in a graph of depth 6.
+    - `depth`: the maximum number of edges that a straight line may cross, at least 1. On meshes of bodies,
+        the shortest paths in a graph of depth 6 are too long by 0.1 to 0.2 % on average. The shortest paths
+        in a graph of depth 10 are too long by 0.03 to 0.07 % on average. Searches in a graph of depth 10 take
+        1.4 times as long as in a graph of depth 6.
 
     **Returns:** The lengths of the edges and lines as a sparse symmetric matrix (n, n), in the unit of the
     mesh. A stored zero is the length of a line between two vertices at the same position. All callers share
@@ -303,10 +303,10 @@ def geodesic_distances(
         times n numbers, so split a large number of sources into several calls. For distances between given
         pairs of points, use `geodesic_distances_between`.
     - `method`: `"strips"` or `"exact"`. `"strips"` is Dijkstra's algorithm on a graph of edges and straight
-        lines across faces. On bodies, distances computed with `"strips"` are too long by 0.03 to 0.07 % on
-        average. `"exact"` propagates windows (Mitchell, Mount and Papadimitriou 1987, implemented in libigl).
-        `"exact"` works only between vertices of manifold meshes, and takes about 100 times as long as
-        `"strips"`.
+        lines across faces. On meshes of bodies, distances computed with `"strips"` are too long by 0.03 to
+        0.07 % on average. `"exact"` propagates windows (Mitchell, Mount and Papadimitriou 1987, implemented
+        in libigl). `"exact"` works only between vertices of manifold meshes, and takes about 100 times as
+        long as `"strips"`.
     - `limit`: the largest distance of interest, in the unit of the mesh. Larger distances become inf. With
         `"strips"`, a limit reduces the computation time.
 

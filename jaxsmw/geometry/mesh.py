@@ -86,7 +86,7 @@ class Mesh:
 
     @cached_property
     def area_vectors(self) -> Float64[np.ndarray, "f 3"]:
-        """The normal of each face (f, 3), with twice the area of the face as its length."""
+        """The normals of the faces (f, 3). The length of each normal is twice the area of its face."""
         corners = self.vertices[self.faces]
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
@@ -112,9 +112,9 @@ class Mesh:
     def average(
         self, values: Float[np.ndarray, "n ..."] | Bool[np.ndarray, " n"]
     ) -> Float[np.ndarray, " ..."] | np.floating:
-        """Return the mean of values at the vertices (n, ...) over the surface, in the unit of the values.
+        """Return the area-weighted mean of values at the vertices (n, ...), in the unit of the values.
 
-        Each vertex is weighted with its area. The mean of a mask is the share of the area that it selects.
+        The mean of a mask is the share of the area in which the mask is True.
         """
         return np.average(values, axis=0, weights=self.vertex_areas)
 
@@ -151,7 +151,7 @@ class Mesh:
 
     @cached_property
     def edges(self) -> Int64[np.ndarray, "e 2"]:
-        """The undirected edges (e, 2) in lexicographic order, each once, with its lower index first."""
+        """The edges (e, 2) in lexicographic order. The lower vertex index of each edge is first."""
         return self._edge_table.edges
 
     @cached_property
@@ -230,7 +230,7 @@ class Diagnosis:
     **Attributes:**
 
     - `vertices`, `faces`: the numbers of vertices and of faces.
-    - `components`: the number of connected components, without unreferenced vertices.
+    - `components`: the number of connected components. Unreferenced vertices are not counted.
     - `unreferenced_vertices`: the number of vertices that no face references.
     - `boundary_edges`: the number of edges with exactly one face.
     - `boundary_loops`: the number of connected chains that the boundary edges form.
@@ -360,7 +360,7 @@ def connected_components(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, 
 
 
 def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shaped[np.ndarray, "m ..."]:
-    """Copy the match of the nearest referenced vertex to each unreferenced vertex.
+    """For each unreferenced vertex, copy the match of the nearest referenced vertex.
 
     **Arguments:**
 
@@ -392,11 +392,11 @@ def make_mesh(
     as an earlier face. Vertices are never dropped or renumbered.
 
     Scans may contain vertices without a usable position, and small components such as dust. A vertex is lost
-    if its position is not finite or is very far away. If at most one vertex in 1000 is lost, each lost vertex
-    is moved to the mean of its neighbours, or of all usable vertices if it has no usable neighbour, and its
-    faces are dropped. If more vertices are lost, they stay, and the checks under "Raises" apply to them. If
-    one component has at least half of the area, the faces of components with less than 1 % of the area are
-    dropped. Vertices that lose all their faces become
+    if its position is not finite or is very far away. If at most one vertex in 1000 is lost, the faces of
+    lost vertices are dropped. Each lost vertex is moved to the mean of its usable neighbours. A lost vertex
+    without usable neighbours is moved to the mean of all usable vertices. If more vertices are lost, they
+    stay, and the checks under "Raises" apply to them. If one component has at least half of the area, the
+    faces of components with less than 1 % of the area are dropped. Vertices that lose all their faces become
     unreferenced, and receive the match of the nearest referenced vertex.
 
     **Arguments:**
@@ -406,7 +406,7 @@ def make_mesh(
         - an object with `vertices` and `faces`, as in trimesh, pyFM and geomfum;
         - an object with `points` and `faces`, such as a `PolyData` of PyVista;
         - a tuple of vertices and faces, as in potpourri3d.
-    - `faces`: vertex indices (f, 3), 0-based, of any integer type, or floats that are whole numbers. The
+    - `faces`: vertex indices (f, 3), 0-based, as integers of any type, or as floats with integer values. The
         array is copied.
     - `name`: the name of the mesh in messages.
     - `weld`: whether to merge vertices at exactly the same position. If True, faces use only the

@@ -1,9 +1,9 @@
 """Surfaces of point clouds: triangle meshes whose vertices are the given points.
 
-With a mesh through its points, a point cloud can be used with all methods for meshes. The tetrahedra of the
+All methods for meshes can be applied to a mesh through the points of a point cloud. The tetrahedra of the
 Delaunay triangulation of the points are labelled inside or outside, and the surface consists of the triangles
-between the two. Unlike triangulations in tangent planes, this method separates sheets that nearly touch, and
-orients the surface consistently.
+between inside and outside tetrahedra. Unlike triangulations in tangent planes, this method separates sheets
+that nearly touch, and orients the surface consistently.
 """
 
 from __future__ import annotations
@@ -86,9 +86,9 @@ def triangulate_points(
     **Returns:** A `Mesh` with the n points as vertices. Its normals point outward. Its `notes` say how many
     triangles join the points.
 
-    **Raises:** `InputError` if an array has a wrong shape or type, if there are fewer than 20 different
-    points, if the coordinates are too large for float64, or if fewer than half of the points lie on the
-    surface of a body.
+    **Raises:** `InputError` if an array has a wrong shape or type, or if there are fewer than 20 different
+    points. `InputError` is also raised if the extent of the points is below 1e-60 or above 1e60, or if fewer
+    than half of the points lie on the surface of a body.
     """
     position = numeric_rows(points, "points", name).astype(np.float64)
     direction = None if normals is None else numeric_rows(normals, "normals", name).astype(np.float64)
@@ -161,7 +161,7 @@ class _Tetrahedra(NamedTuple):
     outer: Bool[np.ndarray, " t"]
 
     def overlap(self, i: Int64[np.ndarray, " k"], j: Int64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
-        """Return the cosines of the angles at which circumspheres intersect: 1 for equal spheres."""
+        """Return the cosines of the angles at which circumspheres intersect. Equal spheres have cosine 1."""
         apart = ((self.centers[i] - self.centers[j]) ** 2).sum(axis=1)
         cosines = (self.radii[i] ** 2 + self.radii[j] ** 2 - apart) / (2 * self.radii[i] * self.radii[j])
         return np.clip(cosines, -1, 1)

@@ -15,8 +15,8 @@ def nearest_rotations(
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, " n"]]:
     """Find the rotation R that maximises the trace of Rᵀ M, for each matrix M.
 
-    If M is a sum of products of target vectors with given vectors (as rows), R turns the given vectors as
-    close to the targets as possible in least squares (Kabsch 1976).
+    Usually M is a sum of products t gᵀ of a target vector t and a given vector g. R then turns the given
+    vectors as close to their target vectors as possible in least squares (Kabsch 1976).
 
     The maximal trace is the largest root of a polynomial of degree four, which Newton's method finds. The
     rotation then has a closed form (Markley, "Attitude determination using vector observations: a fast

@@ -119,7 +119,7 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
 
     If the mesh has at most 15 000 vertices, its edges are returned. Otherwise the nodes of the graph are
     about 5000 evenly spread samples. Each vertex belongs to its nearest sample. Two samples are connected if
-    an edge of the mesh joins a vertex of one sample to a vertex of the other.
+    an edge of the mesh joins two vertices that belong to these samples.
 
     **Returns:** The edges (e, 2) of the graph, and for each vertex of the mesh the nearest node (n,). Nodes
     are given as vertex indices of the mesh.

@@ -24,14 +24,14 @@ class ScaleSettings:
 
     **Attributes:**
 
-    - `shares`: the tested shares of the full shape's area that the partial shape covers.
+    - `shares`: the tested ratios of the partial shape's area to the full shape's area.
     - `samples` (Table R33): the approximate number of samples of the full shape.
-    - `radii` (Table R33): the radii of SHOT, in units of 0.06.
-    - `distances` (Table R33): the least and the largest distance of the pairs of samples that are compared.
-      Farther samples move against each other between poses.
-    - `angle_tolerance` (Table R33): a pair of samples is compared with the pair of their matches only if the
-      cosines of three angles differ by less than this number. The angles are those between the two normals,
-      and between each normal and the line through both samples.
+    - `radii` (Table R33): the radii of SHOT, as multiples of 0.06.
+    - `distances` (Table R33): two samples of the partial shape are compared with their matches only if the
+      distance between the samples is in this range. Larger distances vary more between poses.
+    - `angle_tolerance` (Table R33): two samples are compared with their matches only if the cosines of three
+      angles differ by less than this number. One angle is that between the two normals. The other angles are
+      those between each normal and the line through both points.
     - `tolerance`: two ratios agree if their logarithms differ by less than this number.
     - `uncertain_below` (Table R33): an estimate with a smaller support is uncertain.
     """
@@ -68,12 +68,13 @@ def estimate_scale(
     """Estimate the relative scale of a partial shape and a full shape.
 
     The shape with the longer boundary, relative to the square root of its area, is taken as the partial
-    shape. Several shares of the full shape's area are tested. For each share, SHOT is computed with the same
-    radius relative to the full shape, and samples with mutually nearest descriptors are matched. The distance
-    between two nearby samples, compared with the distance between their matches, gives a ratio. The ratios of
-    correct matches agree, and the ratios of wrong matches are scattered. The function therefore returns the
-    most frequent ratio of the share with the largest support. Pairs of samples are compared only if their
-    normals agree (point pair features; Drost, Ulrich, Navab, Ilic, "Model globally, match locally", 2010).
+    shape. The function tests several ratios of the partial shape's area to the full shape's area (shares).
+    Each share implies a common unit of length, in which SHOT has the same radius on both shapes. Samples with
+    mutually nearest descriptors are matched. The distance between two nearby samples, compared with the
+    distance between their matches, gives a ratio. The ratios of correct matches agree, and the ratios of
+    wrong matches are scattered. The function therefore returns the most frequent ratio of the share with the
+    largest support. Pairs of samples are compared only if their normals agree (point pair features; Drost,
+    Ulrich, Navab, Ilic, "Model globally, match locally", 2010).
 
     **Arguments:**
 
@@ -104,7 +105,7 @@ def estimate_scale(
 
     with one_blas_thread():
         best = max(map(vote, settings.shares), key=lambda found: found.support)
-        # At the estimated share, the radii of both shapes agree, and so do more descriptors.
+        # At the estimated share, both shapes have the same SHOT radius, so more descriptors match.
         best = max(best, vote(best.share), key=lambda found: found.support)
     if best.support == 0:
         raise InputError(
@@ -154,7 +155,7 @@ def _describe(mesh: Mesh, share: float, settings: ScaleSettings) -> _Described:
 
 
 def _vote(part: _Described, full: _Described, share: float, settings: ScaleSettings) -> _Vote:
-    """Return the share with which most pairs of matches agree, near a tested share."""
+    """Estimate the share from the most frequent ratio of distances at a tested share."""
     rows, matches = _mutually_nearest(part.descriptors, full.descriptors)
     before, angles_before = _pair_features(part, rows)
     after, angles_after = _pair_features(full, matches)
@@ -164,7 +165,8 @@ def _vote(part: _Described, full: _Described, share: float, settings: ScaleSetti
     ratios = np.sort(np.log(after[compared] / before[compared]))
     if len(ratios) < _FEWEST:
         return _Vote(share, 0.0)
-    # The most frequent ratio has the most ratios within the tolerance. Other shares give ratios far from 1.
+    # The most frequent ratio is the ratio with the most other ratios within the tolerance. Ratios far from 1
+    # belong to other shares and are not counted.
     tolerance = settings.tolerance
     counts = np.searchsorted(ratios, ratios + tolerance) - np.searchsorted(ratios, ratios - tolerance)
     counts = np.where(np.abs(ratios) < _FARTHEST, counts, 0)
@@ -175,7 +177,7 @@ def _vote(part: _Described, full: _Described, share: float, settings: ScaleSetti
 def _pair_features(
     shape: _Described, rows: Int64[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "q 3"]]:
-    """Return the distances of all pairs of samples, and the cosines of the three angles of their normals."""
+    """Return the distance and the cosines of three angles (see `ScaleSettings`) for each pair of samples."""
     first, second = np.triu_indices(len(rows), 1)
     positions, normals = shape.positions[rows], shape.normals[rows]
     lines = positions[second] - positions[first]
@@ -196,7 +198,7 @@ def _mutually_nearest(
     return rows, forward[rows]
 
 
-# The largest logarithm of a ratio of lengths for which the descriptors of both shapes are still comparable.
+# Ratios with a larger absolute logarithm are not counted, because the SHOT radii then differ too much.
 _FARTHEST = 0.3
-# Fewer compared pairs can agree by chance.
+# If fewer pairs than this number are compared, their ratios can agree by chance.
 _FEWEST = 30

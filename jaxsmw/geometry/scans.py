@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
 # The largest share of lost vertices that is repaired. A mesh with more lost vertices is probably damaged. Its
-# lost vertices are kept, and later checks refuse positions that are not finite or too far away.
+# lost vertices are kept, and later checks refuse far positions and positions that are not finite.
 _MOST_LOST = 1e-3
 # A vertex is lost if its distance from the median position exceeds `_FAR` times the 90th percentile of these
 # distances. It is also lost if its position is not finite. Some scans have coordinates of about 1e30, because

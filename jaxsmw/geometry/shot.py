@@ -1,4 +1,4 @@
-"""SHOT descriptors, which are histograms of normals in a local frame and distinguish left from right."""
+"""SHOT descriptors: histograms of normals in a local frame, which distinguish left from right."""
 
 from __future__ import annotations
 
@@ -58,7 +58,8 @@ def shot_descriptors(
       samples are given, descriptors are computed only at the samples, and only samples are used as
       neighbours. The normal of a sample is the mean normal of the vertices nearest to the sample. Without
       samples, the time grows with the square of the number of vertices.
-    - `required`: whether the caller cannot avoid SHOT. If True, messages advise only a finer mesh.
+    - `required`: if True, messages about coarse meshes advise only a finer mesh. If False (the default), they
+      also advise how to match without SHOT.
 
     **Returns:** Dimensionless descriptors as float32: one row per vertex (n, 352), or one row per sample (s,
     352) if samples are given. The row is zero for unreferenced vertices and for vertices with fewer than 3
@@ -150,7 +151,7 @@ def _describe(
     - `block`: the vertices to describe.
     - `center`, `neighbor`, `distance`: arrays with one entry for each pair of a vertex in the block and one
       of its neighbours. `center` contains indices into `block`, `neighbor` contains vertices, and `distance`
-      contains the distances between them.
+      contains the distance between the two vertices of each pair.
     - `radius`: the radius of the neighbourhoods, in the unit of the positions.
     """
     offsets = positions.take(neighbor, axis=0) - positions[block].take(center, axis=0)
@@ -207,8 +208,8 @@ def _local_frames(
     def towards_majority(axis: np.ndarray) -> np.ndarray:
         height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
         majority = np.bincount(center, np.sign(height), size)
-        # On regular meshes, both signs of an axis can have equally many points. The signs of eigenvectors are
-        # arbitrary, so the weighted heights of the points decide.
+        # On regular meshes, equally many neighbours can lie in both directions of an axis. The sum of their
+        # weighted heights then decides, because the signs of eigenvectors are arbitrary.
         tied = majority == 0
         majority[tied] = np.bincount(center, weight * height, size)[tied]
         return np.where(majority >= 0, 1.0, -1.0)[:, None] * axis

@@ -73,12 +73,14 @@ def nearest_facing_points(
     nearest: SurfacePoints,
     mesh: Mesh,
 ) -> SurfacePoints:
-    """Replace nearest points on triangles that face away, such as on the other one of two touching legs.
+    """Replace the nearest points that lie on triangles that face away.
 
-    A triangle faces away if its normal and the normal at the point in space form an angle above 90 degrees.
-    Such points move to the nearest triangle that faces the same side of the same axis as the normal, if this
-    triangle does not face away. Nothing is replaced if more than 20 % of the triangles face away, because the
-    triangles of the mesh are then not oriented consistently.
+    For example, if two legs touch, the nearest point of a point on one leg can lie on the other leg. A
+    triangle faces away if its normal and the normal at the point in space form an angle above 90 degrees. The
+    new nearest point is searched only on triangles whose normals have the same sign as the point's normal
+    along one axis. This axis is that of the largest component of the point's normal. The new point is used if
+    its triangle does not face away. Nothing is replaced if more than 20 % of the nearest triangles face away,
+    because the triangles of the mesh are then not oriented consistently.
 
     **Arguments:**
 

@@ -20,7 +20,7 @@ def aligned_features(sampled: SampledPair) -> tuple[Float[np.ndarray, "m d"], Fl
 
     **Arguments:**
 
-    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
+    - `sampled`: the pair, and the vertices of both shapes at which descriptors are compared.
 
     **Returns:** The features of X (m, d) and of Y (n, d), with one row per compared vertex and d = 355.
     The positions of X are those after the alignment.

@@ -26,7 +26,7 @@ def landmark_features(
 
     **Arguments:**
 
-    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
+    - `sampled`: the pair, and the vertices of both shapes at which descriptors are compared.
     - `landmarks`: landmarks (l, 2) that `check_landmarks` has checked.
 
     **Returns:** The features of X (m, d) and of Y (n, d), where m and n are the numbers of compared vertices.
@@ -78,7 +78,7 @@ def distance_features(
 
     - `side`: X or Y, as a `SampledShape`.
     - `vertices`: vertices of the mesh (l,), to which distances are computed.
-    - `unit`: the unit of the returned distances, expressed as a length in the unit of the mesh; see
+    - `unit`: a length in the unit of the mesh, by which the distances are divided; see
       `Pair.units_of_length`.
 
     **Returns:** The weighted distances (n, l) from the n compared vertices to the l given vertices.

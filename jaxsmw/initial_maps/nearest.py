@@ -19,7 +19,7 @@ def nearest_map(
 
     **Arguments:**
 
-    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
+    - `sampled`: the pair, and the vertices of both shapes at which descriptors are compared.
     - `features_x`, `features_y`: the features of X (a, d) and of Y (b, d), with one row per compared vertex.
 
     **Returns:** The map T: X -> Y (m,), 0-based vertices of Y.
@@ -57,7 +57,7 @@ def to_all_vertices(sampled: SampledPair, found: Int64[np.ndarray, " a"]) -> Int
 
     **Arguments:**
 
-    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
+    - `sampled`: the pair, and the vertices of both shapes at which descriptors are compared.
     - `found`: the match of each compared vertex of X (a,), as a 0-based index into the compared vertices of
       Y.
 

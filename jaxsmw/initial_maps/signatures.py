@@ -29,7 +29,7 @@ def signature_features(
 
     **Arguments:**
 
-    - `sampled`: the pair, with the vertices of each shape at which descriptors are compared.
+    - `sampled`: the pair, and the vertices of both shapes at which descriptors are compared.
     - `name`: a key of `SIGNATURES`: `"wks"`, `"hks"` or `"wavelet"`.
 
     **Returns:** The signatures of X (m, d) and of Y (n, d), with one row per compared vertex.

@@ -54,16 +54,16 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
     - `path`: the file. The suffix, in upper or lower case, determines the format:
         - `.mrk.json`: a Markups file of 3D Slicer with a single point list. A file with several markups is
           refused. If the file states no coordinate system, the default of the format applies, which is LPS.
-        - `.fcsv`: a file of 3D Slicer. The numbers 0 and 1 mean RAS and LPS.
+        - `.fcsv`: a file of 3D Slicer. The coordinate system 0 is RAS, and the coordinate system 1 is LPS.
         - `.pp`: a file of MeshLab (PickedPoints).
         - `.mps`: a point set of MITK, whose world coordinates are LPS.
         - `.csv`, `.txt`: a table with the columns name, x, y and z, or x, y and z. Semicolons, tabs, commas
           or blanks separate the columns. The first line may name the columns, and then their order is free.
 
-    **Returns:** `Landmarks` whose `name` is the path, with l names, positions (l, 3) as in the file, and the
-    coordinate system `"LPS"`, `"RAS"` or None. The `unit` is the unit that a `.mrk.json` file states, or
-    None. The `notes` report points that were left out, because Slicer has no defined position for them or
-    because they are not active in MeshLab.
+    **Returns:** `Landmarks` with l names and positions (l, 3) as in the file. The `name` is the path. The
+    attribute `coordinates` is `"LPS"`, `"RAS"` or None. The `unit` is the unit that a `.mrk.json` file
+    states, or None. Points are left out if Slicer has no defined position for them, or if they are not active
+    in MeshLab. The `notes` report these points, and what the file does not state.
 
     **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, or is larger
     than 128 MiB (`.mrk.json`: 32 MiB). `InputError` is also raised if the file contains no landmarks or more
@@ -124,9 +124,10 @@ def check_readable_suffix(path: str | os.PathLike[str]) -> str:
 
 
 def check_known_system(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
-    """Check that the coordinate system of landmarks is known if the format of a file states one.
+    """Check that landmarks have a coordinate system if they are to be written to a file of 3D Slicer.
 
-    **Raises:** `InputError` if the format states a coordinate system, but that of the landmarks is None.
+    **Raises:** `InputError` if files with the suffix state a coordinate system, but `landmarks.coordinates`
+    is None.
     """
     suffix = check_landmark_suffix(path)
     if landmarks.coordinates is None and suffix in _WITH_SYSTEM:

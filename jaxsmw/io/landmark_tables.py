@@ -195,7 +195,7 @@ def _setting(line: str) -> tuple[str, str]:
 
 
 def _fcsv_columns(stated: dict[str, str]) -> tuple[_Columns, list[str]]:
-    """Return the positions of the columns of an `.fcsv` file, and the names of all its columns."""
+    """Return the `_Columns` of an `.fcsv` file, and the names of all columns in their order."""
     if "columns" in stated:
         order = [title.strip() for title in stated["columns"].split(",")]
     elif "markups fiducial file version" in stated:

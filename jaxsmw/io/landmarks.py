@@ -166,9 +166,9 @@ class LandmarkMatch(NamedTuple):
 
     **Attributes:**
 
-    - `names`: the names that both sets of landmarks have, in the order of the first landmarks.
-    - `only_first`: the names that only the first landmarks have, in their order.
-    - `only_second`: the names that only the second landmarks have, in their order.
+    - `names`: the names in both sets of landmarks, in the order of the first set.
+    - `only_first`: the names in the first set only, in the order of the first set.
+    - `only_second`: the names in the second set only, in the order of the second set.
     """
 
     names: tuple[str, ...]
@@ -249,8 +249,8 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
 
     **Raises:** `InputError` if the median distance of the landmarks to the surface is above 3 % of the
     diagonal. `InputError` is also raised if their mean distance is above 5 % of the diagonal, but would be
-    below 2 % in the other coordinate system. The message names the factor if another unit explains the
-    distance.
+    below 2 % in the other coordinate system. If the landmarks seem to have another unit, the message
+    names the factor between the units.
     """
     diagonal = bounding_box_diagonal(mesh)
     distances = distances_to_surface(landmarks.positions, mesh)
@@ -272,7 +272,7 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
 
 
 def _cure_of_unit(landmarks: Landmarks, mesh: Mesh, diagonal: float) -> str:
-    """Return the cure for landmarks that are far from a surface, which names the factor of a wrong unit."""
+    """Return the advice for landmarks far from a surface, with a conversion factor if the unit is wrong."""
     for factor in _UNITS:
         scaled = factor * landmarks.positions
         if usable(scaled).all() and distances_to_surface(scaled, mesh).mean() < NEAR * diagonal:

@@ -28,7 +28,7 @@ from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
 
 # Suffixes of other kinds of files. The programs that open such files cannot open a map. The suffixes `.mat`
-# and `.npy` are removed, because maps are also written in these formats.
+# and `.npy` are not in this set, because maps are also written in these formats.
 _NOT_MAPS = {
     *(".npz", ".baryc_gt", ".vts", ".json"),
     *(".png", ".jpg", ".jpeg", ".gif", ".bmp", ".tif", ".tiff", ".webp", ".svg", ".pdf", ".eps", ".ps"),

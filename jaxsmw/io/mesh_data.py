@@ -94,15 +94,15 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
       Further columns are ignored.
     - `.pcd`: all fields of a file of the Point Cloud Library, which may be text, binary or compressed. The
       fields `normal_x`, `normal_y` and `normal_z` become `normals`.
-    - `.npy`: an array with one row per point, like the columns of an `.xyz` file.
+    - `.npy`: an array with one row per point. It has the same columns as an `.xyz` file.
 
     If a file has no faces, `jaxsmw.geometry.triangulate_points` adds faces, with the help of `normals`.
 
     A glTF file duplicates vertices along texture seams. All duplicates stay in the list of vertices, but
-    vertices at exactly the same position are welded, as if `weld` were True. All meshes of the scene are
-    joined, in the order of the nodes, after the transforms of the nodes. Skinned meshes stay in their bind
-    pose. Buffers in other files are read only if these files are in the folder of the glTF file or below.
-    Normals, tangents, animations and pictures are not read.
+    vertices at exactly the same position are welded, as if `weld` were True. The transforms of the nodes
+    are applied, and all meshes of the scene are joined in the order of the nodes. Skinned meshes stay in
+    their bind pose. Buffers in other files are read only if these files are in the folder of the glTF
+    file or below. Normals, tangents, animations and pictures in glTF files are not read.
 
     **Arguments:**
 
@@ -164,8 +164,8 @@ def _fans(
 ) -> tuple[Int64[np.ndarray, "t 3"], Int64[np.ndarray, " t"]]:
     """Split each polygon (c0, c1, …) into the triangles (c0, ci, ci+1).
 
-    Return the positions of the corners of all triangles (t, 3) in the list of all corners, and the polygon of
-    each triangle (t,).
+    Return an array (t, 3) with the corners of each triangle, as indices into the list of all corners. Return
+    also the polygon of each triangle (t,).
     """
     if (sizes < 3).any():
         at = int((sizes < 3).argmax())
@@ -180,7 +180,7 @@ def _fans(
 
 
 def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarray:
-    """Return data with one row per triangle: the row of the triangle's polygon.
+    """Return data with one row per triangle, which is copied from the row of the triangle's polygon.
 
     Arrays that are too short are returned unchanged, because `MeshData` refuses them.
     """
@@ -231,8 +231,8 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
 
     - `path`: the file to create or to replace. The suffix determines the format: `.off`, `.obj`, `.ply`,
         `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb` or `.npz`.
-    - `data`: a `MeshData`. The file contains all of its `faces`, including faces that cleaning dropped from
-        its `mesh`.
+    - `data`: a `MeshData`. The file contains all triangles of `data.faces`, including triangles that cleaning
+        dropped from `data.mesh`.
 
     **Returns:** A tuple of sentences about the data that the format cannot hold. The tuple is empty if the
     file contains everything. Only a `.npz` file can contain all data of any `MeshData`.

@@ -79,7 +79,7 @@ def write_mesh(
 
     **Raises:**
 
-    `InputError` for another suffix, colours of another shape, type or range, or a file that cannot be
+    `InputError` for another suffix, colours with a wrong shape, type or range, or a file that cannot be
     written.
     """
     data = {} if colors is None else {"colors": _bytes_of_colors(colors, len(mesh.vertices))}

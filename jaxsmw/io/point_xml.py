@@ -1,4 +1,4 @@
-"""Parsers of landmarks in XML: `.pp` files of MeshLab and `.mps` files of MITK; a writer of `.pp` files."""
+"""Parsers of `.pp` files of MeshLab and `.mps` files of MITK (XML), and a writer of `.pp` files."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from jaxsmw.io.landmark_entries import Entries, check_count, left_out, parse_pos
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.text import is_number
 
-# Limits far above any file of points, so that a malicious file cannot use gigabytes of memory.
+# These limits are far above what any file of points needs. They prevent a malicious file from using gigabytes
+# of memory.
 _DEEPEST, _LONGEST_TAG = 20, 2**16
 
 # Functions that are called at the beginning and at the end of an element. Their first argument lists the
@@ -29,8 +30,8 @@ _OnText = Callable[[list[str], str], None]
 def _parse_xml(text: str, root: str, on_start: _OnStart, on_text: _OnText | None = None) -> None:
     """Parse XML whose outermost element is `root`, and call a function for each element.
 
-    `on_start` receives the attributes of each element, when the element begins. `on_text` receives the text
-    of each element without children, when the element ends.
+    When an element begins, `on_start` receives its attributes. When an element ends, `on_text` receives its
+    text. If the element has children, only the text after the last child is included.
     """
     if re.search(f"<[^<]{{{_LONGEST_TAG}}}", text):
         raise InputError(f"has an element of more than {_LONGEST_TAG} characters: export the points again.")
@@ -80,8 +81,8 @@ def _check_doctype(name: str, system: str | None, public: str | None, has_declar
 def parse_picked_points(text: str) -> Entries:
     """Parse a `.pp` file of MeshLab (the class PickedPoints in MeshLab's source code).
 
-    Positions are in the coordinate system of the mesh. Points with `active="0"` are left out, because they
-    are names of a template that nobody has placed.
+    Positions are in the coordinate system of the mesh. Points with `active="0"` are left out, because nobody
+    has placed them; their names come from a template.
     """
     names: list[str] = []
     words: list[str] = []

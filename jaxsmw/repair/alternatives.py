@@ -28,24 +28,25 @@ from jaxsmw.stage import Stage
 
 # A map of samples: for each sample of X, the 0-based index of a sample of Y.
 SampleMap = Int64[np.ndarray, " s"]
-# The proper rotations by half a turn about the principal axes, as factors of the three coordinates.
+# The identity and the half turns about the three principal axes, as factors of the three coordinates.
 _HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
 class Alternatives:
     """Alternative maps of a pair, computed and compared on proxies.
 
-    Each shape is reduced to about a thousand samples. On the samples, a feature regression with few
-    eigenvectors refines many initial maps in the time that one refinement takes at all vertices. An initial
-    map is the result of a nearest-neighbour search in features. There are three kinds of features:
+    Each shape is reduced to about a thousand samples. A feature regression with few eigenvectors refines many
+    initial maps of these samples. This takes about as long as one refinement at all vertices. An initial map
+    is the result of a nearest-neighbour search in features. There are three kinds of features:
 
     - SHOT with several radii. Each choice of radii gives one map.
     - SHOT and the distances to extremities, such as the ends of limbs. A pairing assigns extremities of X to
       extremities of Y. Each of the most plausible pairings gives one map.
-    - SHOT and the positions along the principal axes of inertia. Each of the four rotations that take
-      principal axes to principal axes gives one map.
+    - SHOT and the positions along the principal axes of inertia. Four rotations align the principal axes of X
+      with those of Y, and each rotation gives one map.
 
-    For a partial pair, only the first kind is used, because a part has other extremities and other axes.
+    For a partial pair, only the first kind is used, because the extremities and axes of a part differ from
+    those of the full shape.
 
     **Arguments:**
 
@@ -90,10 +91,10 @@ class Alternatives:
         return deformation(self.x, self.y, self._reduced(pointwise_map), radius)
 
     def best(self, *known: Int64[np.ndarray, " m"]) -> Iterator[Int64[np.ndarray, " m"]]:
-        """Yield maps that differ from each other, mostly in the order of their scores.
+        """Yield alternative maps that differ from each other. Maps with better scores mostly come first.
 
-        Of the refined maps, the best are repaired: a refinement without the vertices of a fault gives a
-        further map.
+        The best refined maps are repaired. For each fault of such a map, a refinement without the faulty
+        vertices gives a further map.
 
         **Arguments:**
 
@@ -110,12 +111,13 @@ class Alternatives:
             yield outcome.unpadded_map(self.pair)
 
     def _distinct(self, outcomes: Sequence[Outcome]) -> Iterator[Outcome]:
-        """Yield outcomes that differ from each other, from outcomes that are sorted by their scores.
+        """Choose outcomes that differ from each other, and yield them.
 
-        `different_areas` contains the least difference of each outcome from all earlier outcomes.
+        The given outcomes must be sorted by their scores. The setting `different_areas` contains the smallest
+        share of X's area on which a yielded outcome differs from all earlier ones.
         """
         areas = self.settings.alternatives.different_areas
-        # Each outcome with its smallest difference from the outcomes that were yielded.
+        # Each entry contains an outcome and its smallest difference from the outcomes yielded so far.
         differences = [(outcome, 1.0) for outcome in outcomes]
         for number in count():
             least = areas[min(max(number - 1, 0), len(areas) - 1)]
@@ -128,13 +130,13 @@ class Alternatives:
             ]
 
     def _without_faults(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
-        """Refine each outcome without each of its faults."""
+        """For each fault of each outcome, refine the map without the faulty vertices."""
         faulty = [(outcome, fault) for outcome in outcomes for fault in self.judge.faults(outcome)]
         maps = [self._reduced(one.unpadded_map(self.pair)) for one, _ in faulty]
         return self._refined(maps, [fault[self.x.samples.vertices] for _, fault in faulty])
 
     def _initial_maps(self) -> Iterator[SampleMap]:
-        """Yield the initial maps of samples."""
+        """Yield the initial maps, each from the samples of X to the samples of Y."""
         settings = self.settings.alternatives
         usual = self._usual_shot()
         for radii in settings.radii:
@@ -150,7 +152,9 @@ class Alternatives:
             yield np.argmin(shot + positions, axis=1)
 
     def _by_extremities(self, shot: Float[np.ndarray, "s t"]) -> Iterator[SampleMap]:
-        """Yield the initial maps from pairings of extremities, those of the most plausible pairings first.
+        """Yield the initial maps from pairings of extremities.
+
+        Pairings with the most similar features come first.
 
         **Arguments:**
 
@@ -158,7 +162,7 @@ class Alternatives:
         """
         settings = self.settings.alternatives
         ends = extremities(self.x, settings.extremities), extremities(self.y, settings.extremities)
-        # The limbs of different animals have different lengths. Relative distances are more similar.
+        # Limbs of different animals differ in length. Distances divided by their mean are more similar.
         to_ends = [
             proxy.distances[:, of_side.samples] / (proxy.areas @ proxy.distances[:, of_side.samples])
             for of_side, proxy in zip(ends, (self.x, self.y), strict=True)
@@ -187,7 +191,7 @@ class Alternatives:
         )
 
     def _shot(self, multiple: int) -> tuple[Float[np.ndarray, "s d"], Float[np.ndarray, "t d"]]:
-        """Compute SHOT at the samples with a multiple of the usual radius."""
+        """Compute SHOT with a multiple of the usual radius at all samples."""
 
         def of_one(argument: tuple[Proxy, float]) -> Float[np.ndarray, "s d"]:
             proxy, unit = argument
@@ -207,7 +211,7 @@ class Alternatives:
         - `faults`: for each map, a mask of the samples of X (s,) that are left out. The default is to use all
           samples.
 
-        **Returns:** The successful outcomes with maps of vertices, those of the best score first.
+        **Returns:** The successful outcomes, the best score first. Their maps are extended to all vertices.
         """
         x, y = self._spectra
         size, used = len(x.mask), len(self.x.areas)

@@ -1,4 +1,4 @@
-"""Refinement of many pairs in stages, in batches on all devices."""
+"""Refinement of many pairs in stages. Each stage runs in batches on all devices."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def refine_batch(
 
     **Arguments:**
 
-    - `prepared`: the prepared pairs of full shapes. Pairs that share a shape should share its spectrum, so
-      that the spectrum is copied to the devices once.
+    - `prepared`: the prepared pairs, which must consist of full shapes. Pairs that share a shape should share
+      its spectrum, so that the spectrum is copied to the devices once.
     - `stages`: the stages, in the order in which they run.
     - `batch_size`, `devices`: see `jaxsmw.refine_pairs`.
 
-    **Returns:** One `Outcome` with padded maps per pair, in the order of `prepared`. The outcome of a pair
-    contains no stages after the first stage that failed for this pair.
+    **Returns:** One `Outcome` per pair, in the order of `prepared`. The maps of the outcomes are padded. The
+    outcome of a pair contains no stages after the first stage that failed for this pair.
     """
     spectra: dict[int, Spectrum] = {}
     samples: dict[int, jax.Array | None] = {}
@@ -64,7 +64,8 @@ def refine_batch(
             maps[number] = np.asarray(found.pointwise_map)
             padded = prepared[number].padded_map(maps[number].astype(np.int64))
             found = eqx.tree_at(lambda tree: tree.pointwise_map, found, padded)
-            if outcomes[number].successful:  # if not, the stage ran from the map of a failure
+            # After a failure, later stages still run for this pair, but their results are ignored.
+            if outcomes[number].successful:
                 refinements = [*outcomes[number].refinements, found]
                 outcomes[number] = outcomes[number]._replace(refinements=refinements)
     return outcomes

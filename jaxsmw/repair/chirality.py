@@ -36,9 +36,9 @@ class Hands:
     distances.
 
     Most bodies are their own mirror image, up to pose. For these bodies, the map of X and the map of its
-    mirror image preserve distances equally well. However, one of these coarse maps can be wrong by chance.
-    The asymmetry of a shape measures how much the shape differs from its own mirror image. Teeth have a
-    larger asymmetry than most bodies.
+    mirror image preserve distances equally well. However, both maps are coarse, and one of them can be wrong
+    by chance. The asymmetry of a shape measures how much the shape differs from its own mirror image. Teeth
+    have a larger asymmetry than most bodies.
 
     The evidence is the logarithm of a ratio: the distance error of the map of X itself, divided by the
     distance error of the map of its mirror image. Positive evidence supports the mirror image. The distance
@@ -49,7 +49,7 @@ class Hands:
 
     - `pair`: two full shapes, the source X (m vertices) and the target Y (n vertices).
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, from `paired_spectra`.
-    - `settings`: the settings of the search.
+    - `settings`: the settings of the comparison.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Hands:
         and if the evidence supports the mirror image. With `"yes"` and `"no"`, only the asymmetry is
         computed.
 
-        **Returns:** The decision. If a shape has too few samples, X itself is matched with `"auto"`.
+        **Returns:** The decision. With `"auto"`, X itself is matched if a shape has too few samples.
         """
         settings = self.settings
         given = Decision(mirror == "yes")
@@ -94,10 +94,10 @@ class Hands:
     def asymmetry(self) -> float:
         """Return the mean asymmetry of X and Y.
 
-        The asymmetry of a shape is the distance error of the map from the shape to its own mirror image,
-        divided by the distance error of a random map (seed 0). Each sample is mapped to the sample of the
-        mirror image with the nearest SHOT descriptor. The asymmetry is near 0 for a shape that is its own
-        mirror image, and near 1 for a shape without any similarity to its mirror image.
+        The samples of a shape are mapped to the samples of its own mirror image by nearest SHOT descriptors.
+        The asymmetry of the shape is the distance error of this map, divided by the distance error of a
+        random map (seed 0). The asymmetry is near 0 for a shape that is its own mirror image, and near 1 for
+        a shape without any similarity to its mirror image.
 
         **Raises:** `InputError` if the samples are too sparse for SHOT.
         """
@@ -105,7 +105,7 @@ class Hands:
 
     def _asymmetry(self, shape: Proxy) -> float:
         shot = self._shot(shape, self.settings.asymmetry_radii)
-        # All descriptors have the same length, so the nearest descriptor has the largest inner product.
+        # All descriptors have the same norm, so the nearest descriptor has the largest inner product.
         mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
         found = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
         random = np.random.default_rng(0).permutation(len(found))
@@ -114,11 +114,11 @@ class Hands:
     def evidence(self) -> float:
         """Compare a coarse map of X with a coarse map of the mirror image of X.
 
-        The coarse maps come from nearest neighbours of SHOT with large radii, and are refined by a feature
-        regression with few eigenvectors, at evenly spread samples. The comparison is repeated for each set of
-        radii in the settings. The smallest evidence is returned, because one of two wrong maps can be much
-        better than the other by chance. The method stops as soon as the evidence is clearly too small to
-        support the mirror image.
+        Nearest neighbours of SHOT with large radii give the initial maps of evenly spread samples. A feature
+        regression with few eigenvectors refines these maps. The comparison is repeated for each set of radii
+        in the settings. The smallest evidence is returned, because one of two wrong maps can be much better
+        than the other by chance. The method stops as soon as the evidence is clearly too small to support the
+        mirror image.
 
         **Returns:** The evidence, a number without unit. Positive evidence supports the mirror image.
 
@@ -134,7 +134,7 @@ class Hands:
         return float(least)
 
     def _describe(self, radii: tuple[int, ...]) -> list[_Hand]:
-        """Describe the samples of X, of its mirror image, of Y, and of its mirror image."""
+        """Compute descriptors of four shapes: X, the mirror image of X, Y, and the mirror image of Y."""
         shot_x, shot_y = side_by_side(lambda shape: self._shot(shape, radii), self.x, self.y)
         shapes = [self.x, self.x, self.y, self.y]
         shot = [
@@ -193,7 +193,7 @@ class _Hand(NamedTuple):
 
 
 def _nearest(x: Float[np.ndarray, "s r"], y: Float[np.ndarray, "t r"]) -> Int64[np.ndarray, " s"]:
-    """Return the nearest SHOT descriptor of Y for each SHOT descriptor of X."""
+    """Return the index of Y's nearest SHOT descriptor for each SHOT descriptor of X."""
     # A matrix product takes a fraction of the time of `cdist`.
     return np.argmax(x @ y.T - 0.5 * (y**2).sum(axis=1), axis=1)
 
@@ -211,10 +211,10 @@ class Decision(NamedTuple):
     - `mirrored`: whether the mirror image of X corresponds to Y.
     - `evidence`: the evidence for the mirror image; see `Hands`. None if no evidence was computed, for
       example because the shapes are their own mirror images.
-    - `doubtful`: whether the decision is uncertain. A decision for asymmetric shapes is uncertain if the
-      evidence is near its threshold. If the asymmetry is below its threshold by at most `asymmetry_doubt`,
-      the decision is uncertain if the evidence supports the mirror image.
-    - `asymmetric`: whether the mean asymmetry of X and Y reaches its threshold.
+    - `doubtful`: whether the decision is uncertain. For asymmetric shapes, the decision is uncertain if the
+      evidence is near `mirrored_from`. If the asymmetry is up to `asymmetry_doubt` below `asymmetric_from`,
+      evidence for the mirror image makes the decision uncertain. `ChiralitySettings` contains the thresholds.
+    - `asymmetric`: whether the mean asymmetry of X and Y is at least `asymmetric_from`.
     """
 
     mirrored: bool

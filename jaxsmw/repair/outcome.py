@@ -34,8 +34,8 @@ class Outcome(NamedTuple):
     - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed yet.
     - `deformation`: `jaxsmw.repair.proxies.deformation` of the final map; 0 if it was not computed.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
-    - `rivals`: the outcomes of the next best scores if repair did not find a map that looks right, the best
-      first. Further passes can make a rival better than the outcome itself.
+    - `rivals`: the outcomes with the next best scores, the best first, if the map still looks wrong after
+      repair; otherwise empty. Further passes can make a rival better than the outcome itself.
     """
 
     refinements: list[Refinement]
@@ -96,8 +96,8 @@ class Judge:
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y with the largest available number of eigenvectors,
       because more eigenvectors make faults easier to detect. The spectra may be padded.
     - `settings`: the thresholds and weights of the repair.
-    - `measure_deformation`: a function from a map X -> Y (m,) to its deformation; None if outcomes are judged
-      without deformations.
+    - `measure_deformation`: a function that takes a map X -> Y (m,) and returns its deformation; None if
+      outcomes are judged without deformations.
     """
 
     pair: Pair
@@ -107,9 +107,10 @@ class Judge:
     measure_deformation: Callable[[Int64[np.ndarray, " m"]], float] | None = None
 
     def judged(self, outcome: Outcome) -> Outcome:
-        """Return the outcome with computed values of `distortion` and `suspicious`.
+        """Compute the attributes `distortion` and `suspicious` of an outcome, and return the outcome.
 
-        If a stage failed, the distortion is infinite and the outcome is suspicious.
+        If `measure_deformation` is given, the attribute `deformation` is computed as well. If a stage failed,
+        the distortion is infinite and the outcome is suspicious.
         """
         if not outcome.successful:
             return outcome._replace(distortion=np.inf, suspicious=True)
@@ -128,7 +129,7 @@ class Judge:
         return score(outcome, self.settings)
 
     def faults(self, outcome: Outcome) -> list[Bool[np.ndarray, " m"]]:
-        """Return the faults of an outcome that repair can remove, each as a mask of vertices of X (m,).
+        """Return the faults that repair can remove from an outcome, each as a mask of X's vertices (m,).
 
         The two possible faults are the vertices with orientation reversal and the vertices in discontinuous
         parts. A fault is not returned if its share of X's area is at most `negligible_area` or at least
@@ -153,9 +154,10 @@ class Judge:
         return not outcome.suspicious or (slightly_distorted and not self.faults(outcome))
 
     def area_change(self, outcome: Outcome) -> float:
-        """Return the `area_shape_difference` of the map of an outcome, which is near 0 for poses of one body.
+        """Return the `area_shape_difference` of an outcome's map.
 
-        For partial pairs, the result is 0, because areas of the full shape have no match.
+        The result is near 0 for poses of one body. For partial pairs, the result is 0, because parts of the
+        full shape have no match.
         """
         if self.pair.partial:
             return 0.0

@@ -30,7 +30,7 @@ class Proxy:
     **Attributes:**
 
     - `mesh`, `spectrum`, `samples`: the arguments.
-    - `areas`: the share of the area that belongs to each sample (s,), with sum 1.
+    - `areas`: the share of the surface area that belongs to each sample (s,). The shares have the sum 1.
     - `positions`: the positions of the samples (s, 3).
     """
 
@@ -41,11 +41,11 @@ class Proxy:
         self.positions = mesh.vertices[samples.vertices] / unit
 
     def sampled_spectrum(self, descriptors: Float[np.ndarray, "s d"] | None = None) -> Spectrum:
-        """Return the spectrum at the samples, with their areas.
+        """Return the spectrum at the samples, with the areas of the samples as vertex areas.
 
         **Arguments:**
 
-        - `descriptors`: the descriptors of the samples (s, d). The default is those of `spectrum`.
+        - `descriptors`: the descriptors of the samples (s, d); by default, the descriptors of `spectrum`.
         """
         at_samples = self.spectrum.sample(jnp.asarray(self.samples.vertices))
         dtype = at_samples.eigenvectors.dtype
@@ -64,8 +64,8 @@ class Proxy:
     def distances(self) -> Float[np.ndarray, "s s"]:
         """The lengths of the shortest paths between the samples.
 
-        A path consists of straight steps between samples whose regions are adjacent. Between two connected
-        components, the distance is the distance in space.
+        A path consists of straight steps between samples whose regions are adjacent. The distance between
+        samples on different connected components is their Euclidean distance.
         """
         pairs = np.unique(np.sort(self.samples.nearest[self.mesh.edges], axis=1), axis=0)
         pairs = pairs[pairs[:, 0] != pairs[:, 1]]
@@ -81,7 +81,7 @@ def distance_error(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"]) -> float:
     **Arguments:**
 
     - `x`, `y`: the proxies of X (s samples) and Y (t samples).
-    - `found`: a map of samples (s,), as 0-based indices of samples of Y.
+    - `found`: the matches of the samples of X (s,), as 0-based indices of samples of Y.
     """
     return float(x.areas @ np.abs(x.distances - y.distances[np.ix_(found, found)]) @ x.areas)
 
@@ -89,20 +89,22 @@ def distance_error(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"]) -> float:
 def deformation(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"], radius: float) -> float:
     """Measure how far a map is from moving every patch of X rigidly.
 
-    The patch of a sample consists of all samples within a geodesic distance. The rotation and the translation
-    that best carry the patch to its matches leave a residual. The deformation is the mean residual of all
-    patches, divided by the size of each patch. A map that bends a body at its joints deforms most patches
-    little. Upside-down maps and mirrored maps deform most patches, because rotations contain no reflection.
-    Energies of this kind are called as rigid as possible (Sorkine, Alexa 2007).
+    The patch of a sample consists of all samples at a geodesic distance below `radius`. A rotation and a
+    translation carry the patch as close as possible to its matches. The residual is the mean squared distance
+    that remains, divided by the size of the patch. The size is the variance of the patch's positions plus the
+    variance of its matches. The deformation is the mean residual of all patches.
+
+    A map that bends a body at its joints deforms most patches little. Upside-down maps and mirrored maps
+    deform most patches, because rotations contain no reflection. Such energies are called
+    "as-rigid-as-possible" (Sorkine, Alexa 2007).
 
     **Arguments:**
 
     - `x`, `y`: the proxies of X (s samples) and Y (t samples).
-    - `found`: a map of samples (s,), as 0-based indices of samples of Y.
+    - `found`: the matches of the samples of X (s,), as 0-based indices of samples of Y.
     - `radius`: the radius of the patches, in the unit of the distances.
 
-    **Returns:** The mean squared residual, relative to the mean squared distances of the patch and of its
-    matches from their centroids: 0 for a rigid motion, and at most 1.
+    **Returns:** The deformation, from 0 for a rigid motion to at most 1.
     """
     weights = (x.distances < radius) * x.areas
     weights /= weights.sum(axis=1, keepdims=True)

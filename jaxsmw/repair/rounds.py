@@ -38,13 +38,14 @@ def refine_in_stages(
     (`jaxsmw.repair.scores`). If the outcome looks wrong, repair takes the following three steps. The stage at
     position `repair.stage` is called the repeated stage.
 
-    1. Alternatives: `jaxsmw.repair.alternatives` refines many initial maps on a thousand samples. From each
-       of the best maps, at most `finalists`, the repeated stage and all later stages run. Of these outcomes
-       and the first outcome, the outcome with the best score is kept. If it looks right, repair ends.
+    1. Alternatives: `jaxsmw.repair.alternatives` refines many initial maps on a thousand samples. The best of
+       these maps, at most `finalists`, are then refined by the repeated stage and all later stages. Of these
+       outcomes and the first outcome, the outcome with the best score is kept. If it looks right, repair
+       ends.
     2. Rounds: each round runs the repeated stage and all later stages again. The first functional map of the
        repeated stage is computed without the vertices that have a fault in the previous map. If a map has
        both orientation reversal and discontinuous parts, successive rounds leave out these two faults
-       alternately. If the outcome of the second-best score has faults, it is repaired in the same way. It is
+       alternately. The outcome with the second-best score is repaired in the same way if it has faults. It is
        used if all its faults disappear and its score is the best.
     3. Fallback: the repeated stage and all later stages run once more, from the best outcome of the rounds.
        The repeated stage then uses the numbers of eigenvectors in `fallback_levels`. The map of the fallback
@@ -61,8 +62,8 @@ def refine_in_stages(
     - `alternatives`: alternative maps (m,), the best first, as an iterable that is consumed only if needed.
       By default, the maps come from `jaxsmw.repair.alternatives` if the initial map is `"shot"`. For other
       initial maps, there are no alternatives by default.
-    - `refined`: the outcome of all stages from the initial map, for example from `refine_batch`. By default,
-      the stages run first.
+    - `refined`: the outcome of all stages if they have already run, such as a result of `refine_batch`. By
+      default, the function runs the stages itself.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Returns:** An `Outcome` with padded maps. Refinement stops at the first stage that fails.
@@ -101,12 +102,12 @@ def refine_further(
 ) -> Outcome:
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
-    If repair did not find a map that looks right, its rivals are refined as well. The map with the best score
-    after the passes is returned.
+    If repair did not find a map that looks right, the `rivals` of the outcome are refined as well. The map
+    with the best score after the passes is returned.
 
-    The repeated stage and all later stages run `repair.passes` more times. If the shapes differ very much, or
-    if the initial map of full shapes is `"aligned"`, coarse passes with the levels `repair.coarse_levels` and
-    one usual pass run instead.
+    In each usual pass, the repeated stage and all later stages run again. There are `repair.passes` usual
+    passes. For very different shapes, and for full shapes that start from `"aligned"`, coarse passes with the
+    levels `repair.coarse_levels` run instead. One usual pass follows the coarse passes.
 
     **Arguments:**
 
@@ -116,15 +117,16 @@ def refine_further(
     - `outcome`: an outcome of `refine_in_stages`.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
-    **Returns:** The `Outcome` of the last pass, which is suspicious if the given outcome is suspicious. The
-    given outcome is returned if `repair` is None, if no passes are needed, or if the given outcome or all
-    passes failed.
+    **Returns:** The `Outcome` with the best score. It is suspicious if and only if the given outcome is
+    suspicious. The given outcome is returned if `repair` is None, if no passes are needed, or if the given
+    outcome or all passes failed.
     """
     if repair is None or not outcome.successful:
         return outcome
     runner, judge = _runner_and_judge(prepared, stages, repair, history)
     change = judge.area_change(outcome)
-    # Rigidly aligned full shapes differ in form, not in pose, and their map has the details of the alignment.
+    # Rigidly aligned full shapes differ in form, not in pose. Coarse passes lower the errors of their maps
+    # for any area-based shape difference. (Entry R24)
     aligned = isinstance(prepared.init, str) and prepared.init == "aligned" and not prepared.pair.partial
     if change < repair.non_isometric and not aligned:
         return outcome
@@ -178,7 +180,7 @@ class _Runner:
         return before._replace(refinements=[*before.refinements, found])
 
     def coarse(self, levels: tuple[int, ...]) -> _Runner:
-        """Return a runner whose last stage has the given levels, if its refiner has levels at all."""
+        """Return a runner whose last stage has the given levels. A refiner without levels is not changed."""
         *before, (view, stage) = self.steps
         if stage.refiner.levels:
             stage = _with_levels(stage, levels)
@@ -187,7 +189,7 @@ class _Runner:
 
 
 def _with_levels(stage: Stage, levels: tuple[int, ...]) -> Stage:
-    """Return the stage with other levels, none of which exceeds its number of eigenvectors."""
+    """Return the stage with other levels, each limited to the stage's number of eigenvectors."""
     return stage.with_levels(tuple(min(level, stage.number_of_eigenvectors) for level in levels))
 
 

@@ -22,9 +22,9 @@ def dirichlet_energy_ratio(
 ) -> float:
     """Return the Dirichlet energy of the matched positions, divided by the energy of X's own positions.
 
-    Both energies are computed from the same first eigenvectors of X. The span of the eigenvectors excludes
-    the scatter of single matches, which grows with the density of the mesh. For true maps between poses of
-    one body, the ratio is about 1, even if the triangulations differ. For true maps between non-isometric
+    Both energies are computed from the same first eigenvectors of X. More eigenvectors would include the
+    scatter of single matches, and its energy grows with the density of the mesh. For true maps between poses
+    of one body, the ratio is about 1, even if the triangulations differ. For true maps between non-isometric
     shapes, the ratio is up to 1.1. Discontinuous maps have larger ratios.
 
     **Arguments:**
@@ -47,8 +47,8 @@ def dirichlet_energy_ratio(
     def energy(positions: Float[np.ndarray, "m 3"]) -> float:
         # A constant offset of the positions has no energy but would cause rounding errors.
         centered = positions - pair.mesh_x.average(positions)
-        # The product uses the type of the eigenvectors, because a converted copy of the eigenvectors of a
-        # large mesh takes too much memory.
+        # The eigenvectors keep their type, because a converted copy of them takes too much memory on large
+        # meshes.
         weighted = (areas[:m] * centered.T).astype(eigenvectors.dtype)
         return float(np.sum(eigenvalues * (weighted @ eigenvectors[:m]) ** 2))
 
@@ -69,8 +69,8 @@ def distortion(
     the share of X's area with `orientation_reversal`. Without the factor for orientation reversal, a map that
     mirrors the body would have a smaller distortion than a map with swapped legs. An energy ratio below 1 is
     replaced by its inverse, because a map that collapses a part of X is as wrong as a map that stretches it.
-    If Y is a partial shape, large parts of X have no match, so the energy of a correct map can fall to the
-    share of X's area that Y covers. This share then replaces the numerator 1 of the inverse.
+    If Y is a partial shape, large parts of X have no match. The energy ratio r of a correct map can then fall
+    to the share s of X's area that Y covers. In this case, r is replaced by the larger of r and s / r.
 
     Correct maps from `Registration` have a distortion of at most 1.12 between poses of one body, and at most
     1.2 between non-isometric shapes. Most maps with swapped limbs have a distortion above 1.3.
@@ -168,11 +168,11 @@ def area_shape_difference(
 ) -> float:
     """Measure how much a map changes areas.
 
-    The measure is the norm of the area-based shape difference minus the identity. The area-based shape
-    difference (Rustamov et al. 2013) is an operator on functions on Y. For two functions f and g on Y, the
-    operator compares two inner products: the product of f and g on Y, and the product of their pull-backs
-    f ∘ T and g ∘ T on X. In the basis of the first eigenfunctions of Y, the operator is a symmetric matrix.
-    This matrix is the identity if the map preserves areas.
+    The measure is the norm of D - I, where D is the area-based shape difference and I is the identity. D is
+    an operator on functions on Y (Rustamov et al. 2013). For two functions f and g on Y, the operator
+    compares two inner products: the product of f and g on Y, and the product of their pull-backs f ∘ T and
+    g ∘ T on X. In the basis of the first eigenfunctions of Y, the operator is a symmetric matrix. This matrix
+    is the identity if the map preserves areas.
 
     **Arguments:**
 

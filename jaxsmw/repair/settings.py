@@ -51,16 +51,17 @@ class ExpectedErrorSettings:
     **Attributes:**
 
     - `detour_weight` (Tables R17 and R18): the weight of the detour of a vertex. The detour is the distance
-      between a vertex and the vertex to which the reverse map takes its match.
-    - `distortion_weight`: the weight of the mean change in length of the edges at a vertex. With the default
-      values of both weights, the true errors on real pairs are 0.8 to 1.4 times the expected errors.
+      from the vertex to its image under the map and then the reverse map.
+    - `distortion_weight`: the weight of the mean change in length of the edges at a vertex. With all default
+      settings, the mean error of each tested data set is 0.9 to 1.6 times its mean expected error (Table
+      R30).
     - `misplaced_weight`: the increase of the expected error on a limb that looks swapped, in units of the
       square root of the limb's area.
     - `heat_time`: the time of the heat flow that averages over neighbouring vertices. The default value
       averages over a disk of radius 0.06.
-    - `area_weight`, `isometric_difference` (Table R30): the expected error of two full shapes is multiplied
-      by 1 + `area_weight` times the logarithm of the area-based shape difference divided by
-      `isometric_difference`. For smaller shape differences, the factor is 1.
+    - `area_weight`, `isometric_difference` (Table R30): for two full shapes with the area-based shape
+      difference d, the expected error is multiplied by `1 + area_weight * log(d / isometric_difference)`. If
+      d is smaller than `isometric_difference`, the factor is 1.
     """
 
     detour_weight: float = 0.5
@@ -77,7 +78,7 @@ class WrongProbabilitySettings:
 
     **Attributes:**
 
-    - `intercept`: the logarithm of the odds of a map whose distortion and mean expected error are both 1.
+    - `intercept`: the log-odds that a map is wrong if its distortion and its mean expected error are both 1.
     - `distortion_weight`: the weight of the logarithm of the distortion.
     - `expected_error_weight`: the weight of the logarithm of the mean expected error.
     """
@@ -114,20 +115,21 @@ class AlternativeSettings:
     - `radii`: a tuple with one entry for each initial map from SHOT alone. Each entry is a tuple of radii,
       which are positive integers in units of 0.06.
     - `extremities`: the settings of the search for extremities, an `ExtremitySettings`.
-    - `compared_pairings`: the number of pairings of extremities that are compared by the similarity of their
-      features. The pairings are those that best preserve the distances between extremities.
+    - `compared_pairings`: the number of pairings of extremities that are ranked by the similarity of
+      features. Only the pairings that best preserve the distances between extremities are ranked.
     - `pairings` (Table R27): the number of initial maps from pairings of extremities.
     - `distance_weight`, `position_weight`: the weights of squared differences of relative distances and of
-      relative positions, compared with squared differences of SHOT.
+      relative positions. In the initial maps, squared differences of SHOT have the weight 1.
     - `levels`, `descriptors`: the levels and the number of descriptors of the feature regression that refines
       the initial maps.
     - `repaired`: the number of refined maps that are refined again without their faults.
     - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
     - `patch_radius` (Table R28): the radius of the patches of the deformation.
-    - `different_areas` (Table R27): the least shares of X's area, above 0, on which the second, the third and
-      each further alternative map differ from all maps before them.
+    - `different_areas` (Table R27): a tuple of shares of X's area, each above 0. The second alternative map
+      must differ from the first map on at least the first share. Each further map must differ from all maps
+      before it on at least the next share. The last share also applies to all remaining maps.
     - `margin` (Table R28): the largest difference of scores between the best map and a returned map. If a
-      wrong map has the best score, the scores of the right map and of the wrong map differ less.
+      wrong map has the best score, the score of the right map is worse by less than this margin.
     """
 
     samples: int = 1000
@@ -151,55 +153,60 @@ class RepairSettings:
     """The settings that determine when a map looks wrong, and how the map is repaired.
 
     The settings are passed as `Preset(stages, repair=RepairSettings(...))` and take effect in `jaxsmw.match`.
-    A map is judged by its distortion, which is 1 for isometries and larger for worse maps, and by its faults.
-    The faults are vertices with orientation reversal, and parts that discontinuities separate from the rest
-    of X. Tables and entries R1, R2, … are in `docs/research_log.md`.
+    A map is judged by its distortion and by its faults. The distortion is 1 for isometries and larger for
+    worse maps. The faults are vertices with orientation reversal, and parts that discontinuities separate
+    from the rest of X. Tables and entries R1, R2, … are in `docs/research_log.md`.
 
     **Attributes:**
 
-    - `stage`: the 0-based position, in the stages of the preset, of the stage that repair repeats. The
-      refiner of this stage must have levels.
+    - `stage`: the stage that repair repeats, as a 0-based position in the stages of the preset. The refiner
+      of this stage must have levels.
     - `fallback_levels` (entry R4): the numbers of eigenvectors in the iterations of the fallback. The
       fallback is one further repetition of the stage after the rounds. By default, the fallback begins with
       fewer eigenvectors than the stage.
-    - `suspicious` (Table R3): a number above 1. A map with a distortion of at least this value is suspicious
-      and is repaired. Correct maps between poses of one body have a distortion below this value.
-    - `suspicious_area` (Table R28): a number from 0 to 1. A map with a fault of at least this share of X's
-      area is suspicious as well.
+    - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
+      value is suspicious and is repaired. Correct maps between poses of one body have a distortion below this
+      value.
+    - `suspicious_area` (Table R28): a share of X's area, from 0 to 1. A map is also suspicious if a fault
+      covers at least this share.
     - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
       value. A value below `suspicious` has no effect. Between non-isometric shapes, some correct maps have
       distortions up to this value.
-    - `negligible_area`: a fault with at most this share of X's area, from 0 to 1, is not repaired. Small
-      faults, such as at fingertips, appear and disappear by chance.
-    - `excessive_area`: a fault with at least this share of X's area, from 0 to 1, is not repaired. If most of
-      a body is mapped upside down, the rest of the map does not suffice to find the correct map.
+    - `negligible_area`: a share of X's area, from 0 to 1. A fault that covers at most this share is not
+      repaired. Small faults, such as at fingertips, appear and disappear by chance.
+    - `excessive_area`: a share of X's area, from 0 to 1. A fault that covers at least this share is not
+      repaired. If most of a body is mapped upside down, the rest of the map does not suffice to find the
+      correct map.
     - `rounds` (Table R5): the largest number of rounds of repair, at least 0. Each round runs the repeated
       stage and all later stages.
     - `finalists`: the largest number of alternative maps that are refined at all vertices, at least 0.
-    - `uncertainty_weight` (Table R28): the weight of the feature regression's uncertainty in the score,
-      relative to the logarithm of the distortion; at least 0. Upside-down maps have a higher uncertainty than
-      correct maps, and mirrored maps have a higher distortion.
+    - `uncertainty_weight` (Table R28): the weight of the feature regression's uncertainty in the score, at
+      least 0. The logarithm of the distortion has the weight 1. Upside-down maps have a higher uncertainty
+      than correct maps, and mirrored maps have a higher distortion.
     - `deformation_weight` (Table R28): the weight of the deformation in the score, at least 0. Upside-down
       maps and mirrored maps have larger deformations than right maps.
-    - `score_tolerance` (entry R4): the map of the fallback is preferred if it looks right and its score is
-      worse by less than this value (at least 0). The scores of two correct maps mostly differ by less than
-      this value. The scores of a correct map and an upside-down map differ by more than this value.
-    - `non_isometric` (Table R29): a number from 0. Two full shapes whose final map has an area-based shape
-      difference of at least this value are refined further, even if the map looks right. The difference is
-      smaller between poses of one body.
-    - `passes` (Table R29): how often the repeated stage and all later stages run again for such shapes, at
-      least 0. Their maps converge more slowly than maps between poses of one body.
-    - `coarse_from` (Table R32): a number from `non_isometric`. If the area-based shape difference is at least
-      this value, coarse passes and one usual pass run instead of the usual passes. They also run for all maps
-      that start from `"aligned"` (entry R24).
+    - `score_tolerance` (entry R4): a number of at least 0. The map of the fallback is preferred if it looks
+      right and its score is worse by less than this value. The scores of two correct maps mostly differ by
+      less than this value. The scores of a correct map and an upside-down map differ by more than this value.
+    - `non_isometric` (Table R29): a number of at least 0. If the final map of two full shapes has an
+      area-based shape difference of at least this value, the map is refined further, even if it looks right.
+      The difference is smaller between poses of one body.
+    - `passes` (Table R29): the number of usual passes for such shapes, at least 0. In each pass, the repeated
+      stage and all later stages run again. Maps of such shapes converge more slowly than maps between poses
+      of one body.
+    - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
+      value, coarse passes and one usual pass run instead of the usual passes. A value below `non_isometric`
+      has the same effect as `non_isometric`. Coarse passes also run for all maps of full shapes that start
+      from `"aligned"` (entry R24).
     - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass. If
       the refiner of the last stage has no levels, coarse passes are usual passes.
-    - `rivals` (Table R36): the number of further outcomes of the repair that passes refine, if the best
-      outcome still looks wrong. The best outcome after the passes is chosen.
-    - `aligned_preference` (entry R24): a number from 0. With `init="auto"`, asymmetric shapes are matched
-      from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean expected
-      error is below this multiple of the other map's mean expected error. Both expected errors are computed
-      without `ExpectedErrorSettings.area_weight`, and before further passes.
+    - `rivals` (Table R36): the largest number of rivals. If the best outcome of the repair still looks wrong,
+      the passes also refine its rivals, which have the next best scores. The best outcome after the passes is
+      chosen.
+    - `aligned_preference` (entry R24): a number of at least 0. With `init="auto"`, asymmetric shapes are
+      matched from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean
+      expected error is below this multiple of the other map's mean expected error. Both expected errors are
+      computed without `ExpectedErrorSettings.area_weight`, and before further passes.
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 

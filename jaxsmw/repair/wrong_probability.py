@@ -1,4 +1,4 @@
-"""The probability that a map is wrong on a part of the body, which needs no ground truth."""
+"""Estimates the probability that a map is wrong on a part of the body, without ground truth."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def wrong_probability(
     """Estimate the probability that a map is wrong, without ground truth.
 
     A map is called wrong if at least 2 % of X's area have errors above 0.25 times the square root of Y's
-    area. Swapped limbs, mirrored bodies and upside-down bodies are wrong in this sense. Small errors
-    everywhere are not. The estimate is a logistic regression on the logarithms of the distortion and of the
-    mean expected error.
+    area. Maps with swapped limbs, mirrored maps and upside-down maps are wrong in this sense. A map with only
+    small errors is not wrong in this sense. The estimate is a logistic regression on the logarithms of the
+    distortion and of the mean expected error.
 
     **Arguments:**
 

@@ -91,7 +91,8 @@ def write_collection_page(
       The model must contain the shapes in the same order, and its reference must be the template.
     - `title`: the heading of the page.
     - `notes`: sentences about decisions, such as the choice of the template.
-    - `left_out`: a dictionary from the name of each shape that is not on the page to the reason.
+    - `left_out`: the shapes that the page does not show, as a dictionary from the name of a shape to the
+      reason.
     - `warning`: a sentence below the heading, or an empty text.
     - `up`: the axis of the template's coordinates that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis from several shapes.
@@ -164,10 +165,10 @@ def write_collection_page(
 
 
 def simplify(mesh: Mesh, most: int) -> tuple[Int64[np.ndarray, " q"], Int64[np.ndarray, "g 3"]]:
-    """Choose vertices of a mesh and a triangulation of them, so that the picture of the mesh hardly changes.
+    """Simplify a mesh: choose some of its vertices and triangulate them.
 
-    The shortest edges are collapsed first (`igl.decimate`). If the mesh is not manifold, only its
-    unreferenced vertices are removed.
+    The picture of the mesh hardly changes. The shortest edges are collapsed first (`igl.decimate`). If the
+    mesh is not manifold, only its unreferenced vertices are removed.
 
     **Arguments:**
 
@@ -283,7 +284,10 @@ def _encode_model(
     offset: Float64[np.ndarray, " 3"],
     to_page: Float64[np.ndarray, "3 3"],
 ) -> dict[str, Any]:
-    """Encode the mean, the displacements of one standard deviation, and the scores in standard deviations."""
+    """Encode the mean shape, the modes and the scores of a model.
+
+    The modes are displacements by one standard deviation. The scores are in units of the standard deviation.
+    """
     shares = model.variances[:_MODES] / (model.total_variance or 1.0)
     count = max(np.count_nonzero(shares >= _SMALLEST_SHARE), min(len(shares), 2))
     deviations = np.sqrt(model.variances[:count])

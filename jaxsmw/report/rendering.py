@@ -33,9 +33,9 @@ def choose_azimuth(meshes: Sequence[Mesh]) -> float:
 
     The best direction of view is the horizontal direction in which the bodies are thin. This direction shows
     people from the front and animals from the side. Directions close to a preferred direction r are favoured.
-    The direction r shows a body from the front and a little from the side. The chosen direction is the
-    eigenvector of M - 0.8 n r r^T with the smallest eigenvalue, where n is the number of meshes. The matrix M
-    is the sum of the meshes' horizontal covariance matrices, each of which is scaled to trace 1.
+    The direction r shows a body from the front and a little from the side. Let M be the sum of the horizontal
+    covariance matrices of all n meshes, each scaled to trace 1. The chosen direction is the eigenvector of
+    M - 0.8 n r r^T with the smallest eigenvalue.
 
     **Arguments:**
 

@@ -31,9 +31,9 @@ _CONVENTIONS: tuple[Axis, ...] = ("y", "z", "-y")
 # files, the spread along z is at least 0.47 times the spread along y. The only exceptions are two animals
 # that leap or crouch.
 _SLENDER = 0.45
-# The usual axis is y or z (see `guess_up`). Its number in this dictionary is added to its score. For people
-# who stand on one foot with raised arms, an upside-down axis scores up to 0.18 higher than the correct axis.
-# For bodies that sit or leap, a wrong axis scores up to 0.09 higher than the correct axis.
+# The numbers that are added to the score of the usual axis, which is y or z (see `guess_up`). For people who
+# stand on one foot with raised arms, an upside-down axis scores up to 0.18 higher than the correct axis. For
+# bodies that sit or leap, a wrong axis scores up to 0.09 higher than the correct axis.
 _HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
 _STABILITY_WEIGHT = 0.25
 # Stability is clipped to this range, in units of the square root of the area. Differences outside of the

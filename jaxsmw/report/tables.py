@@ -31,8 +31,8 @@ class MethodSummary(NamedTuple):
       geodesic error, in thousandths of the square root of the target's area.
     - `difference`: an `Interval` with the attributes `mean`, `low` and `high`. For each pair, the error of
       the method `REFERENCE` is subtracted from the error of this method. `difference` contains the mean of
-      these differences and the confidence interval of this mean, in the unit of the attribute `mean`. Pairs
-      on which `REFERENCE` failed are left out. `difference` is NaN for `REFERENCE` itself.
+      these differences and the confidence interval of this mean, in the same unit as the errors. Pairs on
+      which `REFERENCE` failed are left out. `difference` is NaN for `REFERENCE` itself.
     - `within`: the share of points with an error of at most 0.05 times the square root of the target's area.
       The value is the mean over all pairs.
     - `area_under_curve`: the mean area under the correspondence quality curves of all pairs, at most 1.
@@ -217,7 +217,7 @@ def write_tables(
 def _introduction(data_set: DataSet, results: Results, settings: Settings) -> str:
     """Return the paragraph above the table of `summary.md`."""
     pairs = {(row["source"], row["target"]) for row in results.rows}
-    # A list can contain further pairs of shapes of different classes.
+    # A user's list of pairs can contain pairs that the data set does not list.
     listed = pairs <= {(pair.source, pair.target) for pair in data_set.pairs}
     share = f"{len(pairs)} of {len(data_set.pairs)}" if listed else f"{len(pairs)} given"
     points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"

@@ -26,7 +26,7 @@ from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import one_blas_thread
 
-# Larger batches saved no time on any device on which scripts/benchmark_batches.py was run.
+# In scripts/benchmark_batches.py, larger batches save no time on any tested device.
 _LARGEST_BATCH = 64
 # The assumed memory, in bytes, of a device that does not report its memory.
 _USUAL_MEMORY = 8 * 2**30
@@ -103,8 +103,8 @@ def refine_pairs(
 
     **Arguments:**
 
-    - `spectra`: a sequence of shapes, each a `Spectrum`. Numbers of eigenvectors may differ. All shapes have
-      the same number of descriptors, or none.
+    - `spectra`: a sequence of shapes, each a `Spectrum`. The shapes may have different numbers of
+      eigenvectors. All shapes must have the same number of descriptors, or no shape may have descriptors.
     - `pairs`: for each pair, a tuple of two integers: the indices of source X and target Y in `spectra`,
       counted from 0. A pair may occur several times with different initial maps.
     - `pointwise_maps`: for each pair, the initial map T: X -> Y, an integer array (m,) with one vertex of Y
@@ -185,7 +185,7 @@ def _check_pairs(
     pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     samples: Sequence[Int[Array, " _"]] | None,
 ) -> None:
-    """Raise `ValueError` if an argument of `refine_pairs`, other than `batch_size`, is not valid."""
+    """Raise `InputError` if the shapes, pairs, initial maps or samples of `refine_pairs` are not valid."""
     if len(pairs) != len(pointwise_maps):
         raise InputError(
             f"there are {len(pairs)} pairs and {len(pointwise_maps)} initial maps: give one map per pair"
@@ -307,8 +307,7 @@ def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settin
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
         return refine(spectrum_x, spectrum_y, initial_map, refiner=refiner, samples=samples, **settings)
 
-    # CPUs use `lax.map`, because XLA's threads for CPUs wait for each other forever in some programs of
-    # `jax.vmap`.
+    # CPUs use `lax.map`, because some programs of `jax.vmap` deadlock on CPUs.
     each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
     if mesh.size == 1:
         return each(batch)

@@ -81,7 +81,7 @@ def cached(
 
 
 class Store:
-    """Results in a directory, each with the values on which it depends.
+    """A store of results in a directory. Each file name contains a hash of the inputs of the result.
 
     **Arguments:**
 
@@ -210,8 +210,8 @@ def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
     digest = hashlib.sha256()
     for value in (_FORMAT, kind, *inputs):
         array = np.asarray(value)
-        # The header contains the size of each array. Without it, different arrays in a row could give the
-        # same bytes.
+        # The header contains the size of each array. Without the sizes, different lists of arrays could give
+        # the same bytes.
         digest.update(f"{type(value).__name__} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()

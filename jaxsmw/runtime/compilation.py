@@ -85,9 +85,9 @@ def compile_ahead(
 
     **Arguments:**
 
-    - `arguments`: a function that takes no arguments, and returns the arrays for `function`: a tuple of
-      positional arguments and a mapping of named arguments. JAX traces `arguments` to determine the sizes of
-      the arrays, and does not compute the arrays.
+    - `arguments`: a function without arguments, which returns the arrays for `function`. The result consists
+      of a tuple of positional arguments and a mapping of named arguments. JAX traces `arguments` to determine
+      the sizes of the arrays, and does not compute the arrays.
     - `settings`: the remaining keyword arguments of `function`.
 
     **Returns:** A future that is done when the program is compiled. If compilation raises an exception, the
@@ -115,11 +115,11 @@ def compile_ahead(
 def release_programs() -> None:
     """Release all compiled programs if the process uses a large share of its allowed memory maps.
 
-    Commands, and functions that match many pairs, call this function between pairs. Functions that match one
-    pair must not call it, because `jax.clear_caches` also clears the programs of the caller. On Linux, the
-    programs for a few dozen pairs of different sizes would use up all memory maps of the process. LLVM would
-    then end the process. JAX compiles released programs again when they are needed, or loads them from the
-    disk. On other systems the function does nothing.
+    Commands call this function between pairs. Functions that match many pairs also call it. Functions that
+    match one pair must not call it, because `jax.clear_caches` also clears the programs of the caller. On
+    Linux, the programs for a few dozen pairs of different sizes would use up all memory maps of the process.
+    LLVM would then end the process. JAX compiles released programs again when they are needed, or loads them
+    from the disk. On other systems the function does nothing.
     """
     try:
         used = Path("/proc/self/maps").read_bytes().count(b"\n")

@@ -21,7 +21,7 @@ memory.
 
 
 def largest_contents(size_of_file: int) -> int:
-    """Return the largest plausible size of the unpacked contents of a compressed file, in bytes.
+    """Return the largest number of bytes to which a compressed file may unpack.
 
     A limit is necessary because a malicious file can unpack to a thousand times its size. Contents of up to 1
     GiB are always accepted, because a mesh of ten million vertices has this size. Only files of eigenvectors
@@ -131,9 +131,10 @@ def remove_unfinished() -> None:
 
 
 def remove_leftovers(directory: Path) -> None:
-    """Remove the temporary files of `atomic_write` that killed processes left in a directory.
+    """Remove the temporary files of `atomic_write` from a directory.
 
-    No other process may be writing to the directory. If the directory does not exist, nothing happens.
+    Such files stay behind when a process is killed. The caller must ensure that no other process is writing
+    to the directory. If the directory does not exist, nothing happens.
     """
     with suppress(OSError):
         for name in os.listdir(directory):

@@ -195,9 +195,9 @@ def claimed_directory(
     - `noted`: a dictionary of further information that the first call writes to the file. Later calls ignore
       `noted`.
 
-    **Raises:** `InputError` if the directory contains results with another `provenance` or without
-    `provenance.json`, if `provenance.json` is damaged, if the directory cannot be locked, or if another
-    process is adding results.
+    **Raises:** `InputError` if the stored provenance differs from `provenance`, or if the directory contains
+    results but no `provenance.json`. `InputError` is also raised if `provenance.json` is damaged, if the
+    directory cannot be locked, or if another process is adding results.
     """
     # The operating system releases the lock even if the process is killed.
     lock = FileLock(directory / ".lock", timeout=0)

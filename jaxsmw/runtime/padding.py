@@ -8,9 +8,9 @@ from jaxtyping import Shaped
 from jaxsmw.core.search import BLOCK
 
 # A padded size is a multiple of `power / _SUBDIVISION`, where `power` is the largest power of two below the
-# number of vertices. Every padded size is also a multiple of the block size of the search. If the padded size
-# is at least 1024, at most 1/8 of its vertices are padding. Shapes with 4000 to 16 000 vertices have only 17
-# different padded sizes.
+# number of vertices. Every padded size is also a multiple of the block size of the search. At most 1/8 of the
+# vertices of a padded shape are padding if the padded size is at least 1024. Shapes with 4000 to 16 000
+# vertices have only 17 different padded sizes.
 _SUBDIVISION = 8
 
 

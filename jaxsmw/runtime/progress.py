@@ -19,7 +19,7 @@ def no_progress(step: str, done: int, number: int) -> None:
 
 @contextmanager
 def timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Log the name of a step, and store the wall time of the block in `seconds[name]`, in seconds.
+    """Log the name of a step, and store the wall time of the block in `seconds[name]`.
 
     If the block raises an exception, no time is stored.
     """

@@ -65,9 +65,9 @@ class Workers(ProcessPoolExecutor):
 class _OneCoreProcess(SpawnProcess):
     """A process that is limited to one core.
 
-    The environment variables that set this limit must be set before the process starts. NumPy and JAX read
-    these variables only once, when they are imported. A new process first imports the main module of the
-    calling program. This module may import NumPy and JAX.
+    `start` sets the environment variables of the limit before the process starts. Later changes would have no
+    effect, because NumPy and JAX read these variables only once, when they are imported. A new process first
+    imports the main module of the calling program, and this module may import NumPy and JAX.
     """
 
     def start(self) -> None:
@@ -136,7 +136,7 @@ _warnings: list[Warning] = []
 
 
 def _with_warnings(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[Warning]]:
-    """Call a function in a worker. Return its result, and the warnings since the last such call."""
+    """Call a function in a worker. Return the result, and the worker's warnings since the last call."""
     result = function(task)
     issued = _warnings.copy()
     _warnings.clear()

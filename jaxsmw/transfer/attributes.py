@@ -31,7 +31,7 @@ _Value = TypeVar("_Value")
 
 
 class _Corners(NamedTuple):
-    """The k rows of an array from which each of p results is computed, and the weights of these rows."""
+    """Each of p results is computed from k weighted rows of an array."""
 
     rows: Int64[np.ndarray, "p k"]
     weights: Float64[np.ndarray, "p k"]
@@ -61,8 +61,9 @@ def transfer_attributes(
       from the same side of a seam: the side on which the face's centroid lies. Along seams, vertices of Y
       have several texture vertices. If the nearest face of X has no texture, the face of Y has no texture
       either.
-    - Skin weights are interpolated. A vertex of Y has at most as many joints as the vertices of X; the
-      smallest weights are left out. Each row sums to 1, unless all weights of the nearest face are 0.
+    - Skin weights are interpolated. A vertex of Y has at most as many joints as the vertex of X with the most
+      joints. The smallest weights are left out. The weights of a vertex sum to 1, unless all weights of the
+      nearest face are 0.
     - Blend shapes are displacements of the vertices of X. Each displacement is first rotated and scaled in
       the same way as the neighbourhood of its vertex (`RegisteredMesh.similarities`). The results are then
       interpolated.
@@ -75,8 +76,8 @@ def transfer_attributes(
 
     - `data`: the `MeshData` of X. Its `mesh` is `registered.mesh_x`.
     - `registered`: the `RegisteredMesh` of X on Y.
-    - `target`: Y, a `MeshData` whose `mesh` is `registered.mesh_y`, or a `Mesh`. If None (the default), Y is
-      `registered.mesh_y`.
+    - `target`: a `MeshData` with the mesh `registered.mesh_y`, or this mesh itself. None (the default) stands
+      for this mesh.
 
     **Returns:** The `MeshData` of Y with the vertices and faces of `target`. The `notes` of its `mesh` tell
     which data of Y were replaced. The notes also count the vertices of Y whose distance to the registered
@@ -185,7 +186,10 @@ def _face_numbers(data: MeshData, mesh_x: Mesh) -> Int64[np.ndarray, " f"]:
 def _sampled_faces(
     registered: RegisteredMesh, faces: Int64[np.ndarray, "f 3"], numbers: Int64[np.ndarray, " g"]
 ) -> _Corners:
-    """Return which faces of the source's data lie at four points of each face of the target."""
+    """Find the nearest face of the source for each of four points per face of the target.
+
+    The result contains rows of the source's `MeshData.faces`.
+    """
     samples = np.einsum("sk,fkx->fsx", _SAMPLES, registered.mesh_y.vertices[faces])
     found, _ = nearest_surface_points(samples.reshape(-1, 3), registered.mesh)
     weights = np.full(samples.shape[:2], 1 / len(_SAMPLES))

@@ -33,19 +33,19 @@ class Attraction(NamedTuple):
     positions: Float64[np.ndarray, "c 3"]
 
     def matrix(self) -> csr_array:
-        """Return the matrix (m, m) of the squared distances as a quadratic form of the source's vertices."""
+        """Return the matrix (m, m) of the quadratic term of the weighted squared distances."""
         return csr_array(self.interpolation.T @ (diags_array(self.weights) @ self.interpolation))
 
     def right_side(self) -> Float64[np.ndarray, "m 3"]:
-        """Return the linear term of the squared distances."""
+        """Return the linear term of the weighted squared distances."""
         return self.interpolation.T @ (self.weights[:, None] * self.positions)
 
 
 class UncoveredVertices:
     """The vertices of Y that a deformation of X does not reach, such as the tips of ears and fingers.
 
-    A vertex is not uncovered if its nearest triangle touches a boundary of X. Otherwise a hole of X would
-    close, or its edge would be drawn to a part of the body that X lacks.
+    A vertex does not count as uncovered if the nearest triangle of X touches a boundary of X. Otherwise holes
+    of X would close, and boundaries of X would stretch to parts of the body that X lacks.
 
     **Arguments:**
 
@@ -65,15 +65,16 @@ class UncoveredVertices:
     def attraction(
         self, positions: Float64[np.ndarray, "m 3"], strengths: Float64[np.ndarray, " m"]
     ) -> Attraction | None:
-        """Draw the nearest points of a deformation of X to the uncovered vertices of Y.
+        """Return the attraction of points of a deformed X to the uncovered vertices of Y.
 
-        After the first call, only vertices near or above the limit of uncovered vertices are considered.
+        The first call excludes the vertices whose distance from X is at most half of the limit. Later calls
+        ignore these vertices.
 
         **Arguments:**
 
         - `positions`: the positions of the vertices of X.
-        - `strengths`: a factor for each vertex of X. The weight of an uncovered vertex of Y is its area times
-          the factor at its nearest point.
+        - `strengths`: a factor for each vertex of X. The weight of an uncovered vertex of Y is the vertex
+          area times the factor at the nearest point of X.
 
         **Returns:** An `Attraction`, or None if no vertex is uncovered.
         """

@@ -55,8 +55,8 @@ def transfer_landmarks(
       (`expected_errors`). The positions do not depend on this argument.
 
     **Returns:** `TransferredLandmarks`, whose attribute `landmarks` contains the positions (l, 3) on Y. The
-    result states the coordinate system and the unit of the given landmarks, so both meshes should have this
-    coordinate system and this unit.
+    result keeps the coordinate system and the unit that the given landmarks state. Both meshes should
+    therefore have this coordinate system and this unit.
 
     **Raises:** `InputError` if `expected_error` does not contain one number for each vertex of X.
     `InputError` is also raised if the landmarks lie off the surface of X, but would lie on it in the other
@@ -91,8 +91,9 @@ def nearest_vertices(
     - `landmarks_x`, `landmarks_y`: the `Landmarks` on X and on Y, with the same l names in the same order.
     - `mesh_x`, `mesh_y`: the source X and the target Y.
 
-    **Returns:** A vertex of X and a vertex of Y for each landmark (l, 2), 0-based. Each landmark is projected
-    onto the nearest face. The vertex is the corner of this face that is nearest to the projection.
+    **Returns:** An array (l, 2) with one vertex of X and one vertex of Y for each landmark, 0-based. Each
+    landmark is projected onto the nearest face. The vertex is the corner of this face that is nearest to the
+    projection.
 
     The function issues a `UserWarning` for each landmark that is far from its surface.
 

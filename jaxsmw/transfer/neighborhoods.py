@@ -14,8 +14,9 @@ from scipy.sparse import csr_array, diags_array
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.rotations import nearest_rotations
 
-# The number of averagings of moments. More averagings enlarge the neighbourhood of each vertex. With fewer
-# averagings, the similarity transformations follow the noise of the map. (Entry R22 of docs/research_log.md)
+# Moments are averaged over neighbouring vertices this number of times. More averagings enlarge the
+# neighbourhood of each vertex. With fewer averagings, the similarity transformations follow the noise of the
+# map. (Entry R22 of docs/research_log.md)
 _AVERAGINGS = 8
 # Cotangent weights of very obtuse triangles are negative, and those of slivers are huge. Weights are limited
 # to the range from 1/_WEIGHT_RANGE to _WEIGHT_RANGE times the median weight.
@@ -24,8 +25,7 @@ _WEIGHT_RANGE = 10.0
 # collapses a region to a point, the scale would otherwise be zero.
 _SCALE_RANGE = 5.0
 # The rotations include a reflection only if the determinants of the moments are clearly negative. The sum of
-# the determinants must be negative, and its absolute value must exceed this fraction of the sum of the cubed
-# Frobenius norms of the moments.
+# the determinants must be below -_FLAT times the sum of the cubed Frobenius norms of the moments.
 _FLAT = 1e-12
 
 
@@ -100,7 +100,7 @@ class Neighborhoods:
 
     @cached_property
     def squared_lengths(self) -> Float64[np.ndarray, " n"]:
-        """The sum of the weighted squared lengths of the edges at each vertex, averaged like the moments."""
+        """For each vertex, the weighted sum of its squared edge lengths, averaged like the moments."""
         of_edges = self.weights * (self.vectors**2).sum(axis=1)
         return self._averaged(self._matrix(of_edges, of_edges).sum(axis=1))
 
@@ -129,10 +129,11 @@ class Neighborhoods:
         return values[self.edges[:, 0]] - values[self.edges[:, 1]]
 
     def similarities(self, positions: Float64[np.ndarray, "n 3"]) -> Similarities:
-        """Fit a similarity transformation to each neighbourhood, from the mesh to other positions.
+        """Fit a similarity transformation to the neighbourhood of each vertex.
 
-        The fit is that of as-rigid-as-possible deformation (Sorkine, Alexa 2007), extended by a scale. If
-        most neighbourhoods are reflected, all rotations include a reflection.
+        The transformations take the scaled mesh to the given positions. The fit is that of
+        as-rigid-as-possible deformation (Sorkine, Alexa 2007), extended by a scale. If most neighbourhoods
+        are reflected, all rotations include a reflection.
         """
         components = zip(self.components, self.component_sums.T, strict=True)
         columns = [total[:, None] * positions - matrix @ positions for matrix, total in components]
@@ -148,10 +149,10 @@ class Neighborhoods:
         return Similarities(hand * rotations, np.clip(scales, 1 / _SCALE_RANGE, _SCALE_RANGE))
 
     def divergence(self, similarities: Similarities) -> Float64[np.ndarray, "n 3"]:
-        """Return the weighted sum of the transformed vectors of the edges at each vertex.
+        """Return, for each vertex, the weighted sum of its transformed edge vectors.
 
-        Each edge vector is transformed by the mean of the transformations of its ends, and points to the
-        vertex at which it is summed.
+        The edge vectors point to the vertex. Each edge vector is transformed by the mean of the
+        transformations at both ends of the edge.
         """
         matrices = similarities.rotations * similarities.scales[:, None, None]
         sums = np.zeros((len(matrices), 3))

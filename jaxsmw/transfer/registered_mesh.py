@@ -29,19 +29,19 @@ _STIFFNESS_OF_MAPS = 0.01
 
 
 class _Round(NamedTuple):
-    """Successive deformations, each followed by a reduction of weights where faces are flipped.
+    """A sequence of deformations. After each deformation, weights are reduced where faces are flipped.
 
     **Attributes:**
 
-    - `deformations`: the largest number of deformations. A round that does not pull ends earlier if no face
-      is flipped.
+    - `deformations`: the largest number of deformations. The round ends earlier if no face is flipped, and if
+      nothing is pulled or drawn to the target.
     - `factor`: the factor by which weights at flipped faces and at their neighbours are multiplied.
     - `neighbors`: the largest distance to these neighbours, in edges.
-    - `pull`: if positive, the round moves regions with reduced weights to their nearest points of the target,
-      and along the target halfway back to their points of the map. The number is the weight of these
-      positions, relative to the weight of the map elsewhere.
-    - `cover`: if positive, the round draws the source to vertices of the target that it does not reach. The
-      number is the weight of these vertices, relative to the weight of the map elsewhere.
+    - `pull`: if positive, the round pulls vertices with reduced weights to the target. The goal of a vertex
+      is its nearest point of the target, moved along the target halfway to the vertex's point of the map. The
+      number is the weight of these goals, relative to the weight of the map elsewhere.
+    - `cover`: if positive, the round draws the source to vertices of the target that the source does not
+      reach. The number is the weight of these vertices, relative to the weight of the map elsewhere.
     """
 
     deformations: int
@@ -59,10 +59,11 @@ _ROUNDS = (
     _Round(3, 0.4, 1, pull=0.2),
     _Round(6, 0.4, 1, cover=0.3),
 )
-# A map is probably wrong if more than this share of the triangles is flipped, and if angles change by more
-# than this number of degrees in the mean. (Entry R35)
+# A map is probably wrong if two conditions hold: the share of flipped triangles exceeds _MANY_FLIPPED, and
+# the mean change of angles exceeds _MANY_DEGREES. (Entry R35)
 _MANY_FLIPPED, _MANY_DEGREES = 0.003, 16.0
-# The residual at which the linear solver stops, relative to the right side.
+# The linear solver stops when the norm of the residual is at most this fraction of the norm of the right-hand
+# side.
 _TOLERANCE = 1e-5
 # A deformation keeps positions whose errors are at most this fraction of the stiffness. (Entry R22)
 _KEPT = 0.03
@@ -77,11 +78,11 @@ class RegisteredMesh:
     - `mesh_x`, `mesh_y`: the source X (m vertices, f faces) and the target Y.
     - `vertices`: the positions of X's vertices on Y (m, 3), in Y's unit of length. Together with the faces of
       X, they form the registered mesh.
-    - `similarities`: the rotation and the scale of each vertex's neighbourhood. They take X, in X's unit of
-      length, to the registered mesh, in Y's unit.
+    - `similarities`: the rotation and the scale of each vertex's neighbourhood. These transformations take X
+      to the registered mesh. The scales include the change from X's unit of length to Y's.
 
-    An unreferenced vertex of X has the similarity of the nearest referenced vertex and moves with it. A
-    duplicate that welding replaced has exactly the position of its twin.
+    An unreferenced vertex of X moves with the nearest referenced vertex. Both vertices have the same
+    similarity transformation. A duplicate that welding replaced has exactly the position of its twin.
     """
 
     mesh_x: Mesh
@@ -107,12 +108,12 @@ class RegisteredMesh:
 
     @cached_property
     def _normals(self) -> Float64[np.ndarray, "m 3"]:
-        """The normals of the registered mesh, on the side of the normals of Y."""
+        """The vertex normals of the registered mesh, oriented like the normals of Y."""
         return self._hand * self.mesh.vertex_normals
 
     @property
     def _hand(self) -> float:
-        """1, or -1 if X and Y are of opposite hands."""
+        """-1 if the similarity transformations include a reflection, otherwise 1."""
         return float(np.sign(np.linalg.det(self.similarities.rotations[0])))
 
     @cached_property
@@ -257,8 +258,9 @@ def register_mesh(
     stiffness times the squared changes of edge vectors. Before the changes are measured, the edge vectors of
     X are rotated and scaled with their neighbourhoods. The rotations are those of as-rigid-as-possible
     deformation (Sorkine, Alexa 2007); jaxsmw adds the scales. Where faces would flip, the map has less
-    weight, and vertices are also drawn to the nearest points of Y. Where the deformation does not reach Y,
-    such as at the tips of ears, its nearest points are drawn to Y.
+    weight, and vertices are also drawn to the nearest points of Y. Some vertices of Y, such as the tips of
+    ears, are not reached by the deformation. The nearest points of X are drawn to these vertices, unless
+    `scale` is given and X has less area than Y.
 
     **Arguments:**
 
@@ -297,7 +299,7 @@ def register_mesh(
     targets, positions, similarities = mapped.copy(), mapped, around.similarities(mapped)
     weights, number = areas.copy(), 0
     normals = _normals(mesh_x.vertices, mesh_x)
-    # A part does not cover a full shape.
+    # A partial shape X cannot cover all of Y.
     part = scale is not None and around.size**2 * mesh_x.area < mesh_y.area
     for of_round in _ROUNDS:
         loose = weights < areas
@@ -313,7 +315,7 @@ def register_mesh(
             if of_round.pull:
                 nearest, _ = surface.nearest(positions[loose])
                 targets[loose] = _halfway(nearest, mapped[loose], target)
-            if of_round.cover and step % 2 == 0:  # the search takes as long as a deformation
+            if of_round.cover and step % 2 == 0:  # the search is slow
                 attraction = uncovered.attraction(positions, of_round.cover * weights / before)
             positions = _follow(
                 around, similarities, weights, targets, stiffness * root, positions, attraction
@@ -377,12 +379,12 @@ def _follow(
     positions: Float64[np.ndarray, "m 3"],
     attraction: Attraction | None = None,
 ) -> Float64[np.ndarray, "m 3"]:
-    """Return the positions that follow weighted targets and edge vectors in the least-squares sense.
+    """Return the least-squares solution for vertex positions with given targets and edge vectors.
 
-    The edge vectors are those of X, transformed by `similarities`. An attraction adds the weighted squared
-    distances between its points and its vertices of the target. The linear system is solved for the
-    vertices at which the given positions are not accurate, and for their neighbours. All other vertices stay
-    where they are. If their positions are no longer accurate then, the next deformation moves them.
+    The targets have weights. The edge vectors are those of X, transformed by `similarities`. `attraction`
+    adds weighted squared distances from points of X to uncovered vertices of Y. The linear system is solved
+    for the vertices at which the given positions are not accurate, and for their neighbours. All other
+    vertices stay where they are. If these positions become inaccurate, the next deformation moves them.
     """
     system = csr_array(diags_array(weights) + stiffness**2 * around.laplacian)
     right = stiffness**2 * around.divergence(similarities) + weights[:, None] * targets
@@ -390,8 +392,8 @@ def _follow(
         system, right = system + attraction.matrix(), right + attraction.right_side()
     residual = right - system @ positions
     # Without an attraction, the row sums of the system are `weights`, and all entries off the diagonal are
-    # negative. Therefore the error of every position is at most the largest quotient of a residual and its
-    # weight. The criterion stays correct where small weights make the system ill-conditioned.
+    # negative. Therefore the error of every position is at most the largest ratio of a residual to the weight
+    # of the same vertex. The criterion stays correct where small weights make the system ill-conditioned.
     moving = (np.abs(residual).max(axis=1) > _KEPT * stiffness * weights).astype(float)
     rows = np.flatnonzero(around.averaging @ moving)
     if not len(rows):
@@ -403,7 +405,7 @@ def _follow(
     moved = positions.copy()
     with one_blas_thread():
         for axis, tolerance in enumerate(tolerances):
-            # An absolute tolerance stops at the same accuracy if few vertices move.
+            # With an absolute tolerance, the accuracy does not depend on the number of vertices that move.
             found, unfinished = cg(
                 system, residual[:, axis], rtol=0, atol=tolerance, M=preconditioner, maxiter=10 * len(weights)
             )
@@ -418,7 +420,7 @@ def _follow(
 def _halfway(
     nearest: SurfacePoints, mapped: Float64[np.ndarray, "p 3"], mesh_y: Mesh
 ) -> Float64[np.ndarray, "p 3"]:
-    """Move points of Y halfway to other positions, in the planes of their triangles.
+    """Move each point of Y halfway to a given position, in the plane of the point's triangle.
 
     The nearest point alone would let a vertex slide along the surface, away from its point of the map.
     """
@@ -438,7 +440,7 @@ def _flipped_faces(
     positions: Float64[np.ndarray, "m 3"],
     similarities: Similarities,
 ) -> Bool[np.ndarray, " f"]:
-    """Return True for faces whose normal opposes the rotated normal of the source's face.
+    """Return a mask, True for flipped faces; see `RegisteredMesh.flipped_faces`.
 
     `normals` are the normals of the source's faces.
     """
@@ -450,7 +452,7 @@ def _flipped_faces(
 
 
 def _normals(vertices: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.ndarray, "f 3"]:
-    """Return the face normals of a mesh at other vertex positions. The normals are not unit vectors."""
+    """Return the face normals of a mesh with the given vertex positions. The normals are not unit vectors."""
     first, second, third = mesh.faces.T
     origins = vertices[first]
     return np.cross(vertices[second] - origins, vertices[third] - origins)

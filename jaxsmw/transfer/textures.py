@@ -18,7 +18,7 @@ from jaxsmw.transfer.registered_mesh import RegisteredMesh
 # Texture vertices of one vertex are merged if their coordinates are equal after rounding to a grid. The
 # spacing of the grid is this fraction of the extent of all texture coordinates.
 _SAME = 1e-7
-# The number of points that walk over the mesh at the same time, which limits the memory.
+# At most this number of points walk over the mesh at the same time. A limit is necessary to save memory.
 _BLOCK = 20_000
 
 
@@ -68,7 +68,7 @@ def transfer_texture(
     at_corners = np.einsum("pk,pkx->px", weights[best], uv[surface.faces[found[best]]])
 
     grid = _SAME * max(float(np.ptp(uv, axis=0).max()), np.finfo(float).tiny)
-    # The shift keeps regular coordinates, such as multiples of 1/8, away from the limits of rounding.
+    # The shift keeps regular coordinates, such as multiples of 1/8, away from the borders of grid cells.
     keys = np.floor((at_corners - uv.min(axis=0)) / grid + np.sqrt(0.1)).astype(np.int64)
     keys = np.column_stack([faces[shown].ravel(), keys])
     _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -141,7 +141,8 @@ class _CutSurface:
         """Walk from triangles towards goals without crossing a seam.
 
         Each step leads to the neighbour nearest to the goal. Return the last triangle (p,), the barycentric
-        weights of its point nearest to the goal (p, 3), and the distance to this point (p,).
+        weights of this triangle's point nearest to the goal (p, 3), and the distance of this point from the
+        goal (p,).
         """
         found, weights, distances = start.copy(), np.empty((len(goals), 3)), np.empty(len(goals))
         for first in range(0, len(goals), _BLOCK):
@@ -160,9 +161,10 @@ class _CutSurface:
     def _nearest_neighbor(
         self, goals: Float64[np.ndarray, "p 3"], triangles: Int64[np.ndarray, " p"]
     ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-        """Return the neighbour of each triangle that is nearest to the triangle's goal.
+        """Return, for each goal and its triangle, the neighbouring triangle that is nearest to the goal.
 
-        Also return the barycentric weights of the neighbour's nearest point, and the distance to this point.
+        Also return the barycentric weights of the neighbour's point nearest to the goal, and the distance of
+        this point from the goal.
         """
         indptr = self.neighbors.indptr.astype(np.int64)
         first, counts = indptr[triangles], indptr[triangles + 1] - indptr[triangles]

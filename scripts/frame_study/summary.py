@@ -114,7 +114,7 @@ class Study:
         return float(np.median(settled[succeeded])) if succeeded.any() else np.nan
 
     def interval(self, variant: Variant | None, data_set: str) -> Interval:
-        """Return the mean paired difference from the default and its interval.
+        """Return the mean paired difference from the default, with its confidence interval.
 
         If there are no measurements, all values are NaN.
         """
@@ -122,9 +122,10 @@ class Study:
         return Interval(np.nan, np.nan, np.nan) if found is None else found.difference
 
     def contrast(self, variant: Variant, reference: Variant, data_set: str) -> str:
-        """Return, as text, the mean difference between two variants over the pairs on which neither failed.
+        """Return a text with the mean difference between the errors of two variants.
 
-        The text also states the number of pairs on which at least one of the variants failed.
+        The mean leaves out pairs on which at least one of the variants failed. The text states the number of
+        these pairs.
         """
         differences = self.errors(variant, data_set) - self.errors(reference, data_set)
         both = np.isfinite(differences)
@@ -132,8 +133,10 @@ class Study:
         return text if both.all() or not both.any() else f"{text}, {np.sum(~both)} failed"
 
     def relative_energy(self, variant: Variant, data_set: str) -> float:
-        """Return the mean energy ratio E(C) / E(0), which is comparable between frames of different
-        heights."""
+        """Return the mean energy ratio E(C) / E(0).
+
+        The ratio is comparable between frames whose filters have different heights.
+        """
         succeeded = np.isfinite(self.errors(variant, data_set))
         energies, of_zero = (
             self.numbers(variant, data_set, name)[succeeded] for name in ("energy", "energy_of_zero")

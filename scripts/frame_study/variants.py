@@ -219,7 +219,10 @@ def refiner(
     *,
     number_of_filters: int,
 ) -> TabulatedPreservation:
-    """Return the refiner of a variant for a pair, with zero filters appended up to `number_of_filters`."""
+    """Return the refiner of a variant for a pair.
+
+    The bank is extended by zero filters until it has `number_of_filters` filters.
+    """
     tables = [tabulate(bank, spectrum, number_of_filters) for spectrum in (spectrum_x, spectrum_y)]
     if variant.update == "projected":
         solution: Solution = NearestOrthogonal(Filtering())
@@ -289,8 +292,9 @@ def least_kernel_eigenvalue(
 ) -> float:
     """Return the ratio of the smallest to the largest eigenvalue of the kernel of a variant.
 
-    The variant multiplies C_0, the unfiltered map from the shape to itself, elementwise by this kernel. Up to
-    rounding, the ratio is nonnegative for every filter bank. The ratio is negative for `band_mask`.
+    The kernel is computed for the pair of a shape with itself. The variant multiplies the unfiltered
+    functional map elementwise by this kernel. Up to rounding, the ratio is nonnegative for every filter bank.
+    The ratio is negative for `band_mask`.
     """
     method = refiner(variant, bank, spectrum, spectrum, number_of_filters=number_of_filters)
     kernel = multiscale_kernel(method.responses_x, method.responses_y)

@@ -66,8 +66,8 @@ class CubicSpline(_LogSpacedDilates):
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets cover
-      the eigenvalues from `lambda_max / ratio` to lambda_max.
+    - `ratio`: the wavelets cover the eigenvalues from `lambda_max / ratio` to lambda_max. The value is a
+      single number above 1, or an array of shape (). The default is 20.
     - `normalize`: whether each wavelet is multiplied by the square root of its scale. This scale is in units
       of 1 / lambda_max. The default is False.
 
@@ -105,8 +105,8 @@ class MexicanHat(_LogSpacedDilates):
     **Arguments:**
 
     - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: a single number above 1, or an array of shape (); by default 20. The wavelets cover
-      the eigenvalues from `lambda_max / ratio` to lambda_max.
+    - `ratio`: the wavelets cover the eigenvalues from `lambda_max / ratio` to lambda_max. The value is a
+      single number above 1, or an array of shape (). The default is 20.
     - `normalize`: whether each wavelet is multiplied by the square root of its scale. This scale is in units
       of 1 / lambda_max. The default is False.
 

@@ -68,8 +68,8 @@ def frame_bounds(
       the default resolution, the relative error is below 1e-5 for the banks of this package with up to 8
       filters.
 
-    **Returns:** A `FrameBounds` with the attributes `lower` and `upper`, the smallest and the largest value
-    of G, as dimensionless arrays of shape ().
+    **Returns:** A `FrameBounds`. Its attributes `lower` and `upper` are the smallest and the largest value of
+    G, as dimensionless arrays of shape ().
 
     **Raises:** `ValueError` if `over` is unknown, if `resolution` is below 2 with `over="interval"`, or if
     the bank returns responses that are not of shape (filters, points).

@@ -12,7 +12,7 @@ from jaxsmw.core.checks import as_parameter
 
 
 class SoftmaxFrame(FilterBank):
-    """A filter bank with trainable filters that is a Parseval frame for all finite parameters.
+    """A filter bank with trainable filters. The bank is a Parseval frame for all finite parameters.
 
     The squared filters are a softmax: `g_l(lambda)² = exp(z_l(lambda)) / sum_j exp(z_j(lambda))`. Each z_l is
     a piecewise linear function of the eigenvalue lambda, with evenly spaced knots from 0 to lambda_max. With
@@ -57,8 +57,8 @@ class SoftmaxFrame(FilterBank):
         - `bank`: any `FilterBank`. Negative responses of the bank become positive, because all filters of a
           `SoftmaxFrame` are positive.
         - `knots`: the number of knots, at least 2. The default is 32.
-        - `floor`: a number in [1e-12, 1), by default 0.01. Responses of the bank whose absolute value is
-          below the floor are replaced by the floor, because a response of zero cannot be learned.
+        - `floor`: a number in [1e-12, 1), by default 0.01. If the absolute value of a response is below the
+          floor, the response is replaced by the floor, because a response of zero cannot be learned.
 
         **Returns:** A `SoftmaxFrame` with logits (filters, knots).
 

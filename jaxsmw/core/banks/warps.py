@@ -91,8 +91,8 @@ class Power(Warp):
     """The warp `(lambda / lambda_max)^exponent` of the eigenvalue axis, for use in `Warped(bank, Power())`.
 
     A call takes points (p,) and a shape's eigenvalues (k,), as for every `Warp`. The call returns the warped
-    points (p,), from 0 to 1. lambda_max is the last eigenvalue. The default exponent 0.5 (the square root)
-    turns eigenvalues into frequencies.
+    points (p,) in [0, 1]. The last eigenvalue is lambda_max. The default exponent 0.5 (the square root) turns
+    eigenvalues into frequencies.
 
     **Arguments:**
 

@@ -75,7 +75,7 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     def active_eigenvectors(
         self, prepared: PreparedT, iteration: Int32[Array, ""]
     ) -> tuple[Bool[Array, " k_x"], Bool[Array, " k_y"]]:
-        """Return two masks, True for the eigenvectors of X (k_x,) and of Y (k_y,) that an iteration uses.
+        """Return masks of the eigenvectors of X (k_x,) and of Y (k_y,). Used eigenvectors are True.
 
         **Arguments:**
 

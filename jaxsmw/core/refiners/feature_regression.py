@@ -42,8 +42,8 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     reverse map, the features of Y are regressed on the features of X in the same way. The argument `levels`
     increases the number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi et al. 2019).
 
-    The method does not assume isometry. Refinement reduces the error of an initial map that is as accurate as
-    a map from `WaveletPreservation`. docs/accuracy.md contains the measurements.
+    The method does not assume isometry. If the initial map is as accurate as a map from
+    `WaveletPreservation`, refinement makes the map more accurate. docs/accuracy.md contains the measurements.
 
     If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape with large residuals receive
     smaller weights (`partial_matching_weights`). A residual is the squared Mahalanobis distance from a vertex
@@ -68,7 +68,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     """
 
     def prepare(self, problem: Problem) -> PreparedFeatures:
-        """Collect the features of all vertices and, if there are samples, of the samples.
+        """Collect the features of all vertices. If there are samples, also collect their features.
 
         **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
         """
@@ -141,15 +141,15 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         """Return dimensionless points (m, d_x) for X and (n, d_x) for Y.
 
         The dimension d_x is the number of features of X. The distance between a point of X and a point of Y
-        is a Mahalanobis distance. This distance compares the features of the vertex of X with the prediction
-        of these features from the vertex of Y.
+        is the Mahalanobis distance between the features of the vertex of X and the features predicted from
+        the vertex of Y.
         """
         return state.forward.embeddings(prepared.x, prepared.all_y)
 
     def _eigenvector_embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """Return the coordinates of the `embeddings` that depend only on eigenvectors: the first k_x.
+        """Return the first k_x coordinates of the `embeddings`, which depend only on eigenvectors.
 
         In these coordinates, the vertices of a patch are close together. The search in patches therefore uses
         only these coordinates.
@@ -173,7 +173,7 @@ class _Features(NamedTuple):
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Features:
         area = jnp.sum(spectrum.vertex_areas)
-        # With this factor, each eigenvector has mean square 1, whatever the unit of length.
+        # The square root of the area scales each eigenvector to mean square 1, whatever the unit of length.
         values = spectrum.eigenvectors * jnp.sqrt(area)
         if spectrum.descriptors is not None:
             values = jnp.concatenate([values, spectrum.descriptors], axis=1)
@@ -202,8 +202,8 @@ class PreparedFeatures(Prepared):
 class Prediction(NamedTuple):
     """A linear prediction of features, for use in a nearest-neighbour search.
 
-    The distance between a query point and a target point is a Mahalanobis distance. This distance compares
-    the features of the query vertex with the prediction of these features from the target vertex.
+    The distance between a query point and a target point is the Mahalanobis distance between the features of
+    the query vertex and the features predicted from the target vertex.
 
     **Attributes:**
 
@@ -250,7 +250,7 @@ class Regression(CoarseToFineState):
 
     @property
     def uncertainty(self) -> Float[Array, ""]:
-        """The mean logarithm of the standard deviation of the residuals, a scalar array; lower is better.
+        """The mean logarithm of the standard deviation of the residuals; lower is better.
 
         The mean is taken over the principal components of the residuals of both predictions. The uncertainty
         is half the sum of the log-determinants of both residual covariances, divided by the number of

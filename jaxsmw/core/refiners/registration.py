@@ -151,7 +151,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     def energy(
         self, prepared: PreparedSurfaces, state: Registered, pointwise_map: Int[Array, " m"]
     ) -> Float[Array, ""]:
-        """Return the `objective` for the pointwise map from which the state was computed."""
+        """Return the `objective` at `pointwise_map`, the map from which the state was computed."""
         return self.objective(prepared, state, pointwise_map)
 
     def embeddings(
@@ -159,19 +159,19 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
         """Return points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
-        The coordinates are weighted positions, normals, eigenfunctions and descriptors. Each row of the first
-        array contains the coordinates of a vertex of X deformed onto Y, followed by the coordinates of the
-        same vertex without deformation. Each row of the second array contains the coordinates of a vertex of
-        Y without deformation, followed by the coordinates of the same vertex deformed onto X. Positions are
+        The coordinates are weighted positions, normals and eigenfunctions, with and without deformation, and
+        then weighted descriptors. In the first array, the coordinates after deformation of X onto Y come
+        first. In the second array, the coordinates after deformation of Y onto X come second. Positions are
         in units of the square root of the area.
         """
         return _product_space(prepared.x, prepared.all_y, state, state.descriptor_weight)
 
 
 class _Surface(NamedTuple):
-    """All vertices or the samples of a shape. Lengths are in units of the square root of the area.
+    """The data of a shape's vertices, either of all vertices or only of the samples.
 
-    `points` contains the positions, normals and eigenfunctions, multiplied by their weights.
+    Positions are in units of the square root of the area. `points` contains the positions, normals and
+    eigenfunctions, multiplied by their weights.
     """
 
     eigenvectors: Float[Array, "n k"]
@@ -217,7 +217,7 @@ class _Surface(NamedTuple):
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
-        """Return a surface that contains only the given vertices (s,), with their spectrum `spectrum`."""
+        """Return the surface restricted to the given vertices (s,), which have the given spectrum."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
@@ -260,9 +260,10 @@ class Deformation(NamedTuple):
 
     **Attributes:**
 
-    - `own`: the coefficients of the surface's positions (k_x, 3), zero for inactive eigenvectors.
-    - `matched`: the coefficients of the positions, normals and eigenfunctions of the matches (k_x, d), zero
-      for inactive eigenvectors.
+    - `own`: the coefficients (k_x, 3) of the surface's positions. Inactive eigenvectors have coefficients of
+      zero.
+    - `matched`: the coefficients (k_x, d) of the positions, normals and eigenfunctions of the matches.
+      Inactive eigenvectors have coefficients of zero.
     - `moments`: the coefficients (k_x, 24) of 24 functions that heat flow has smoothed. The functions are
       positions, matched positions, the products of positions with matched positions, and the products of
       normals with matched normals.
@@ -337,8 +338,8 @@ def _product_space(
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
     """Return points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
-    A vertex x of X and a vertex y of Y have nearby points under two conditions: the deformed x is close to y
-    on Y, and the deformed y is close to x on X.
+    The points of two vertices x and y are close together if the deformed x is close to y on Y, and the
+    deformed y is close to x on X.
     """
     return (
         jnp.concatenate([state.forward.points(x), x.points, weight * x.descriptors], axis=1),

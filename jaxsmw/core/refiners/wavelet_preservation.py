@@ -87,7 +87,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
 
         **Arguments:**
 
-        - `spectrum_x`, `spectrum_y`: source X and target Y.
+        - `spectrum_x`, `spectrum_y`: the spectra of the source X and the target Y.
         - `sampled`: whether the spectra contain samples only.
 
         **Raises:** `ValueError` if the responses of the bank do not have shape (filters, eigenvalues).

@@ -22,14 +22,15 @@ class Solution(eqx.Module, Generic[PreparedT]):
     `Filtering` (the default), `LeastSquares`, `RegularizedLeastSquares` and `NearestOrthogonal`.
 
     A subclass must define `solve(problem, prepared, pointwise_map, previous)`, which returns C (k_out, k_in)
-    and a status code (`RESULTS`). The arguments are the `WaveletProblem` of both shapes, the values that
-    `prepare` returned, the map T: X -> Y, and the functional map of the previous iteration (None in the first
-    iteration). In the pullback convention (the default), C maps functions on Y ("in") to functions on X
-    ("out"). In the pushforward convention, C maps functions on X ("in") to functions on Y ("out").
+    and a status code (`RESULTS`). The argument `problem` is the `WaveletProblem` of both shapes, and
+    `prepared` contains the values that `prepare` returned. The argument `pointwise_map` is the map T: X -> Y.
+    The argument `previous` is the functional map of the previous iteration (None in the first iteration). In
+    the pullback convention (the default), C maps functions on Y ("in") to functions on X ("out"). In the
+    pushforward convention, C maps functions on X ("in") to functions on Y ("out").
 
     A subclass may also define `prepare(problem)`. This method computes, once per refinement, values that
-    `solve` needs in every iteration. The class is generic in the type of these values: `Solution[T]` if their
-    type is T.
+    `solve` needs in every iteration. The class is generic: if these values have the type `Values`, the
+    subclass derives from `Solution[Values]`.
     """
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:
@@ -60,7 +61,8 @@ class Solution(eqx.Module, Generic[PreparedT]):
           filter bank, and the convention of C.
         - `prepared`: the values that `prepare` returned for this problem; None if the subclass does not
           define `prepare`.
-        - `pointwise_map`: T, one 0-based vertex of Y per vertex of X (m,), or a soft map from X to Y.
+        - `pointwise_map`: the map T. It is either an integer array (m,) with one 0-based vertex of Y per
+          vertex of X, or a soft map from X to Y.
         - `previous`: the functional map (k_out, k_in) of the previous iteration, or None in the first
           iteration. An iterative solver can start from this map.
 

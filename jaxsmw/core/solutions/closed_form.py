@@ -43,7 +43,7 @@ class Filtering(Solution[PreparedFiltering]):
     are the filters of the bank. The diagonal matrix Lambda_out contains the eigenvalues of the shape that C
     maps to. The diagonal matrix Lambda_in contains the eigenvalues of the shape that C maps from. The sum
     equals the elementwise product of C_0 and the `multiscale_kernel` of the bank, so no linear system is
-    solved. `Filtering` is a `Solution`, for the argument `solution` of `WaveletPreservation`.
+    solved. Pass a `Filtering` object to `WaveletPreservation` as the argument `solution`.
 
     If the bank is a Parseval frame, C minimises the wavelet-preservation energy in the area norm. In the
     default pullback convention, C is the exact minimiser only if T preserves area; otherwise C is only close
@@ -89,7 +89,7 @@ class NearestOrthogonal(Solution[PreparedT]):
 
     The new map (k_out, k_in) has orthonormal columns, or orthonormal rows if k_out is below k_in. With
     `solution=Filtering()` and the bank `Identity()`, this solution is the update of spectral ICP (Ovsjanikov
-    et al. 2012). `NearestOrthogonal` is a `Solution`, for the argument `solution` of `WaveletPreservation`.
+    et al. 2012). Pass a `NearestOrthogonal` object to `WaveletPreservation` as the argument `solution`.
 
     The status code is that of the other solution. If the other solution's map contains NaN, all entries of
     the new map are NaN.
@@ -122,8 +122,8 @@ class LeastSquares(Solution[None]):
     """The solution that minimises the wavelet-preservation energy exactly, for any frame.
 
     Equation (5) of the MWP paper defines the energy. One Cholesky factorisation of the energy's gram matrix
-    (k_in, k_in) gives the minimiser C (k_out, k_in). `LeastSquares` is a `Solution`, for the argument
-    `solution` of `WaveletPreservation`.
+    (k_in, k_in) gives the minimiser C (k_out, k_in). Pass a `LeastSquares` object to `WaveletPreservation` as
+    the argument `solution`.
 
     `solve` returns C and the status code `RESULTS.successful`, `RESULTS.undetermined_functional_map` or
     `RESULTS.singular_system`. The functional map is undetermined if all filters are zero at an eigenvalue of

@@ -65,8 +65,8 @@ class DescriptorPair(eqx.Module):
       eigenbasis.
 
     The term for descriptor commutativity needs the operators of both shapes. `RegularizedLeastSquares` raises
-    `ValueError` if this term has a weight and an operator array is None. `DescriptorPair.project` computes
-    the operators of both shapes or of neither shape.
+    `ValueError` if this term has a weight but the operators of a shape are None. `DescriptorPair.project`
+    computes the operators of both shapes or of neither shape.
 
     **Raises:** `ValueError` if `coefficients` does not have two dimensions on each shape, or if X and Y have
     different numbers of functions.

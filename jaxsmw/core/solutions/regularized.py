@@ -1,4 +1,4 @@
-"""Iterative minimisation of the wavelet-preservation energy with further terms."""
+"""Iterative minimisation of a sum of the wavelet-preservation energy and other terms."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ def _as_weight(value: ArrayLike | None) -> Array | None:
 
 
 class RegularizedLeastSquares(Solution[None]):
-    """A solution that minimises the wavelet-preservation energy and further terms with an iterative solver.
+    """An iterative solution that minimises a sum of the wavelet-preservation energy and other terms.
 
-    `RegularizedLeastSquares` is a `Solution`, for the argument `solution` of `WaveletPreservation`. The
+    Pass a `RegularizedLeastSquares` object to `WaveletPreservation` as the argument `solution`. The
     functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
     - Wavelet preservation is the energy of equation (5) of the MWP paper.
@@ -65,7 +65,8 @@ class RegularizedLeastSquares(Solution[None]):
     these columns are replaced by k_in equivalent columns. Then `optimistix.least_squares` takes Gauss–Newton
     steps. The linear system of each step is solved by conjugate gradients, without a matrix of size k² x k².
     The solver starts from the functional map of the previous iteration; in the first iteration, it starts
-    from an estimate. C is differentiable, by implicit differentiation at the minimum.
+    from an estimate. C is differentiable: its derivatives are computed by implicit differentiation at the
+    minimum.
 
     The status code of `solve` is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
     `RESULTS.singular_system`, `RESULTS.nonfinite_functional_map` and `RESULTS.solver_not_converged`.
@@ -87,8 +88,8 @@ class RegularizedLeastSquares(Solution[None]):
 
     **Raises:** `ValueError` if a weight is not a single positive number, the tolerance is not positive,
     `max_steps` is below 1, or `norm` is unknown. `ValueError` if neither `wavelet_preservation` nor
-    `descriptor_preservation` has a weight. `ValueError` if `descriptors` is given without a weight for a
-    descriptor term, or if a descriptor term has a weight, but `descriptors` is None. `ValueError` if
+    `descriptor_preservation` has a weight. `ValueError` if `descriptors` is given but neither descriptor term
+    has a weight, or if a descriptor term has a weight but `descriptors` is None. `ValueError` if
     `descriptor_commutativity` has a weight, but the descriptors on X or Y have no operators.
     """
 
@@ -171,8 +172,8 @@ class RegularizedLeastSquares(Solution[None]):
 
         **Arguments:**
 
-        - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`. Give None
-          if the weight `wavelet_preservation` is None, and only then.
+        - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`. The
+          energy must be None if this weight is None. Otherwise the energy is required.
         - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to (k_out,), and of
           the shape that C maps from (k_in,). `descriptors.x` must belong to the shape that C maps to, as in
           the pullback convention.
@@ -181,7 +182,7 @@ class RegularizedLeastSquares(Solution[None]):
 
         **Returns:** The minimiser C (k_out, k_in), and a status code, which is a member of `RESULTS`.
 
-        **Raises:** `ValueError` if an energy is given without a weight or a weight without an energy, or if
+        **Raises:** `ValueError` if only one of `energy` and the weight `wavelet_preservation` is None, or if
         the descriptors and C have different numbers of eigenvectors.
         """
         descriptors = None if self.descriptors is None else (self.descriptors.x, self.descriptors.y)

@@ -5,7 +5,7 @@ The modules of this package are:
 - `base`: the input of a method (`MethodInput`) and the interface of a method (`Method`).
 - `initial_map`: the initial map without refinement.
 - `presets`: this library's own methods.
-- `published_maps`: maps that other programs computed, read from files.
+- `published_maps`: methods that read the maps of other programs from files.
 - `spectral_icp`, `zoomout`, `bcicp`, `cpd`, `partial_functional_maps`: methods by other authors,
   reimplemented here.
 - `peers`: methods of other libraries, if these are installed.

@@ -41,12 +41,13 @@ class MethodInput:
     - `initial_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `samples`: sampled vertices of X (s_x,) and of Y (s_y,) in farthest-point order, for methods that
       iterate on samples.
-    - `reverse_initial_map`: the initial map Y -> X (n,), 0-based vertices of X, for methods whose attribute
-      `both_directions` is True; otherwise None.
+    - `reverse_initial_map`: the initial map Y -> X (n,), 0-based vertices of X, or None. Methods whose
+      attribute `both_directions` is True need this map.
     - `meshes`: the meshes of X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
-    - `partial`: whether X and Y are a partial pair, that is, one shape is a part of the other shape. The
-      spectra of a partial pair are comparable only up to the smaller of the two shapes' largest eigenvalues.
+    - `partial`: whether X and Y are a partial pair, that is, one shape is a part of the other shape. Each
+      spectrum has a largest eigenvalue, and the spectra of a partial pair are comparable only up to the
+      smaller of these two eigenvalues.
     - `prepared`: the `PreparedPair` from which this input was created, for methods that run a preset.
     """
 

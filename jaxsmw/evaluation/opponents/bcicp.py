@@ -84,7 +84,7 @@ class _Surface:
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> _Surface:
-        """Return the surface of a mesh without unreferenced vertices and without masked vertices.
+        """Return the `_Surface` of a mesh. Unreferenced and masked vertices are left out.
 
         **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """

@@ -11,10 +11,10 @@ The embedding of Y (`Phi_Y C^T`, the "centroids") moves smoothly, and the embedd
 stays fixed.
 
 In the statistical model, a data point is uniform noise with probability w. Otherwise the data point is drawn
-from a mixture of isotropic Gaussians around the centroids, which have a common variance s. Vertex areas are
-ignored, so all vertices have equal weight. The displacement of the centroids is a linear combination of
-Gaussian kernels at the initial centroids `Y`. `G` (n, n) is the kernel matrix, and `W` (n, d) contains the
-coefficients of the linear combination. The moved centroids are `T = Y + G W`.
+from a mixture of isotropic Gaussians around the centroids. All Gaussians have the same variance s. Vertex
+areas are ignored, so all vertices have equal weight. The displacement of the centroids is a linear
+combination of Gaussian kernels at the initial centroids `Y`. `G` (n, n) is the kernel matrix, and `W` (n, d)
+contains the coefficients of the linear combination. The moved centroids are `T = Y + G W`.
 
 Expectation maximisation (EM) alternates between two steps. The E-step computes the probability `P_ji` that
 data point i was drawn from the Gaussian around centroid j:
@@ -108,9 +108,9 @@ def coherent_point_drift(
     default, and optionally an approximation of rank sqrt(n). The mean geodesic errors on a real pair with
     5000 vertices show the effect of the rank:
 
-    - with 30 eigenvectors, 22.4 x 10^-3 at rank 70, and 20.8 x 10^-3 at the ranks 300 and 1200;
-    - with 100 eigenvectors, 17.2 x 10^-3 at rank 150, 11.4 x 10^-3 at rank 600, and 11.3 x 10^-3 at rank
-      1200.
+    - With 30 eigenvectors, the error is 22.4 x 10^-3 at rank 70, and 20.8 x 10^-3 at the ranks 300 and 1200.
+    - With 100 eigenvectors, the error is 17.2 x 10^-3 at rank 150, 11.4 x 10^-3 at rank 600, and 11.3 x 10^-3
+      at rank 1200.
 
     **Arguments:**
 

@@ -46,8 +46,8 @@ This implementation differs from the paper in the following points.
   v. In the paper, xi(v) vanishes unless v is near 1/2.
 - **Weights.** Y has area 1, and column norms are averaged instead of summed. The units of the weights
   therefore differ from those in the paper. The weights mu_1 = mu_3 = 1 and mu_2 = 100 have the published
-  values, and the fidelity term is multiplied by `FIDELITY`. `FIDELITY` and mu_5 were chosen on four real
-  pairs. No other value of mu_4 was tested.
+  values, and the fidelity term is multiplied by `FIDELITY` in the minimisation over C. `FIDELITY` and mu_5
+  were chosen on four real pairs. No other value of mu_4 was tested.
 - **Recovery.** The nearest-neighbour search includes all vertices of Y. A search among only the vertices of
   the region gave the same maps, or worse maps if the region was wrong.
 - **Solver.** Limited-memory BFGS (L-BFGS) of the library optimistix minimises the energies in a bounded
@@ -171,8 +171,8 @@ class PartialMap(eqx.Module):
 
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y; -1 everywhere if the method failed.
     - `functional_map`: C (r, k_Y) with orthonormal rows, where r is the smaller of k_X and k_Y.
-    - `region`: eta(v) (n,), near 1 inside the region that X covers and near 0 outside; 0 at masked vertices
-      of Y.
+    - `region`: eta(v) (n,), near 1 inside the region that X covers and near 0 outside. The value at masked
+      vertices of Y is 0.
     - `result`: the status code, a member of `RESULTS`.
     """
 
@@ -198,11 +198,11 @@ def partial_functional_map(
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, cut to their common range of eigenvalues
-      (`jaxsmw.pair.common_range`), in the unit of length in which Y has area 1. After this cut, the number
-      k_X of eigenvectors of X is the rank r of the paper. If k_X is larger than k_Y, only the first k_Y
-      eigenvectors of X are used. Both spectra need the same number of descriptors. The descriptors of X and Y
-      must be comparable, and scaled to mean square 1.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, in the unit of length in which Y has area 1. Both
+      spectra must be cut to their common range of eigenvalues (`jaxsmw.pair.common_range`). After this cut,
+      the number k_X of eigenvectors of X is the rank r of the paper. If k_X is larger than k_Y, only the
+      first k_Y eigenvectors of X are used. Both spectra need the same number of descriptors. The descriptors
+      of X and Y must be comparable, and scaled to mean square 1.
     - `gradient_y`: the gradient of functions on Y, in the unit of length in which Y has area 1.
     - `pointwise_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `iterations`: the number of iterations, at least 1. Each iteration minimises the energy over C, then
@@ -281,12 +281,12 @@ class _Energies(eqx.Module):
         return cls(spectrum_x, spectrum_y, gradient_y, dual_y, coefficients_x, _functions(spectrum_y))
 
     def covered(self, c: Float[Array, "r k_y"]) -> Float[Array, " n"]:
-        """Return the function on Y that corresponds to the constant 1 on X under `c`, clipped to [0, 1]."""
+        """Map the constant function 1 on X to Y by `c`, and clip the result to [0, 1]."""
         coefficients = product(c.T, self.coefficients_x[:, -1])
         return jnp.clip(product(self.spectrum_y.eigenvectors, coefficients), 0, 1)
 
     def inside(self, membership: Float[Array, " n"]) -> Float[Array, "k_y functions"]:
-        """Return B(v), the coefficients of the functions on Y after restriction to the region."""
+        """Return B(v), the coefficients of the product of eta(v) and the functions on Y."""
         return product(self.dual_y.T, eta(membership)[:, None] * self.functions_y)
 
     def best_map(self, c: Float[Array, "r k_y"], membership: Float[Array, " n"]) -> Float[Array, "r k_y"]:
@@ -342,10 +342,11 @@ def fidelity(
     coefficients_x: Float[Array, "k_x functions"],
     coefficients_y: Float[Array, "k_y functions"],
 ) -> Float[Array, ""]:
-    """Return the fidelity term `||C A - B||_{2,1}`, with column norms averaged and smoothed at zero.
+    """Return the fidelity term, which averages the column norms of `C A - B`.
 
     The last column of the matrix `C A - B` belongs to the constant function, and each other column belongs to
     a descriptor. The fidelity term is the norm of the last column plus the mean norm of the other columns.
+    The norms are smoothed at zero.
 
     **Arguments:**
 
@@ -357,7 +358,7 @@ def fidelity(
 
 
 def map_energy(functional_map: Float[Array, "k_x k_y"], weights: Float[Array, "k_x k_y"]) -> Float[Array, ""]:
-    """Return the energy that regularises the functional map: the weighted terms of mu_1, mu_2 and mu_3.
+    """Return the sum of the terms with the weights mu_1, mu_2 and mu_3, which regularise the functional map.
 
     These terms keep the large entries of C near the slanted diagonal, and keep the rows of C nearly
     orthonormal.
@@ -383,7 +384,7 @@ def region_energy(
     spectrum_y: Spectrum,
     gradient_y: SurfaceGradient,
 ) -> Float[Array, ""]:
-    """Return the energy that regularises the region: the weighted terms of mu_4 and mu_5.
+    """Return the sum of the terms with the weights mu_4 and mu_5, which regularise the region.
 
     The term with the weight mu_4 keeps the area of the region close to the area of X. The term with the
     weight mu_5 keeps the boundary of the region short.

@@ -83,7 +83,7 @@ class _Shape:
 
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Shape:
-        """Return a spectrum without padding and without unreferenced vertices."""
+        """Convert a spectrum. Padding and unreferenced vertices are left out."""
         used = np.flatnonzero(spectrum.mask)
         arrays = spectrum.eigenvalues, spectrum.eigenvectors[used], spectrum.vertex_areas[used]
         return cls(used, *(np.asarray(array, np.float64) for array in arrays))
@@ -141,6 +141,6 @@ _STEPS = (LAST_EIGENVECTORS - FIRST_EIGENVECTORS) // ZOOMOUT_STEP
 
 
 def installed_peers() -> dict[str, Method]:
-    """Return a dictionary from name to method, with the methods whose packages are installed."""
+    """Return the methods whose packages are installed, as a dictionary from name to method."""
     peers: dict[str, Peer] = {"pyfm-zoomout": PyFM(), "geomfum-zoomout": Geomfum()}
     return {name: peer for name, peer in peers.items() if find_spec(peer.package)}

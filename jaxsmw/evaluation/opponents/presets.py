@@ -3,7 +3,7 @@
 MWP is Algorithm 1 of Hu, Li, Liu, Liu, *Efficient deformable shape correspondence via multiscale spectral
 manifold wavelets preservation*, CVPR 2021. `MWP` has the settings of the paper: 100 eigenvectors, a Meyer
 frame of 6 filters, and 3 iterations. `MWP_SAMPLED` has the same settings, but iterates on 500 samples of each
-shape, like the fast variant of the paper's authors.
+shape. The authors of the paper have a similar fast variant.
 """
 
 from __future__ import annotations

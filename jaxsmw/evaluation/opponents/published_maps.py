@@ -1,4 +1,4 @@
-"""Maps that another program computed, read from files named `X_Y.map`."""
+"""Methods that read the maps of other programs from files named `X_Y.map`."""
 
 from __future__ import annotations
 

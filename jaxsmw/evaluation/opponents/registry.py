@@ -44,7 +44,7 @@ def known_methods() -> dict[str, Method]:
 
 
 def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
-    """Return a dictionary from name to method, with the known methods that can match all pairs."""
+    """Return the known methods that can match all pairs, as a dictionary from name to method."""
     return {name: method for name, method in known_methods().items() if method.suits(pairs)}
 
 

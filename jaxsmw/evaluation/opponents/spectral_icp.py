@@ -7,7 +7,7 @@ and then searches for nearest neighbours. `SPECTRAL_ICP` and `NO_FILTER` run in 
 with 100 eigenvectors, like MWP.
 
 - `SPECTRAL_ICP`: spectral ICP with 10 iterations.
-- `NO_FILTER`: MWP without filters, with 3 iterations like MWP.
+- `NO_FILTER`: the 3 iterations of MWP, without filters.
 """
 
 from __future__ import annotations

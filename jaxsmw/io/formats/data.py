@@ -90,9 +90,10 @@ class MeshData:
     - `blend_shapes`: a dictionary from the names of blend shapes (morph targets) to displacements (n, 3) of
       the vertices, in the unit of the vertices.
     - `skin`: a `Skin`, or None.
-    - `label_names`: a dictionary from names in `vertex_data` or `face_data` to the names of the labels 0, 1,
-      … in the array. For example, `face_data["group"]` of an OBJ file contains the number of each triangle's
-      group, and `label_names["group"]` contains the names of all groups.
+    - `label_names`: a dictionary for arrays of labels 0, 1, … in `vertex_data` or `face_data`. Its keys are
+      the names of these arrays, and its values are tuples of the names of the labels. For example,
+      `face_data["group"]` of an OBJ file contains the number of each triangle's group, and
+      `label_names["group"]` contains the names of all groups.
 
     **Raises:** `InputError` if an array has a wrong length or type, an index is out of range, or a
     displacement, weight or texture coordinate is not finite.
@@ -129,7 +130,7 @@ class MeshData:
 
     @property
     def has_attributes(self) -> bool:
-        """Whether there are data besides positions and normals, which `transfer_attributes` can transfer."""
+        """Whether there are data besides positions and normals. `transfer_attributes` can transfer them."""
         return bool(
             {*self.vertex_data} - {NORMALS}
             or self.face_data
@@ -243,12 +244,12 @@ class Written(NamedTuple):
 
 
 def always(name: str, values: Any) -> bool:
-    """Return True: the format can hold every element of an attribute (an argument for `omissions`)."""
+    """Return True, because the format can hold every element of an attribute; see `omissions`."""
     return True
 
 
 def never(name: str, values: Any) -> bool:
-    """Return False: the format can hold no element of an attribute (an argument for `omissions`)."""
+    """Return False, because the format can hold no element of an attribute; see `omissions`."""
     return False
 
 
@@ -305,7 +306,8 @@ def texture_of_corners(
     """Return texture vertices, and the texture vertex of each corner, given the coordinates of all corners.
 
     Two corners share a texture vertex if they belong to the same vertex and have equal texture coordinates.
-    The texture vertices are numbered in the order of their vertices. Corners at NaN have no texture vertex.
+    The texture vertices are numbered in the order of their vertices. A corner has no texture vertex if its
+    texture coordinates are NaN.
     """
     known = np.isfinite(at_corners).all(axis=1)
     rows = np.column_stack([corners, at_corners])[known]

@@ -24,12 +24,12 @@ _IGNORED = re.compile(r"POSITION|NORMAL|TANGENT|TEXCOORD_0|(JOINTS|WEIGHTS)_\d+"
 
 
 def parse_gltf(data: bytes, folder: Path) -> Polygons:
-    """Parse a JSON file. Its buffers are data URIs, or files in `folder` or below."""
+    """Parse a `.gltf` file, which is JSON. The buffers are data URIs, or files in `folder` or below."""
     return _Scene(Document(data, folder)).polygons()
 
 
 def parse_glb(data: bytes) -> Polygons:
-    """Parse a binary file, which contains its buffer."""
+    """Parse a `.glb` file, which is binary and contains the buffer."""
     if data[:4] != b"glTF":
         raise InputError("does not begin with glTF: export the mesh again as a .glb file.")
     return _Scene(Document(data, None)).polygons()
@@ -39,8 +39,8 @@ def parse_glb(data: bytes) -> Polygons:
 class _Part:
     """Vertices and their data, from one primitive or from several primitives with the same attributes.
 
-    `joints` (n, k) contains the joints of each vertex, as numbers of nodes. `weights` (n, k) contains the
-    weights of these joints.
+    `joints` (n, k) contains the joints of each vertex, as node indices. `weights` (n, k) contains the weights
+    of these joints.
     """
 
     vertices: np.ndarray
@@ -200,7 +200,7 @@ class _Scene:
     def _skin(
         self, attributes: dict[str, Any], nodes: list[Any] | None, n: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the joints of each vertex, as numbers of nodes, and their weights.
+        """Return the joints of each vertex, as node indices, and the weights of these joints.
 
         Both arrays have the shape (n, 4 s) for s sets of attributes JOINTS_i and WEIGHTS_i.
         """
@@ -223,7 +223,7 @@ class _Scene:
         return joints, weights
 
     def _faces(self, primitive: dict[str, Any], part: _Part, is_mirrored: bool) -> np.ndarray:
-        """Return the triangles of a primitive (f, 3), as vertices of the joined mesh."""
+        """Return the triangles of a primitive (f, 3), as vertex indices of the joined mesh."""
         n, mode = len(part.vertices), primitive.get("mode", _TRIANGLES)
         if "indices" in primitive:
             values, _ = self.document.accessor(primitive["indices"], (1,))
@@ -306,7 +306,7 @@ class _Scene:
         return coordinates, number[corners]
 
     def _shapes(self, n: int) -> dict[str, np.ndarray]:
-        """Return all blend shapes. A part without a blend shape does not move."""
+        """Return all blend shapes. If a part lacks a blend shape, its displacements are zero."""
         names = list(dict.fromkeys(name for part in self.parts for name in part.shapes))
         if len(names) * n > LARGEST_SHAPES:
             raise InputError("has too many blend shapes for its vertices: export fewer blend shapes.")

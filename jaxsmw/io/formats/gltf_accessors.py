@@ -204,9 +204,9 @@ class Document:
     def accessor(
         self, index: Any, columns: tuple[int, ...], rows: int | None = None
     ) -> tuple[np.ndarray, bool]:
-        """Return the numbers of an accessor (rows, columns), and whether they are fractions.
+        """Return the numbers of an accessor (rows, columns), and whether they are stored fractions.
 
-        Fractions are integers that `as_floats` divides by the largest integer of their type.
+        A fraction is stored as an integer, which `as_floats` divides by the largest integer of its type.
 
         **Arguments:**
 
@@ -224,7 +224,7 @@ class Document:
         if "bufferView" in description:
             offset = self.integer(description, "byteOffset", 0)
             values = self.view(description["bufferView"], offset, count, kind, width)
-        elif rows is None:  # without data, the number of elements has no limit
+        elif rows is None:  # without data, an accessor could declare any number of elements
             raise InputError(f"accessor {index} has no buffer view, {DAMAGED}")
         else:
             values = np.zeros((count, width), kind)
@@ -250,7 +250,7 @@ class Document:
 def as_floats(values: np.ndarray, is_fraction: bool) -> np.ndarray:
     """Return numbers of an accessor as float64.
 
-    If the numbers are fractions, they are divided by the largest integer of their type.
+    A fraction is stored as an integer, which is divided by the largest integer of its type.
     """
     if not is_fraction:
         return values.astype(np.float64)

@@ -42,7 +42,7 @@ def format_glb(data: MeshData) -> Written:
 
 
 class _File:
-    """The JSON part and the buffer of a file with one mesh of one primitive."""
+    """The JSON part and the buffer of a file. The file contains one mesh, which has one primitive."""
 
     def __init__(self, data: MeshData) -> None:
         self.data = data
@@ -108,7 +108,7 @@ class _File:
         order = np.argsort(-np.abs(weights), axis=1, kind="stable")
         used = max(int((weights != 0).sum(axis=1).max()), 1)
         order = order[:, : 4 * -(-used // 4)]
-        # Joints without weight must have the number 0, and the number of columns is a multiple of four.
+        # In glTF, joints without weight must have the number 0. Zeros fill the last set of four columns.
         largest = np.take_along_axis(weights, order, axis=1)
         columns = -order.shape[1] % 4
         joints = np.pad(np.where(largest != 0, order, 0), ((0, 0), (0, columns)))
@@ -132,7 +132,7 @@ class _File:
         self.json["skins"] = [{"joints": nodes, "inverseBindMatrices": len(self.json["accessors"]) - 1}]
 
     def view(self, values: np.ndarray, target: int | None = None) -> int:
-        """Add a buffer view, whose rows begin at multiples of four bytes."""
+        """Add a buffer view. In views of vertex data, each row begins at a multiple of four bytes."""
         rows = values.reshape(len(values), -1)
         width = rows.dtype.itemsize * rows.shape[1]
         stride = width + -width % 4 if target == _VERTICES else width
@@ -190,8 +190,8 @@ def _split(
 ) -> tuple[Int64[np.ndarray, " s"], Int64[np.ndarray, " s"], Int64[np.ndarray, "f 3"]]:
     """Split vertices along texture seams, because glTF has one texture vertex per vertex.
 
-    Return the vertex and the texture vertex (-1 for none) of each new vertex, and the faces as new vertices.
-    Texture vertices without faces belong to vertex 0.
+    Return the vertex and the texture vertex (-1 for none) of each new vertex. Return also the faces, as
+    indices of new vertices. Texture vertices without faces belong to vertex 0.
     """
     n = len(data.mesh.vertices)
     if data.texture is None:
@@ -199,7 +199,7 @@ def _split(
     t = len(data.texture[0])
     pairs = np.column_stack([data.faces.ravel(), data.texture[1].ravel()])
     alone = np.setdiff1d(np.arange(n), data.faces)
-    # Without seams, texture vertices have the numbers of their vertices.
+    # Without seams, texture vertex i belongs to vertex i.
     pairs = np.vstack([pairs, np.column_stack([alone, alone if t == n else np.full(len(alone), -1)])])
     unused = np.setdiff1d(np.arange(t), pairs[:, 1])
     pairs = np.vstack([pairs, np.column_stack([np.zeros_like(unused), unused])])

@@ -89,9 +89,9 @@ def _arrays(data: bytes) -> dict[str, np.ndarray]:
 
 
 def check_header(stream: Any, size: int) -> None:
-    """Refuse an array that declares more numbers than its member of the archive contains.
+    """Check that the header of an array declares at most `size` bytes and no Python objects.
 
-    **Raises:** `ValueError` for such an array.
+    **Raises:** `ValueError` if the header declares more bytes, a negative length or Python objects.
     """
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0

@@ -13,7 +13,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.io.formats.data import COLORS, MeshData, Polygons, Written, always, is_color, omissions
 from jaxsmw.io.formats.lines import excerpt, numbers, polygon_lines, text
 
-# The names of labels, and the statements that become these labels. A statement applies to all faces after it.
+# The name of each label, and its keyword in OBJ files. A statement applies to all faces after it.
 _LABELS = {"group": "g", "object": "o", "material": "usemtl"}
 _NO_NAME = "default"
 
@@ -81,7 +81,7 @@ def _texture(
     content: str, lines: Sequence[str], sizes: np.ndarray, face_at: Callable[[], list[int]]
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the texture coordinates, and the texture vertex of each corner (-1 for none)."""
-    if not re.search(r"[^/\s]/[^/\s]", "\n".join(lines)):  # no corner vertex/texture, only vertex//normal
+    if not re.search(r"[^/\s]/[^/\s]", "\n".join(lines)):  # no corner has a texture vertex
         return None
     # A corner begins with the number of its vertex.
     words = [word.split("/") for line in lines for word in line.split() if word[0] != "/"]
@@ -129,7 +129,7 @@ def _labels(
 
 
 def _decoded(name: str) -> str:
-    """Decode a name again as UTF-8 if its bytes, which were decoded as Latin-1, are valid UTF-8."""
+    """Decode a name as UTF-8 if its bytes are valid UTF-8. The file was decoded as Latin-1 before."""
     try:
         return name.encode("latin-1").decode("utf-8")
     except UnicodeDecodeError:

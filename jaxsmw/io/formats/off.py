@@ -58,9 +58,10 @@ def _within(corners: np.ndarray, n: int) -> bool:
 
 
 def _vertex_data(lines: list[str], keyword: str) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-    """Return normals and colours, and texture coordinates, from the columns after the positions.
+    """Return the vertex data (normals and colours) and the texture coordinates.
 
-    If a line has fewer numbers than the keyword announces, all columns after the positions are ignored.
+    They are read from the columns after the positions. These columns are ignored if their number in any line
+    differs from what the keyword announces.
     """
     first = len(lines[0].split()) if keyword and lines else 0
     normals, coordinates = 3 * ("N" in keyword), 2 * ("ST" in keyword)
@@ -128,7 +129,7 @@ _NONE = np.empty(0)
 
 
 def _with_colors(lines: list[str], colors: Float64[np.ndarray, "rows c"] | np.ndarray) -> list[str]:
-    """Append colours with an alpha component to lines."""
+    """Append a colour to each line. Colours without an alpha component become opaque."""
     if colors.shape[1] == 3:
         opaque = np.full((len(colors), 1), 255 if colors.dtype == np.uint8 else 1.0, colors.dtype)
         colors = np.hstack([colors, opaque])

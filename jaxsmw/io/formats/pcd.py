@@ -21,7 +21,7 @@ _PADDING = "_"
 
 
 class _Header(NamedTuple):
-    """A record type with the fields of a point, the number of points, and the encoding of the points."""
+    """The header of a file. `record` is the record type of a point."""
 
     record: np.dtype
     points: int

@@ -37,7 +37,7 @@ _NAMES = {
     **{"u4": "unsigned_int", "i8": "vtktypeint64", "u8": "vtktypeuint64", "f4": "float", "f8": "double"},
 }
 _KINDS = {"VERTICES": VERTEX, "LINES": LINE, "POLYGONS": POLYGON, "TRIANGLE_STRIPS": STRIP}
-# Attributes whose first line does not declare the number of columns, and their numbers of columns.
+# The number of columns of each attribute whose first line does not declare it.
 _COLUMNS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1}
 _COLUMNS["EDGE_FLAGS"] = 1
 
@@ -91,7 +91,7 @@ class _File:
         )
 
     def statement(self, words: list[str]) -> None:
-        """Read one statement, which begins with the given words, and the numbers after it."""
+        """Read a statement and the numbers after it. `words` contains the words of the first line."""
         keyword = words[0].upper()
         match [keyword, *words[1:]]:
             case ["DATASET", kind]:
@@ -241,7 +241,7 @@ class _File:
                 self.truncated(count)
 
     def take_cells(self, kind: int, count: int, size: int) -> Cells:
-        """Return cells. Since version 5, files store offsets and corners; before, sizes with corners."""
+        """Return cells. Files since version 5 store offsets and corners; older files, sizes and corners."""
         if self.major >= 5:
             parts = []
             for keyword, length in (("OFFSETS", count), ("CONNECTIVITY", size)):

@@ -84,7 +84,7 @@ def parse_vtp(data: bytes) -> Polygons:
 
 
 def _common(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Join the arrays that all pieces have with the same number of columns."""
+    """Concatenate each array that all pieces contain, if its number of columns is the same in all pieces."""
     return {
         name: np.concatenate([piece[name] for piece in pieces])
         for name in pieces[0]
