@@ -64,8 +64,8 @@ class Correspondence:
       True if the distortion is at least 1.25. In both cases, the value is also True if `match` is uncertain
       whether X or its mirror image corresponds to Y, for example if `mirror_evidence` is between 0 and 0.1.
     - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
-      hands, such as a left and a right tooth. Whether X is mirrored or not, entry i of `pointwise_map` is the
-      match of vertex i of X.
+      hands, such as a left and a right tooth. Entry i of `pointwise_map` is always the match of vertex i of
+      X, even if X was mirrored.
     - `mirror_evidence`: the evidence that the mirror image of X, and not X itself, corresponds to Y; None if
       `match` computed no evidence. The evidence is the logarithm of a ratio: the distance error of a coarse
       map of X itself, divided by the distance error of a coarse map of the mirror image. `match` compares up
@@ -121,9 +121,9 @@ class Correspondence:
 
         The last stage embeds X and Y in a common space. In this space, `pointwise_map` gives the vertex of Y
         that is nearest to a vertex of X. This method searches the triangles around that vertex of Y for the
-        nearest point. For 98 % of the vertices of X, no other triangle of Y has a nearer point.
-        `jaxsmw.functional_maps.decode_to_triangles` searches all triangles, which takes 20 times as long. An
-        unreferenced vertex of X receives the point of the nearest referenced vertex.
+        nearest point. For 98 % of the vertices of X, this point is also the nearest point on all triangles of
+        Y. `jaxsmw.functional_maps.decode_to_triangles` searches all triangles, which takes 20 times as long.
+        An unreferenced vertex of X receives the point of the nearest referenced vertex.
 
         **Returns:** A `SurfacePoints` with m points on Y, one for each vertex of X. Its attribute `faces`
         (m,) contains 0-based rows of `mesh_y.faces`, and its attribute `weights` (m, 3) contains barycentric
@@ -311,7 +311,7 @@ class Correspondence:
         return self.estimate_error(ExpectedErrorSettings())
 
     def estimate_error(self, settings: ExpectedErrorSettings) -> Float[np.ndarray, " m"]:
-        """Return what `expected_error` returns (m,), but computed with the given settings."""
+        """Estimate the geodesic error of every match (m,) with the given settings; see `expected_error`."""
         expected = expected_error(
             self.pair.mirrored() if self.mirrored else self.pair,
             self.pointwise_map,

@@ -53,7 +53,7 @@ class SampledShape(NamedTuple):
 
     @classmethod
     def make(cls, mesh: Mesh, samples: SurfaceSamples | None, spectrum: Spectrum) -> SampledShape:
-        """Make a sampled shape from a mesh and its spectrum, which has all n vertices of the mesh.
+        """Make a sampled shape from a mesh and its spectrum at all n vertices.
 
         **Raises:** `InputError` if the spectrum and the mesh have different numbers of vertices.
         """
@@ -67,7 +67,7 @@ class SampledShape(NamedTuple):
         return cls(mesh, samples, spectrum)
 
     def rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
-        """Return the row of each given vertex (v,) in arrays that have one row per compared vertex.
+        """Return the row number of each vertex (v,), for arrays with one row per compared vertex.
 
         A vertex that is not a sample shares the row of the nearest sample. On a shape without samples, the
         row number of a vertex is the vertex index itself.
@@ -174,7 +174,7 @@ def describe(
 def _at_all_vertices(
     shape: SampledShape, spectrum: Spectrum, components: Float[np.ndarray, "a d"]
 ) -> Spectrum:
-    """Return the spectrum at all vertices, with descriptors that are given at the compared vertices."""
+    """Extend descriptors from the compared vertices to all vertices, and add them to the spectrum."""
     everywhere = components if shape.samples is None else components[shape.samples.nearest]
     everywhere = everywhere * np.asarray(spectrum.mask)[:, None]
     return spectrum.with_descriptors(jax.device_put(everywhere))
@@ -309,8 +309,8 @@ class PrincipalAxes(NamedTuple):
 
         **Arguments:**
 
-        - `blocks`: tuples of rows (n, c) and their weights (n,). All weights together sum to 1. The
-          iterable is read twice.
+        - `blocks`: pairs (rows, weights), which are arrays of shapes (n, c) and (n,). The weights of all
+          blocks together sum to 1. The iterable is read twice.
         - `number`: the number d of axes.
         """
         mean = sum(weight @ values for values, weight in blocks)

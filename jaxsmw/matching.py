@@ -149,7 +149,7 @@ def match(
 
     automatic = isinstance(init, str) and init == "auto"
     first_init = DEFAULT_INITIAL_MAP if automatic else init
-    check_initial_map(pair, first_init)  # first, because the eigenbases take longer
+    check_initial_map(pair, first_init)  # before the long computation of the eigenbases
     compiling = _compile_ahead(pair, chosen, history)
     seconds: dict[str, float] = {}
     with timed("eigenbases", seconds):
@@ -157,7 +157,7 @@ def match(
             pair, chosen.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
         )
     decision = Decision(mirror == "yes")
-    aligns = automatic and chosen.repair is not None  # used only for asymmetric shapes
+    aligns = automatic and chosen.repair is not None  # "aligned" is used only for asymmetric shapes
     if (mirror == "auto" or aligns) and not partial:
         with timed("mirror test", seconds):
             decision = Hands(pair, *spectra).decide(mirror)
@@ -237,8 +237,9 @@ def match_prepared(
       and no progress is reported.
     - `compiling`: background compilations that refinement waits for.
     - `alternatives`: whether repair tries alternative maps.
-    - `refined`: the outcome of all stages for each element of `starts`, or None where the stages have not run
-      yet; see `jaxsmw.repair.batches`. An empty sequence (the default) means that no stages have run yet.
+    - `refined`: one entry for each element of `starts`; see `jaxsmw.repair.batches`. The entry is the outcome
+      of all stages, or None if the stages have not run yet. An empty sequence (the default) means that no
+      stages have run yet.
 
     **Returns:** The `Match`.
 
@@ -284,8 +285,8 @@ def match_prepared(
 def _inconsistency(found: Match) -> float:
     """Return the mean expected error of a map, with `area_weight` 0.
 
-    The weight adds a factor that depends on the shapes, not on the quality of the map. (Entry R24 of
-    docs/research_log.md)
+    With a positive `area_weight`, the expected error would contain a factor that depends on the shapes, not
+    on the quality of the map. (Entry R24 of docs/research_log.md)
     """
     settings = ExpectedErrorSettings(area_weight=0.0)
     return float(found.correspondence.mesh_x.average(found.correspondence.estimate_error(settings)))
@@ -296,7 +297,7 @@ def _step(name: str, seconds: dict[str, float] | None) -> AbstractContextManager
 
 
 def _add_seconds(prepared: PreparedPair, seconds: dict[str, float]) -> None:
-    """Add the times of a further preparation."""
+    """Add the times of the steps of a preparation to `seconds`."""
     seconds |= {step: seconds[step] + time for step, time in prepared.seconds.items()}
 
 

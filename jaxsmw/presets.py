@@ -88,7 +88,7 @@ class Preset:
         return max(stage.number_of_samples or 0 for stage in self.stages)
 
 
-# If the smaller mesh has at least this number of vertices, the `large_stages` of a preset run.
+# `Preset.fitted` chooses the `large_stages` if the smaller mesh has at least this number of vertices.
 _LARGE_FROM = 15_000
 
 

@@ -239,7 +239,7 @@ def _cycles(found: Collection) -> dict[str, float]:
     """Return cycle errors of a collection, in thousandths of the square root of the area.
 
     The dictionary contains the mean cycle errors of the graph. It also contains the mean and the median cycle
-    error of random triples of shapes, with maps through the template.
+    error of maps through the template, for random triples of shapes.
     """
     generator = np.random.default_rng(0)
     number = len(found.meshes)

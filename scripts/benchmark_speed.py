@@ -130,7 +130,7 @@ def medians(
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
-    """Return a table of the candidates' times, in seconds and as multiples of the time of candidate `of`."""
+    """Return a table with each candidate's time in seconds, and its ratio to the time of candidate `of`."""
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 
@@ -346,7 +346,7 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
 
             def run() -> None:
                 for entry in cache.glob("*.npz") if cache else ():
-                    entry.unlink()  # removes cached spectra but no compiled programs
+                    entry.unlink()  # compiled programs stay in the cache
                 subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=environment)
 
             return run

@@ -85,7 +85,7 @@ _BODIES = ("faust_r", "tosca_r", "smal_r")
 def _draw(directory: Path, number: int) -> list[tuple[Path, Path]]:
     """Return at most `number` pairs of meshes of a data set, in random order.
 
-    If there are fewer pairs, all pairs are followed by pairs in the reverse direction.
+    If there are fewer pairs, the same pairs in the reverse direction follow.
     """
     listing = directory / "test_pairs.txt"
     if listing.exists():

@@ -15,11 +15,11 @@ and prints four tables:
 - The third table compares `Correspondence.wrong_probability` with the share of wrong maps. A map is wrong if
   at least 2 % of its errors exceed 0.25 times the square root of the area. The note below the table states
   the coefficients of a logistic regression on the measured maps.
-- The fourth table states on how many pairs each score prefers the result to a mirrored map. The script prints
-  this table only for the preset `accurate`. The table covers only pairs of full shapes. Their mirrored ground
-  truth must exist, and must map vertices to vertices. To compute the mirrored map, the script starts from the
-  mirrored ground truth, and skips the first stage and the repair. To compute the uncertainty of a map, the
-  script runs a feature regression with this map as its initial map.
+- The fourth table states, for each score, the number of pairs on which the result has a better score than a
+  mirrored map. The script prints this table only for the preset `accurate`. The table covers only pairs of
+  full shapes whose mirrored ground truth exists and maps vertices to vertices. To compute the mirrored map,
+  the script starts from the mirrored ground truth, and skips the first stage and the repair. To compute the
+  uncertainty of a map, the script runs a feature regression with this map as its initial map.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def main() -> None:
             browser.get(options.page.resolve().as_uri())
             browser.execute_async_script(
                 "const [vertex, scale, done] = arguments, slider = document.querySelector('#filter');"
-                "if (!slider) return setTimeout(done, 5000);"  # a collection needs time for small pictures
+                "if (!slider) return setTimeout(done, 5000);"  # the page of a collection is drawn slowly
                 "document.querySelector('input[value=wavelets]').click();"
                 "slider.value = scale; slider.dispatchEvent(new Event('input')); jaxsmw.pick(vertex);"
                 "requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 100)))",

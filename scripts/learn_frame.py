@@ -175,7 +175,7 @@ def save(frame: SoftmaxFrame, path: Path) -> None:
 
 
 def load(path: Path) -> FilterBank:
-    """Read the filter bank of a frame that `save` wrote."""
+    """Read the logits that `save` wrote, and return the frame as a filter bank."""
     with np.load(path) as arrays:
         return bank_of(SoftmaxFrame(arrays["logits"]))
 

@@ -345,7 +345,10 @@ def measure(
 
 
 def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
-    """Return a table of mean errors, and of mean differences from `names[0]` with confidence intervals."""
+    """Return a Markdown table of the mean errors of the maps `names`.
+
+    Each map except the first also has its mean difference from the first map, with a confidence interval.
+    """
     rows = [["", "pairs", *names]]
     for data_set, pairs in measured.items():
         values = {name: np.array([pair[name] for pair in pairs]) for name in names}

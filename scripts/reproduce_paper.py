@@ -17,7 +17,7 @@ experiment uses only the data sets that suit it:
 - `settings`: MWP and other methods, with the published settings and with other settings, on the data sets of
   `table1`.
 
-In the output directory, the script creates one directory for each run. This directory contains the same files
+In the output directory, the script creates one directory for each run. Each directory contains the same files
 that `jaxsmw benchmark` writes. The script writes all tables to `README.md`. After an interruption, the same
 command continues from the saved results. With `--quick`, the script takes minutes on shapes with 5000
 vertices.
@@ -93,7 +93,7 @@ def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
 
 
 def is_isometric(data_set: DataSet) -> bool:
-    """Return whether all pairs consist of two full shapes of one class without topological noise."""
+    """Return whether each pair consists of full shapes of one class, and no shape has topological noise."""
     special = ("SHREC'16 partial", "SHREC'16 topology")
     within = all(class_of(pair.source) == class_of(pair.target) for pair in data_set.pairs)
     return within and data_set.layout not in special
@@ -273,7 +273,7 @@ MESHINGS: dict[str, Callable[[Mesh], Remeshed]] = {"finer": finer, "coarser": co
 
 
 def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[Mesh], Remeshed]) -> DataSet:
-    """Write and open a data set, with the sources of the pairs and remeshed versions of their targets."""
+    """Write a data set with the sources and the remeshed targets of the pairs, and open the data set."""
     listing = directory / "test_pairs.txt"
     if not listing.exists():
         shapes, truths = make_directory(directory / "off"), make_directory(directory / "corres")

@@ -541,7 +541,7 @@ def _write(
 def _number(collection: Collection, name: str, file: str) -> int:
     """Return the number of the mesh `name`.
 
-    **Raises:** `InputError` if the collection left this mesh out. The message names its `file`.
+    **Raises:** `InputError` if the collection left this mesh out. The message begins with `file`.
     """
     if name not in collection.names:
         raise InputError(f"{file}: was left out of the collection: choose another mesh.")

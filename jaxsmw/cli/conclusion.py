@@ -104,7 +104,8 @@ def write_match_report(
     - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
     - `registered`: the registered mesh if it was already computed; None otherwise.
-    - `landmarks`: the landmarks on the source and on the target. The page shows them when it is opened.
+    - `landmarks`: the landmarks on the source and on the target. The interactive page of the
+      report shows these landmarks when it is opened.
     """
     from jaxsmw.report.summary import write_report
 

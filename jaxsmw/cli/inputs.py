@@ -101,7 +101,7 @@ def initial_map(text: str) -> str:
 
 
 def initial_map_files(init: str) -> list[str]:
-    """Return the names of the files in a value of `--init`.
+    """Return the file names that a value of `--init` contains.
 
     For `landmarks:A,B`, the names are A and B. If a file named `A,B` exists, its name is returned instead.
     """

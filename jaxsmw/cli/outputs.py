@@ -38,7 +38,7 @@ def check_outputs(
     - `directories`: a list of pairs (directory, names). The command creates the directory, and writes files
       with these names into the directory. A directory may occur in several pairs.
 
-    **Raises:** `InputError` that names the first path that cannot be written.
+    **Raises:** `InputError` if an output cannot be written; the message names its path.
     """
     files, figures, pages = ([path for path in paths if path] for paths in (files, figures, pages))
     written = [*files, *figures, *pages]

@@ -49,7 +49,7 @@ class Parser(argparse.ArgumentParser):
         return super().parse_known_args(words, namespace)
 
     def _unknown_option(self, words: Sequence[str]) -> str | None:
-        """Return the first word that looks like an option but is unknown, without the value after `=`."""
+        """Return the name of the first unknown option. The name of `--x=3` is `--x`."""
         known = self._option_string_actions
         if not {"-h", "--help"}.isdisjoint(words):
             return None

@@ -31,7 +31,7 @@ def check_pairs(pairs: Iterable[Any], number: int, kind: str) -> list[tuple[int,
 
     - `pairs`: the pairs, each with the numbers of two shapes.
     - `number`: the number of shapes.
-    - `kind`: what a pair is called in messages.
+    - `kind`: the name for a pair in error messages, for example `"given edge"`.
 
     **Raises:** `InputError` if a pair does not consist of the numbers of two shapes.
     """
@@ -106,7 +106,7 @@ def edge_errors(
 
     **Arguments:**
 
-    - `cycles`: the three edges of each cycle (c, 3), as rows of `prior`.
+    - `cycles`: the three edges of each cycle (c, 3), as indices into `prior`.
     - `errors`: the error of each cycle (c,), from `cycle_error`.
     - `prior`: the first estimate of each edge's error (e,), for example the expected error.
 

@@ -101,7 +101,7 @@ class ConsistentMaps:
         return vertex_map_between(self.points[i], self.points[j], meshes[self.template], meshes[i], meshes[j])
 
     def improvements(self, again: Mapping[Edge, EdgeMap]) -> dict[Edge, EdgeMap]:
-        """Return the new maps that are closer to the consistent maps than the old maps of the same edges.
+        """Return each new map that agrees better with the consistent maps than the old map of its edge does.
 
         A new map is left out if its distortion exceeds the old distortion by more than the factor
         `distortion_tolerance`. It then probably follows a wrong consistent map.

@@ -144,7 +144,7 @@ class EdgeMatcher:
 
 
 class _StoredTask(NamedTuple):
-    """The task of a worker to match one edge. The worker reads both shapes from a store."""
+    """The task of matching one edge in a worker. The worker reads both shapes from a store."""
 
     directory: Path
     keys: tuple[tuple[Any, ...], tuple[Any, ...]]

@@ -79,8 +79,8 @@ class EdgeTask:
 
     - `x`, `y`: the source X (m vertices) and the target Y, which have the same hand.
     - `init`: the initial map X -> Y (m,), as 0-based vertices of Y; None for `"shot"`.
-    - `aligned`: whether to refine the initial map `"aligned"` as well and to keep the better map, if `init`
-      is None; see `jaxsmw.match`.
+    - `aligned`: whether an edge without an initial map is also matched from `"aligned"`. The better map is
+      kept; see `jaxsmw.match`.
     """
 
     x: PreparedShape

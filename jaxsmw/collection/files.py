@@ -108,7 +108,7 @@ def write_attributes(
     **Arguments:**
 
     - `collection`: the collection.
-    - `source`: the number of the mesh whose attributes are transferred.
+    - `source`: the 0-based index of the mesh whose attributes are transferred.
     - `data`: all meshes with their attributes, in the order of `Collection.meshes`.
     - `directory`: the directory of the results.
     - `suffix`: the suffix of the files.
@@ -136,7 +136,7 @@ def write_landmarks(
     **Arguments:**
 
     - `collection`: the collection.
-    - `source`: the number of the shape with the landmarks.
+    - `source`: the 0-based index of the shape on which `landmarks` are given.
     - `landmarks`: the landmarks.
     - `directory`: the directory of the results.
     - `suffix`: the suffix of the files, such as `.mrk.json`.
@@ -151,7 +151,7 @@ def write_landmarks(
     for target, name in enumerate(collection.names):
         if target != source:
             found = transfer_landmarks(landmarks, collection.registered_mesh(source, target))
-            notes = found.notes  # about the landmarks on the source, so equal for all targets
+            notes = found.notes  # the same for all targets, because the notes describe the source
             written.append(folder / f"{name}{suffix}")
             write_landmark_file(written[-1], found.landmarks)
     return written, notes
@@ -311,13 +311,13 @@ def replace_results(new: Path, directory: Path) -> None:
 
 
 def _listed_files(summary: Path) -> list[str]:
-    """Return the files that an earlier summary lists, if they lie within the directory of the summary."""
+    """Return the files that a summary lists, if they lie within the directory of the summary."""
     listed = _summary(summary).get("files", [])
     return [file for file in listed if isinstance(file, str) and _LISTED.fullmatch(file)]
 
 
 def _summary(path: Path) -> dict[str, list[Any]]:
-    """Return the lists of a summary. If the file is missing or damaged, the dictionary is empty."""
+    """Return all lists in a `collection.json` by name, or `{}` if the file is missing or damaged."""
     with suppress(OSError, ValueError, RecursionError):
         found = json.loads(path.read_text("utf-8"))
         if isinstance(found, dict):

@@ -47,16 +47,17 @@ def match_collection(
 ) -> Collection:
     """Match all shapes of a collection, such that the maps of all pairs agree.
 
-    Only the edges of a graph are matched, a few for each shape. Cycles of the graph show which maps are
-    wrong. The maps from a template to all shapes are the robust means of the maps along all edges. If the map
-    of an edge contradicts these means, the edge is matched again from the map through the template.
+    Only some pairs are matched, a few for each shape. These pairs are the edges of a graph, whose nodes are
+    the shapes. Cycles of the graph show which maps are wrong. The maps from a template to all shapes are the
+    robust means of the maps along all edges. If the map of an edge contradicts these means, the edge is
+    matched again from the map through the template.
 
     **Arguments:**
 
     - `meshes`: at least two meshes of the same kind of body, in any poses, units and triangulations. Each is
       a `Mesh`, or a mesh that `make_mesh` accepts.
-    - `names`: the new names of the meshes. By default, the meshes keep their names. If two of these names are
-      equal, all names are numbered.
+    - `names`: the new names of the meshes, all different. By default, the meshes keep their names. If two of
+      their names are equal, a number is appended to the name of each mesh.
     - `preset`: see `match`.
     - `template`: the 0-based position of the template in the argument `meshes`. The default is the shape with
       the smallest sum of errors along the best paths to all other shapes (the medoid).
@@ -67,7 +68,8 @@ def match_collection(
     - `settings`: the `CollectionSettings`.
     - `seed`: the seed of the random edges of the graph.
     - `directory`: an existing directory in which finished steps are kept. A second call with the same
-      directory continues an interrupted call. If meshes are added, only their own edges are matched.
+      directory continues an interrupted call. If the second call has additional
+      meshes, only edges of the additional meshes are matched.
     - `executor`: an executor that matches edges, for example `jaxsmw.runtime.workers.open_executor`. By
       default, edges are matched in this process.
     - `devices`: the JAX devices that match edges in this process; see `match_pairs`. The default is all
@@ -153,7 +155,7 @@ def match_collection(
 
 
 def _named_meshes(meshes: Sequence[Mesh | MeshLike], names: Sequence[str] | None) -> list[Mesh]:
-    """Return the meshes with names that differ from each other."""
+    """Convert the meshes with `as_mesh`, and give each mesh a different name."""
     if names is None:
         given = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
     else:

@@ -17,7 +17,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.transfer.registered_mesh import RegisteredMesh, register_mesh
 from jaxsmw.wording import count_of
 
-# If the share of outliers is larger than this, the maps are probably wrong, and not the shapes unusual.
+# If the share of outliers is larger than this, the maps are probably wrong.
 _MANY_OUTLIERS = 1 / 3
 
 
@@ -41,7 +41,7 @@ class MatchedEdge:
     - `residual`: the mean distance between the map and the map through the template; infinite if the match
       failed. The mean is computed in both directions, and the larger value is used.
     - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. `"replaced"` means that the first map
-      contradicted the other maps, and that a second match from the consistent map replaced the first map.
+      contradicted the other maps. A second match, started from the consistent map, replaced the first map.
       `"contradicted"` means that the map contradicts the other maps and has little weight, or that the match
       failed.
     - `doubtful`: whether the map contradicts the other maps, or its estimated error is at least
@@ -79,8 +79,8 @@ class Collection:
     - `meshes`: the meshes of the N shapes.
     - `template`: the number of the template, which has n vertices.
     - `points`: for each shape, one `SurfacePoints` on its mesh, with an entry per vertex of the template.
-    - `mirrored`: a mask (N,), True for shapes of the other hand, such as right teeth among left teeth. Their
-      mirror images were matched. All points and positions refer to the meshes, not to the mirror images.
+    - `mirrored`: a mask (N,), True for the shapes whose mirror images were matched, such as right teeth among
+      left teeth. All points and positions refer to the meshes, not to the mirror images.
     - `registered`: for each shape, the `RegisteredMesh` of the template on the shape.
     - `edges`: the matched pairs, each a `MatchedEdge`.
     - `axes`: the axes of the descriptors; None if the preset uses no descriptors.
@@ -121,13 +121,13 @@ class Collection:
         return tuple(mesh.name for mesh in self.meshes)
 
     def sentences(self) -> tuple[str, ...]:
-        """Return sentences about the template, the decisions, the hands, the outliers and missing meshes."""
+        """Return sentences about the template, the edges, mirrored shapes, outliers and meshes left out."""
         warning = [self.warning] if self.warning else []
         left_out = [f"Left out: {name} ({reason})" for name, reason in self.left_out.items()]
         return (*self.decisions(), *warning, *left_out)
 
     def decisions(self) -> tuple[str, ...]:
-        """Return sentences about the template, the decisions and the hands."""
+        """Return sentences about the template, the decisions on the edges, and mirrored shapes."""
         decisions = Counter(edge.decision for edge in self.edges)
         found = [
             f"{count_of(len(self.meshes), 'shape')}, {count_of(len(self.edges), 'matched pair')}; the "
@@ -215,8 +215,8 @@ class Collection:
     def signs(self) -> Float64[np.ndarray, "N 3"]:
         """The factors (N, 3) by which the shape model multiplies the coordinates of each shape.
 
-        All factors are 1, unless the hand of a shape differs from that of the template. The x coordinates of
-        such a shape are multiplied by -1.
+        All factors of a shape are 1 if the shape and the template have the same value in `mirrored`.
+        Otherwise the factor of the x coordinates is -1.
         """
         other_hand = self.mirrored != self.mirrored[self.template]
         return np.where(other_hand[:, None], [-1.0, 1.0, 1.0], 1.0)
@@ -225,8 +225,8 @@ class Collection:
         """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
 
         Lengths are in the unit of the meshes, or without unit if `scale` is True. The weight of each vertex
-        is its vertex area on the template. If a shape does not have the hand of the template, its mirror
-        image enters the model.
+        is its vertex area on the template. If a shape and the template have different values in
+        `mirrored`, the mirror image of the shape enters the model.
 
         **Arguments:**
 

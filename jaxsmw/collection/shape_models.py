@@ -85,7 +85,7 @@ def align(
     - `scale`: whether to remove differences of size. If True, each shape is scaled to fit the mean in the
       least-squares sense. All shapes are then scaled by one common factor, so that the mean has the average
       size of the given shapes.
-    - `weights`: non-negative weights of the vertices (n,), such as the vertex areas of the template, so that
+    - `weights`: non-negative weights of the vertices (n,). If the weights are the vertex areas of one shape,
       dense regions of the triangulation do not dominate. With None (the default), all weights are equal.
     - `reference`: the index of the shape whose rotation and centroid do not change.
 
@@ -139,14 +139,14 @@ class ShapeModel:
 
     The modes are the principal components of the shapes (Cootes, Taylor, Cooper, Graham, "Active shape
     models", CVIU 1995). The inner product of two fields u and v of displacements is sum_i w_i u_i · v_i, with
-    the weights w of the vertices. If a score changes by one standard deviation, the root mean square of the
-    displacements over the surface is therefore this standard deviation.
+    the weights w of the vertices. Therefore, if one score changes by s, the root mean square of the vertices'
+    displacements over the surface is s.
 
     **Attributes:**
 
     - `alignment`: the `Alignment` of the N shapes.
-    - `modes`: displacements (k, n, 3), orthonormal in this inner product. The largest score of each mode is
-      positive.
+    - `modes`: the displacements of each mode (k, n, 3). The modes are orthonormal in the inner product above.
+      For each mode, the score with the largest absolute value is positive.
     - `variances`: the variance of the scores of each mode (k,), decreasing, in squared units of length. Sums
       of squares are divided by N - 1.
     - `scores`: the inner products (N, k) of the displacements of each shape with the modes.
@@ -252,8 +252,7 @@ class ShapeModel:
         A model of the other N - 1 shapes reconstructs the shape that was left out (Davies, "Learning shape:
         optimal models for analysing natural variability", 2002; Styner et al., "Evaluation of 3D
         correspondence methods for model building", IPMI 2003). The error of a shape is the mean distance
-        over the surface between the shape and its reconstruction. The shapes are not aligned again. For each
-        shape, the modes of the other shapes follow from an N x N matrix.
+        over the surface between the shape and its reconstruction. The shapes are not aligned again.
 
         **Arguments:**
 
@@ -322,9 +321,10 @@ class ShapeModel:
     def _mean_lengths(
         self, fields: Float64[np.ndarray, "p r"], coordinates: Float64[np.ndarray, "N r"]
     ) -> Float64[np.ndarray, " p"]:
-        """Return the mean length of each displacement field over the surface, given the fields' coordinates.
+        """Return for each displacement field the mean length of its displacements over the surface.
 
-        `coordinates` are the coordinates of the shapes in the same orthonormal basis (`_coordinates`).
+        `fields` and `coordinates` are the coordinates of the fields and of the shapes in the same orthonormal
+        basis (`_coordinates`).
         """
         combinations = fields @ (coordinates / (coordinates**2).sum(axis=0)).T
         lengths = np.zeros(len(fields))
@@ -472,7 +472,10 @@ def _rotations_and_scales(
 
 
 def _squared_norm(combination: Float64[np.ndarray, "3 q"], products: Float64[np.ndarray, "q q"]) -> float:
-    """Return the squared norm of a combination of the coordinates of shapes, given their inner products."""
+    """Return the squared norm of a linear combination of shapes.
+
+    `products` are the inner products of the coordinates of the shapes.
+    """
     return max(float(np.sum((combination @ products) * combination)), 0.0)
 
 
@@ -496,7 +499,7 @@ def _smallest_norm(alignment: Alignment) -> float:
 
 
 def _coordinates(alignment: Alignment) -> Float64[np.ndarray, "N r"]:
-    """Return the scores of all modes. They are the coordinates of the shapes in an orthonormal basis.
+    """Return the scores of all modes: the coordinates of the shapes in the orthonormal basis of the modes.
 
     One QR decomposition per block of vertices reduces the displacements to an N x N matrix, which has the
     same inner products. The small singular values of this matrix are accurate. A matrix of inner products

@@ -28,8 +28,8 @@ class SynchronizationSettings:
     **Attributes:**
 
     - `iterations` (Table R26): the number of iterations. Each iteration averages the points on every shape.
-    - `robust_scale` (Table R26): the distance at which a point has half of the weight of a point at distance
-      zero. Points of wrong maps are much farther away.
+    - `robust_scale` (Table R26): a distance from the mean. A point at this distance has half of the weight
+      of a point at the mean. Points of wrong maps are much farther away.
     - `discontinuity_distance`: if the matches of a triangle's corners are farther apart than this distance, a
       point inside the triangle follows the match of the nearest corner instead of an average.
 
@@ -47,7 +47,7 @@ class SynchronizationSettings:
 
 
 def vertices_as_points(mesh: Mesh) -> SurfacePoints:
-    """Return all vertices of a mesh as `SurfacePoints` with n entries, each at or next to its vertex."""
+    """Return the surface point nearest to each vertex of a mesh, as `SurfacePoints` with n entries."""
     return nearest_surface_points(mesh.vertices, mesh)[0]
 
 
@@ -67,7 +67,8 @@ def carry(
     - `discontinuity_distance`: the largest distance between matches that are averaged, in the unit of
       `images`.
 
-    **Returns:** The positions (p, 3), in the unit of `images`, near to the other surface.
+    **Returns:** The positions (p, 3) of the carried points, in the unit of `images`. The positions lie near
+    the other surface.
     """
     corners = images[mesh.faces[points.faces]]
     main = np.take_along_axis(corners, points.weights.argmax(axis=1)[:, None, None], axis=1)
@@ -89,7 +90,7 @@ def robust_mean(
     **Arguments:**
 
     - `candidates`: d candidate positions of each of n points (d, n, 3).
-    - `weights`: the weight of each of the d candidates (d,), which is the same for all points.
+    - `weights`: the weights of the d candidates (d,). All points use the same weights.
     - `start`: the first estimate of each position (n, 3).
     - `scale`: the distance at which a candidate has half of its weight.
 
@@ -223,10 +224,10 @@ class Network:
 def synchronize(network: Network, template: int) -> list[SurfacePoints]:
     """Compute the maps from the template to all shapes, such that they agree with the maps of all edges.
 
-    The first maps follow the paths with the smallest errors. In each iteration, the points on the neighbours
-    of a shape are carried to this shape, along the edges of the graph. The points on this shape then move to
-    the robust mean of the carried points. This is the synchronisation of pointwise maps (Huang, Guibas 2013)
-    by iterated averages on the surfaces.
+    The first map to each shape follows the path from the template with the smallest sum of errors. In each
+    iteration, the points on the neighbours of a shape are carried to this shape, along the edges of the
+    graph. The points on this shape then move to the robust mean of the carried points. This is the
+    synchronisation of pointwise maps (Huang, Guibas 2013) by iterated averages on the surfaces.
 
     **Arguments:**
 

@@ -72,8 +72,8 @@ def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Si
     """Return the two arguments in the order (out, in).
 
     "Out" is the shape that C maps to, and "in" is the shape that C maps from. So the order is (X, Y) in the
-    pullback convention and (Y, X) in the pushforward convention. If its arguments are in the order (out, in),
-    the function returns them in the order (X, Y).
+    pullback convention and (Y, X) in the pushforward convention. The function is its own inverse: it also
+    converts the order (out, in) to the order (X, Y).
 
     **Raises:** `ValueError` for an unknown convention.
     """
@@ -278,12 +278,12 @@ class WaveletProblem(eqx.Module):
 
     @property
     def spectra(self) -> tuple[Spectrum, Spectrum]:
-        """The spectra of the shape that C maps to and of the shape that C maps from, in this order."""
+        """The spectra of the two shapes in the order (out, in)."""
         return self.out_and_in(self.spectrum_x, self.spectrum_y)
 
     @property
     def responses(self) -> tuple[Float[Array, "filters k_out"], Float[Array, "filters k_in"]]:
-        """The responses on the shape that C maps to, then the responses on the shape that C maps from."""
+        """The responses on the two shapes in the order (out, in)."""
         return self.out_and_in(self.responses_x, self.responses_y)
 
     def encode(
@@ -311,7 +311,7 @@ class WaveletProblem(eqx.Module):
         `problem.energy(T)(C)` is the energy of C. `problem.energy(T).minimizer()` is the C of least energy,
         even if the frame is not tight. `problem.energy(T).constant` is the energy of C = 0. In the pullback
         convention with the area norm, this constant is `sum_i G_X(lambda_i)`, where G_X is the frame function
-        at the eigenvalues lambda_i of X. For a Parseval frame this sum is k_X.
+        on X, and lambda_i are the eigenvalues of X. For a Parseval frame this sum is k_X.
 
         **Arguments:**
 

@@ -151,10 +151,10 @@ def refine(
     failure, all entries of `pointwise_map` are -1.
 
     **Raises:** `ValueError` if `iterations` is below 1, the initial map does not have shape (m,), `samples`
-    is not a pair, or the two spectra have different float types. `ValueError` is also raised if refinement
-    should start or end on samples, but there are no samples or the refiner matches samples of X with samples
-    of Y. `TypeError` if `iterations` or the entries of the initial map are not integers, or if another
-    argument has the wrong type.
+    is not a pair, or the two spectra have different float types. `ValueError` is also raised if
+    `starts_on_samples` or `ends_on_samples` is True without `samples`, or with a refiner that matches samples
+    of X only with samples of Y. `TypeError` if `iterations` or the entries of the initial map are not
+    integers, or if another argument has the wrong type.
     """
     _check_arguments(spectrum_x, spectrum_y, pointwise_map, refiner, samples)
     check_samples_use(refiner, samples is not None, starts_on_samples, ends_on_samples)
@@ -371,8 +371,8 @@ def _check_arguments(
 def check_samples_use(refiner: Refiner, sampled: bool, starts: bool, ends: bool) -> None:
     """Check the arguments `starts_on_samples` and `ends_on_samples` of `refine`.
 
-    **Raises:** `ValueError` if one of them is True, but there are no samples or the refiner matches samples
-    of X with samples of Y.
+    **Raises:** `ValueError` if one of them is True without samples, or with a refiner that matches samples of
+    X only with samples of Y.
     """
     if not (starts or ends):
         return

@@ -180,8 +180,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         """Return two point sets in which each vertex of X is close to its match on Y.
 
         For each vertex of X, `jaxsmw.Correspondence.surface_points` searches the triangles around its match.
-        The result is the point on these triangles whose embedding is nearest to that of the vertex. By
-        default, the embeddings are the `spectral_embeddings` of the functional map in the refiner's
+        Its result is the point on these triangles whose embedding is nearest to the embedding of the vertex.
+        By default, the embeddings are the `spectral_embeddings` of the functional map in the refiner's
         `convention`.
 
         **Returns:** Two arrays: one point for each vertex of X to be matched (m, d), and one point for each

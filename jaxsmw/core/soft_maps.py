@@ -68,7 +68,7 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Transfer functions on Y, such as colours, to the queries.
+        """Pull functions on Y, such as colours, back to the queries.
 
         Each query receives the mean of the values at the database rows, weighted with its shares.
 
@@ -124,7 +124,7 @@ class SparseSoftMap(eqx.Module):
     shares: Float[Array, "m t"]
 
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Transfer functions on Y, such as colours, to the queries.
+        """Pull functions on Y, such as colours, back to the queries.
 
         Each query receives the mean of the values at the database rows, weighted with its shares.
 
@@ -156,7 +156,7 @@ PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
 
 
 def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """Transfer functions on Y to X along a pointwise map or a soft map from X to Y.
+    """Pull functions on Y back to X, along a pointwise map or a soft map from X to Y.
 
     With a pointwise map, each vertex of X receives the value at its match. With a soft map, each vertex of X
     receives the mean of the values on Y, weighted with the shares of the vertex. No array of size m x n is
@@ -455,7 +455,8 @@ def _sinkhorn_potentials(
 
         arrived, _ = lax.scan(jax.checkpoint(add), jnp.zeros_like(b), blocks)
         # The area that arrives at a row can underflow to zero. The lower limit `least` keeps the logarithm
-        # finite. The potential of such a row needs several iterations to rise far enough.
+        # finite. The limit also bounds `correction`, so the potential of such a row rises over several
+        # iterations.
         least = jnp.finfo(dtype).tiny
         correction = jnp.where(b > 0, log_b - jnp.log(jnp.maximum(arrived, least)), 0)
         return potentials + correction, jnp.sum(jnp.abs(arrived - b)) / 2

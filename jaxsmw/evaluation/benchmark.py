@@ -41,8 +41,8 @@ class Results(NamedTuple):
     - `rows`: a list of dictionaries, each with the keys of `RESULT_COLUMNS`. The list contains one row for
       each pair and method. A pair is left out if any method has no result for this pair.
     - `shapes`: a dictionary from the name of each measured shape to a row with the keys of `SHAPE_COLUMNS`.
-    - `failures`: a dictionary from each shape or pair that could not be measured to its error message. A
-      shape is given by its name, and a pair by the text "SOURCE to TARGET".
+    - `failures`: a dictionary of error messages, with one entry per shape or pair that could not be measured.
+      The key is the name of the shape, or the text "SOURCE to TARGET" for a pair.
     """
 
     rows: list[Row]

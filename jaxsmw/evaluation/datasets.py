@@ -398,8 +398,8 @@ def _remeshed(directory: Path) -> _Pairs | None:
         return DataPair(x, y, shapes[x], shapes[y], (plain[x], plain[y]), mirrored)
 
     pairs, others = _listed_first(pair, _listed_pairs(directory, shapes), _within_classes(shapes))
-    # In some sets, such as SMAL, shapes of different classes also correspond row by row. The files do not
-    # tell whether a set is of this kind, so all pairs are allowed.
+    # In some sets, such as SMAL, the .vts files also match shapes of different classes. The files do not tell
+    # whether a set is of this kind, so all pairs are allowed.
     present = {one.names for one in (*pairs, *others)}
     return pairs, others + [pair(*names) for names in permutations(shapes, 2) if names not in present]
 

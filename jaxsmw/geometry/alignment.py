@@ -53,10 +53,10 @@ def align_rigidly(
     the nearest points of y, and from y to the nearest points of x. The motion with the smallest sum is
     chosen.
 
-    With closest points, a nearly round surface does not slide into place, because samples attract each other.
-    If normals are given, further iterations therefore minimise the distances to tangent planes (Chen,
-    Medioni, "Object modelling by registration of multiple range images", 1992). The result of these
-    iterations is used only if the shapes fit each other.
+    Iterative closest points hardly slide a nearly round surface along another surface, because each sample is
+    drawn to the sample that is already closest. If normals are given, further iterations therefore minimise
+    the distances to tangent planes (Chen, Medioni, "Object modelling by registration of multiple range
+    images", 1992). The result of these iterations is used only if the shapes fit each other.
 
     **Arguments:**
 
@@ -130,7 +130,7 @@ def _principal_axes(points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "
 
 
 def _rigid_fit(x: Float64[np.ndarray, "p 3"], targets: Float64[np.ndarray, "p 3"]) -> Alignment:
-    """Return the rigid motion from x to the targets with the least sum of squared distances."""
+    """Return the rigid motion of x that minimises the sum of squared distances to the targets."""
     middle, middle_of_targets = x.mean(axis=0), targets.mean(axis=0)
     (rotation,), _ = nearest_rotations(((targets - middle_of_targets).T @ (x - middle))[None])
     return Alignment(rotation, middle_of_targets - rotation @ middle)

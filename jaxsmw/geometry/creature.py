@@ -119,7 +119,7 @@ class _Body:
         self.joints: dict[str, int] = {}
         self.parents: list[int] = []
         self._pivots: list[np.ndarray] = []
-        self._guides: list[tuple[int, np.ndarray]] = []  # joints, each with the two balls of its limb
+        self._guides: list[tuple[int, np.ndarray]] = []  # a joint, and two balls of a tube it moves
         self._tubes: list[_Tube] = []
         self._scale = np.exp(0.05 * random.normal(size=4))
         self._frequencies = 1.5 * random.normal(size=(3, 4))
@@ -242,8 +242,9 @@ class _Body:
     def posed(self, points: np.ndarray, angles: np.ndarray) -> np.ndarray:
         """Return the positions of points (p, 3) after the rotations of the joints.
 
-        Each joint rotates a point by the point's share of the joint's angle. Averaging rotation matrices
-        instead of angles would shrink the skin around a flexed joint and collapse it around a twisted joint.
+        Each joint rotates each point by a fraction of the joint's angle. The fraction depends on the
+        distances from the point to the limbs. Averaging rotation matrices instead of angles would shrink the
+        skin around a flexed joint and collapse it around a twisted joint.
         """
         shares = np.zeros((len(points), len(angles)))
         for joint, hull in self._guides:

@@ -27,8 +27,8 @@ from jaxsmw.runtime.threads import one_blas_thread
 # The shift that ARPACK uses for a surface of area 1. The first non-zero eigenvalue of a body of area 1 is
 # between 1 and 30.
 _SHIFT = -1e-2
-# The largest accepted relative residual of an exact solver, and the largest accepted deviation from
-# orthonormality of any solver; see `_check`.
+# `_solve_component` accepts an exact solver up to this relative residual, and every solver up to this
+# deviation from orthonormality.
 _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
 # Up to this number of vertices, a dense solver is as fast as the sparse solvers and always succeeds.
@@ -96,7 +96,7 @@ def as_spectrum(
 ) -> Spectrum:
     """Return the `eigenpairs` of a mesh as a `Spectrum` of JAX's default float type.
 
-    The function adds outward normals and positions. The positions are relative to the centroid, in units in
+    The function adds positions and outward normals. The positions are relative to the centroid, in units in
     which the area is 1.
 
     **Arguments:**

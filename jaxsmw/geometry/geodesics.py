@@ -91,9 +91,9 @@ class _Sides(NamedTuple):
     """The 6 f sides of all f triangles and of their mirror images.
 
     Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the mirror
-    images: the faces 0 … f - 1 with reversed order of corners. A line leaves a triangle by one side, and
-    enters the next triangle by a side in the opposite direction. The mirror images let lines cross edges
-    whose faces have opposite orientations, and edges with more than two faces.
+    images: the faces 0 … f - 1 with reversed order of corners. A line leaves a triangle by one side. It
+    enters the next triangle by a side that joins the same two vertices in the opposite direction. Because of
+    the mirror images, all other faces at the edge have such a side, even if their orientations differ.
     """
 
     tail: Int64[np.ndarray, " s"]
@@ -184,8 +184,8 @@ def _unfold(
     - `depth`: the number of sides to cross.
 
     **Returns:** An iterator with `depth` pairs (beams, corners). The beams of pair i have crossed i + 1
-    sides. Each beam is then inside one triangle, which it entered by the last crossed side. The beam's entry
-    in `corners` is the position of the corner of this triangle opposite that side.
+    sides. Each beam is then inside one triangle. For each beam, `corners` contains the position of the corner
+    of this triangle that is opposite the last crossed side.
     """
     right, left = -position * sides.length[side], (1 - position) * sides.length[side]
     beams = _Beams(origin, side, right, left, right, left)

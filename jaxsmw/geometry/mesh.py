@@ -197,10 +197,10 @@ class Mesh:
     def faces_around(
         self, vertices: Int64[np.ndarray, " q"]
     ) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, " p"]]:
-        """Return all pairs of a given vertex and a face around it.
+        """Return all faces around each given vertex.
 
-        **Returns:** Two arrays with one entry per pair: indices into `vertices` (p,), and indices of faces
-        (p,).
+        **Returns:** Two arrays (p,) with one entry per pair of a given vertex and a face around it. The first
+        array contains indices into `vertices`, and the second array contains indices of faces.
         """
         faces = np.argsort(self.faces.ravel(), kind="stable") // 3
         counts = np.bincount(self.faces.ravel(), minlength=len(self.vertices))
@@ -222,9 +222,9 @@ class _EdgeTable(NamedTuple):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The result of `diagnose`: the numbers of all unusual elements of a mesh, such as boundary edges.
+    """The result of `diagnose`, which counts all unusual elements of a mesh, such as boundary edges.
 
-    An unusual element is not necessarily an error. `str` of a `Diagnosis` explains the numbers in sentences,
+    An unusual element is not necessarily an error. `str` of a `Diagnosis` explains the counts in sentences,
     one per line.
 
     **Attributes:**
@@ -257,7 +257,7 @@ class Diagnosis:
         return self._size(), *(f"{number}: {meaning}." for number, meaning in self._unusual().values())
 
     def brief_sentences(self) -> tuple[str, ...]:
-        """Return a sentence about the size of the mesh, and one with the numbers of all unusual elements.
+        """Return a sentence about the size of the mesh, and one that counts all unusual elements.
 
         The second sentence leaves out unreferenced vertices, because the notes of a mesh report them. If the
         mesh has no unusual elements besides unreferenced vertices, only the first sentence is returned.
@@ -275,7 +275,7 @@ class Diagnosis:
         )
 
     def _unusual(self) -> dict[str, tuple[str, str]]:
-        """Return, for each kind of unusual element that exists, the number and the meaning, both as text."""
+        """For each kind of unusual element that occurs, return the count and the meaning, both as text."""
         loops = count_of(self.boundary_loops, "loop")
         found = {
             "unreferenced vertices": (
@@ -324,10 +324,10 @@ def diagnose(mesh: Mesh) -> Diagnosis:
 
     **Returns:**
 
-    A `Diagnosis` with the numbers of elements as the attributes `vertices`, `faces`, `components` (connected
-    components), `unreferenced_vertices`, `boundary_edges`, `boundary_loops`, `nonmanifold_edges`,
-    `nonmanifold_vertices`, `misoriented_edges` and `degenerate_faces`. `str` of the `Diagnosis` explains the
-    numbers in sentences, one per line.
+    A `Diagnosis`, whose attributes count elements: `vertices`, `faces`, `components` (connected components),
+    `unreferenced_vertices`, `boundary_edges`, `boundary_loops`, `nonmanifold_edges`, `nonmanifold_vertices`,
+    `misoriented_edges` and `degenerate_faces`. `str` of the `Diagnosis` explains the counts in sentences, one
+    per line.
     """
     unreferenced = int((~mesh.referenced_vertices).sum())
     boundary_chain = connected_components(mesh.boundary_edges, len(mesh.vertices))[1]
@@ -589,7 +589,7 @@ def _parts(mesh: MeshLike, name: str) -> tuple[ArrayLike, ArrayLike]:
 
 
 def to_host(values: Any) -> Any:
-    """Return values that NumPy can convert: PyTorch tensors are detached and copied to the host."""
+    """Detach PyTorch tensors and copy them to the host. Other values are returned unchanged."""
     return values.detach().cpu() if hasattr(values, "detach") else values
 
 

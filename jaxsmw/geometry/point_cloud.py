@@ -63,11 +63,11 @@ def triangulate_points(
 
     The function labels the tetrahedra of the Delaunay triangulation as inside or outside, with the weights of
     Kolluri, Shewchuk, O'Brien, "Spectral surface reconstruction from noisy point clouds", SGP 2004. Adjacent
-    tetrahedra whose circumspheres overlap deeply are likely to have the same label. The two poles of a point
-    are the farthest vertices of its Voronoi cell on both sides of the surface, and their tetrahedra are
-    likely to have opposite labels. The labels are real numbers that minimise a weighted sum of squared
-    violations of these two conditions. Tetrahedra far from the points have the fixed label outside. The
-    function solves a linear system, whereas the paper solves an eigenvalue problem.
+    tetrahedra whose circumspheres overlap deeply are likely to have the same label. Each point has two
+    poles, which are vertices of its Voronoi cell: the farthest vertex on each side of the surface. The
+    tetrahedra of the two poles are likely to have opposite labels. The labels are real numbers that minimise
+    a weighted sum of squared violations of these two conditions. Tetrahedra far from the points are labelled
+    outside in advance. The function solves a linear system, whereas the paper solves an eigenvalue problem.
 
     Triangles whose edges are much longer than the distances between neighbouring points are dropped, so open
     surfaces stay open. Points that the surface does not use, such as outliers, are unreferenced vertices. If
@@ -218,7 +218,7 @@ def _poles(
 
     Poles are circumcentres of tetrahedra around a point. Without normals, the first pole is the farthest
     circumcentre, and the second pole is the farthest circumcentre in the opposite half-space. With normals,
-    the poles are the farthest circumcentres on both sides of the tangent plane.
+    the poles are the farthest circumcentre on each side of the tangent plane.
     """
     point, tetrahedron = tetrahedra.corners.ravel(), np.repeat(np.arange(len(tetrahedra.corners)), 4)
     given = point < n

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-# Newton's method for the trace converges in 4 to 14 steps if the divisor exceeds `_AMBIGUOUS`. The error of a
-# rotation is then below 1e-10.
+# A rotation is nearly ambiguous if `divisor` is at most `_AMBIGUOUS`. Otherwise, Newton's method for the
+# trace converges in 4 to 14 steps, and the error of the rotation is below 1e-10.
 _NEWTON_STEPS, _AMBIGUOUS = 16, 1e-3
 
 

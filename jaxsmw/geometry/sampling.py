@@ -83,9 +83,9 @@ class SurfaceSamples(NamedTuple):
 def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
 
-    This is Poisson-disk sampling. Any two samples are farther apart than a minimum Euclidean distance, and
-    every candidate is within this distance of a sample. The minimum distance follows from the area and the
-    number of samples. The candidates are one vertex from each occupied box of a grid. The side of a box is a
+    This is Poisson-disk sampling. The candidates are one vertex from each occupied box of a grid. Any two
+    samples are farther apart than a minimum Euclidean distance, and every candidate is within this distance
+    of a sample. The minimum distance follows from the area and the number of samples. The side of a box is a
     third of the minimum distance. Two sheets of surface that are closer to each other than the minimum
     distance share their samples. For many samples, the function is much faster than `farthest_point_samples`.
 

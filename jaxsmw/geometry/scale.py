@@ -29,9 +29,10 @@ class ScaleSettings:
     - `radii` (Table R33): the radii of SHOT, as multiples of 0.06.
     - `distances` (Table R33): two samples of the partial shape are compared with their matches only if the
       distance between the samples is in this range. Larger distances vary more between poses.
-    - `angle_tolerance` (Table R33): two samples are compared with their matches only if the cosines of three
-      angles differ by less than this number. One angle is that between the two normals. The other angles are
-      those between each normal and the line through both points.
+    - `angle_tolerance` (Table R33): two samples are compared with their matches only if three angles at the
+      samples are similar to the same angles at the matches. The cosines of the angles must differ by less
+      than this number. One angle is between the two normals. The other two angles are between each normal
+      and the line that connects the two points.
     - `tolerance`: two ratios agree if their logarithms differ by less than this number.
     - `uncertain_below` (Table R33): an estimate with a smaller support is uncertain.
     """
@@ -51,7 +52,8 @@ class ScaleEstimate(NamedTuple):
     **Attributes:**
 
     - `scale`: the factor by which lengths on X are multiplied to become lengths in the unit of Y.
-    - `support`: the mean number of other matches with which a match agrees on the scale.
+    - `support`: the mean number of other matches that confirm a match. Two matches confirm each other if
+      their ratio of distances agrees with the most frequent ratio.
     - `uncertain`: whether `support` is below `ScaleSettings.uncertain_below`, so that the scale can be wrong.
     """
 
@@ -72,9 +74,10 @@ def estimate_scale(
     Each share implies a common unit of length, in which SHOT has the same radius on both shapes. Samples with
     mutually nearest descriptors are matched. The distance between two nearby samples, compared with the
     distance between their matches, gives a ratio. The ratios of correct matches agree, and the ratios of
-    wrong matches are scattered. The function therefore returns the most frequent ratio of the share with the
-    largest support. Pairs of samples are compared only if their normals agree (point pair features; Drost,
-    Ulrich, Navab, Ilic, "Model globally, match locally", 2010).
+    wrong matches are scattered. The most frequent ratio therefore shows how to correct the share. The
+    function chooses the share with the largest support (see `ScaleEstimate`). The corrected share and the
+    areas of both meshes give the scale. Pairs of samples are compared only if their normals agree (point pair
+    features; Drost, Ulrich, Navab, Ilic, "Model globally, match locally", 2010).
 
     **Arguments:**
 
@@ -127,7 +130,7 @@ class _Described(NamedTuple):
 
 
 class _Vote(NamedTuple):
-    """A share of the full shape's area, and the mean number of matches that agree with each match."""
+    """An estimated share of the full shape's area, and its support (see `ScaleEstimate`)."""
 
     share: float
     support: float
@@ -155,7 +158,7 @@ def _describe(mesh: Mesh, share: float, settings: ScaleSettings) -> _Described:
 
 
 def _vote(part: _Described, full: _Described, share: float, settings: ScaleSettings) -> _Vote:
-    """Estimate the share from the most frequent ratio of distances at a tested share."""
+    """Correct a tested share by the most frequent ratio of distances, and compute its support."""
     rows, matches = _mutually_nearest(part.descriptors, full.descriptors)
     before, angles_before = _pair_features(part, rows)
     after, angles_after = _pair_features(full, matches)

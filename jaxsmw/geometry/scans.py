@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
-# The largest share of lost vertices that is repaired. A mesh with more lost vertices is probably damaged. Its
-# lost vertices are kept, and later checks refuse far positions and positions that are not finite.
+# Lost vertices are moved only if their share is at most this number. A mesh with more lost vertices is
+# probably damaged. Its lost vertices are kept, and later checks refuse far positions and positions that are
+# not finite.
 _MOST_LOST = 1e-3
 # A vertex is lost if its distance from the median position exceeds `_FAR` times the 90th percentile of these
 # distances. It is also lost if its position is not finite. Some scans have coordinates of about 1e30, because
@@ -18,7 +19,7 @@ _SMALL, _LARGEST = 0.01, 0.5
 
 
 def usable_positions(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the positions that are finite and not very far from all others."""
+    """Return a mask, False for positions that are not finite or very far from the median position."""
     usable = np.isfinite(position).all(axis=1)
     if usable.any():
         with np.errstate(over="ignore", invalid="ignore"):
@@ -36,7 +37,10 @@ def lost_vertices(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"
 def between_neighbors(
     position: Float64[np.ndarray, "n 3"], triangles: Int64[np.ndarray, "f 3"], lost: Bool[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Move each lost vertex to the mean of the usable vertices in its faces, or of all usable vertices."""
+    """Move each lost vertex to the mean of its usable neighbours.
+
+    If a lost vertex has no usable neighbours, it is moved to the mean of all usable vertices.
+    """
     placed = position.copy()
     for vertex in np.flatnonzero(lost):
         around = np.unique(triangles[(triangles == vertex).any(axis=1)])

@@ -76,11 +76,13 @@ def nearest_facing_points(
     """Replace the nearest points that lie on triangles that face away.
 
     For example, if two legs touch, the nearest point of a point on one leg can lie on the other leg. A
-    triangle faces away if its normal and the normal at the point in space form an angle above 90 degrees. The
-    new nearest point is searched only on triangles whose normals have the same sign as the point's normal
-    along one axis. This axis is that of the largest component of the point's normal. The new point is used if
-    its triangle does not face away. Nothing is replaced if more than 20 % of the nearest triangles face away,
-    because the triangles of the mesh are then not oriented consistently.
+    triangle faces away if its normal and the normal at the point in space form an angle above 90 degrees.
+
+    For each replacement, the function chooses the axis along which the point's normal has its largest
+    component in absolute value. The function searches only triangles whose normals have the same sign along
+    this axis as the point's normal. The new point is used if its triangle does not face away. Nothing is
+    replaced if more than 20 % of the nearest triangles face away, because the triangles of the mesh are then
+    not oriented consistently.
 
     **Arguments:**
 

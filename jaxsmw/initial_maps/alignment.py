@@ -1,4 +1,4 @@
-"""The initial map of two shapes that are similar in space, such as teeth and bones."""
+"""Features for the initial map of two shapes that rigid alignment brings close together, such as teeth."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def landmark_features(
 
 
 def check_landmarks(pair: Pair, landmarks: np.ndarray) -> None:
-    """Check that integers are landmarks of a pair: a vertex of X and its match on Y in each row.
+    """Check that each row of an array of integers contains a vertex of X and its match on Y.
 
     **Raises:** `InputError` if `landmarks` does not have the shape (l, 2), or gives two matches to one vertex
     of X. `InputError` is also raised if a number in `landmarks` is not a referenced vertex.

@@ -63,7 +63,8 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
     **Returns:** `Landmarks` with l names and positions (l, 3) as in the file. The `name` is the path. The
     attribute `coordinates` is `"LPS"`, `"RAS"` or None. The `unit` is the unit that a `.mrk.json` file
     states, or None. Points are left out if Slicer has no defined position for them, or if they are not active
-    in MeshLab. The `notes` report these points, and what the file does not state.
+    in MeshLab. The `notes` report these points, a missing coordinate system in a file of Slicer, and an
+    ignored unit.
 
     **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, or is larger
     than 128 MiB (`.mrk.json`: 32 MiB). `InputError` is also raised if the file contains no landmarks or more
@@ -81,7 +82,7 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
 def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
     """Write landmarks to a file. Reading the file returns exactly the same names and positions.
 
-    The write is atomic: an incomplete file never appears under this name.
+    The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 

@@ -132,7 +132,7 @@ def usable(positions: Float64[np.ndarray, "*any"]) -> np.ndarray:
 
 
 class FaultyName(NamedTuple):
-    """The 0-based row of a name, the row of an earlier equal name (or None), and the fault in words."""
+    """A faulty name: its 0-based row, the row of an earlier equal name (or None), and the fault in words."""
 
     row: int
     earlier: int | None

@@ -1,8 +1,8 @@
 """Readers and writers of pointwise maps, and readers of landmarks.
 
-A file is text with one row per line, an array in NumPy's `.npy` format, or a matrix in MATLAB's `.mat`
-format. Files do not say whether their indices count from 0 or from 1. By default, indices count from 1 in
-`.mat` files, as in MATLAB, and from 0 in all other files. The argument `index_base` overrides the default.
+A file has one of three formats: text with one row per line, NumPy's `.npy`, or MATLAB's `.mat`. Files do not
+say whether their indices count from 0 or from 1. By default, indices count from 1 in `.mat` files, as in
+MATLAB, and from 0 in all other files. The argument `index_base` overrides the default.
 """
 
 from __future__ import annotations
@@ -121,8 +121,9 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 def check_map_name(path: str | os.PathLike[str]) -> None:
     """Check that a pointwise map can be written under a file name.
 
-    Suffixes that belong to other kinds of files are refused: pictures, pages, meshes, landmarks, and the
-    formats `.npz`, `.baryc_gt`, `.vts` and `.json`. All other names are accepted, including those of tables.
+    Suffixes that belong to other kinds of files are refused: pictures, pages, meshes, point clouds,
+    landmarks, and the formats `.npz`, `.baryc_gt`, `.vts` and `.json`. All other suffixes are accepted, such
+    as `.txt` and `.csv`.
 
     **Arguments:**
 
@@ -241,7 +242,7 @@ class Table:
 
         **Arguments:**
 
-        - `chosen`: the user's choice, 0 or 1, or None for the default of this file.
+        - `chosen`: the index base that the user chose, 0 or 1. None selects the default for this file.
         - `default`: the default for files that are not `.mat` files. For `.mat` files the default is 1.
         """
         if chosen is not None:

@@ -99,7 +99,7 @@ def _single_list(document: Any) -> dict[str, Any]:
 
 
 def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[str, ...]]:
-    """Return the coordinate system of a markup, and a note if the markup states none (so LPS applies)."""
+    """Return the coordinate system of a markup, and notes. If the markup states no system, LPS applies."""
     if "coordinateSystem" not in markup:
         return "LPS", ("The file states no coordinate system, so LPS applies, the default of the format.",)
     stated = markup["coordinateSystem"]
@@ -112,7 +112,7 @@ def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[
 
 
 def _unit(markup: dict[str, Any]) -> tuple[str | None, tuple[str, ...]]:
-    """Return the unit of length that a markup states, or None, and a note if the unit is not text."""
+    """Return the unit of length of a markup, and notes. A missing or invalid unit becomes None."""
     stated = markup.get("coordinateUnits")
     if stated is None or isinstance(stated, str):
         return stated, ()
@@ -120,7 +120,7 @@ def _unit(markup: dict[str, Any]) -> tuple[str | None, tuple[str, ...]]:
 
 
 def _is_defined(point: dict[str, Any], number: int) -> bool:
-    """Return whether the position of a control point is defined. Without a status, it counts as defined."""
+    """Return whether a control point has a defined position. A position without a status is defined."""
     status = point.get("positionStatus", "defined")
     if status != "defined" and status not in _NOT_DEFINED:
         _refuse(number, f"has the unknown position status {_excerpt(status)}")
@@ -128,7 +128,7 @@ def _is_defined(point: dict[str, Any], number: int) -> bool:
 
 
 def _excerpt(value: Any) -> str:
-    """Return the beginning of a text for messages. Other values can be long, so only their type is named."""
+    """Return the first 40 characters of a text, or the type of any other value, for an error message."""
     return ascii(value[:40]) if isinstance(value, str) else f"that is a {type(value).__name__}"
 
 

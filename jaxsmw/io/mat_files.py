@@ -144,7 +144,7 @@ def is_real(value: Any) -> bool:
 def write_variables(path: str | os.PathLike[str], variables: Mapping[str, Any]) -> None:
     """Write variables to a `.mat` file.
 
-    Lists are written as columns. The write is atomic: an incomplete file never appears under this name.
+    Lists are written as columns. The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 

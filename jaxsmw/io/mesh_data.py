@@ -99,10 +99,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     If a file has no faces, `jaxsmw.geometry.triangulate_points` adds faces, with the help of `normals`.
 
     A glTF file duplicates vertices along texture seams. All duplicates stay in the list of vertices, but
-    vertices at exactly the same position are welded, as if `weld` were True. The transforms of the nodes
-    are applied, and all meshes of the scene are joined in the order of the nodes. Skinned meshes stay in
-    their bind pose. Buffers in other files are read only if these files are in the folder of the glTF
-    file or below. Normals, tangents, animations and pictures in glTF files are not read.
+    vertices at exactly the same position are welded, as if `weld` were True. The transforms of the nodes are
+    applied, and all meshes of the scene are joined in the order of the nodes. Skinned meshes stay in their
+    bind pose. Buffers in other files are read only if these files are in the folder of the glTF file or in
+    its subfolders. Normals, tangents, animations and pictures in glTF files are not read.
 
     **Arguments:**
 
@@ -180,7 +180,7 @@ def _fans(
 
 
 def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarray:
-    """Return data with one row per triangle, which is copied from the row of the triangle's polygon.
+    """Return the data of the triangles: each row is a copy of the row of the triangle's polygon.
 
     Arrays that are too short are returned unchanged, because `MeshData` refuses them.
     """
@@ -190,7 +190,7 @@ def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarra
 
 
 def check_mesh_suffix(path: str | os.PathLike[str]) -> None:
-    """Check that a mesh can be written in the format of a file's suffix.
+    """Check that a file's suffix belongs to a format in which meshes can be written.
 
     **Raises:** `InputError` if the suffix belongs to no format.
     """
@@ -202,7 +202,7 @@ def check_mesh_suffix(path: str | os.PathLike[str]) -> None:
 
 
 def check_attribute_suffix(path: str | os.PathLike[str]) -> None:
-    """Check that a mesh can be written with attributes in the format of a file's suffix.
+    """Check that a file's suffix belongs to a format in which meshes can be written with attributes.
 
     **Raises:** `InputError` if the suffix belongs to no format, or to a format that holds only triangles.
     """
@@ -225,7 +225,7 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
     vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
     them again.
 
-    The write is atomic: an incomplete file never appears under this name.
+    The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 

@@ -1,4 +1,4 @@
-"""A reader and a writer of meshes without their data. `jaxsmw.io.mesh_data` lists the formats."""
+"""The functions `read_mesh` and `write_mesh`. `jaxsmw.io.mesh_data` lists the formats."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def write_mesh(
 
     **Raises:**
 
-    `InputError` for another suffix, colours with a wrong shape, type or range, or a file that cannot be
-    written.
+    `InputError` if the suffix is unknown, the file cannot be written, or `colors` has a wrong shape, type or
+    range.
     """
     data = {} if colors is None else {"colors": _bytes_of_colors(colors, len(mesh.vertices))}
     return write_mesh_data(path, MeshData(mesh, mesh.faces, vertex_data=data))

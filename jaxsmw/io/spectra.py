@@ -162,7 +162,7 @@ def _real(values: Any, what: str, name: str) -> np.ndarray:
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
-    """Read the eigenbasis of a shape from a `.npz` file of `write_spectrum`, or from a `.mat` file.
+    """Read the eigenbasis of a shape from a `.mat` file or a `.npz` file (see `write_spectrum`).
 
     The surface is scaled to area 1, as `make_spectrum` explains. The unit of length in the file is arbitrary.
 

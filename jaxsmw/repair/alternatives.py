@@ -113,8 +113,8 @@ class Alternatives:
     def _distinct(self, outcomes: Sequence[Outcome]) -> Iterator[Outcome]:
         """Choose outcomes that differ from each other, and yield them.
 
-        The given outcomes must be sorted by their scores. The setting `different_areas` contains the smallest
-        share of X's area on which a yielded outcome differs from all earlier ones.
+        The given outcomes must be sorted by their scores. Each yielded outcome differs from all earlier
+        outcomes on a minimum share of X's area; see `AlternativeSettings.different_areas`.
         """
         areas = self.settings.alternatives.different_areas
         # Each entry contains an outcome and its smallest difference from the outcomes yielded so far.
@@ -162,7 +162,7 @@ class Alternatives:
         """
         settings = self.settings.alternatives
         ends = extremities(self.x, settings.extremities), extremities(self.y, settings.extremities)
-        # Limbs of different animals differ in length. Distances divided by their mean are more similar.
+        # Limbs of different animals differ in length, so distances are divided by their mean.
         to_ends = [
             proxy.distances[:, of_side.samples] / (proxy.areas @ proxy.distances[:, of_side.samples])
             for of_side, proxy in zip(ends, (self.x, self.y), strict=True)

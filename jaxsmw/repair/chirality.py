@@ -114,11 +114,11 @@ class Hands:
     def evidence(self) -> float:
         """Compare a coarse map of X with a coarse map of the mirror image of X.
 
-        Nearest neighbours of SHOT with large radii give the initial maps of evenly spread samples. A feature
-        regression with few eigenvectors refines these maps. The comparison is repeated for each set of radii
-        in the settings. The smallest evidence is returned, because one of two wrong maps can be much better
-        than the other by chance. The method stops as soon as the evidence is clearly too small to support the
-        mirror image.
+        The samples are spread evenly over each shape. The initial maps take each sample to the sample with
+        the nearest SHOT descriptor. The SHOT descriptors have large radii. A feature regression with few
+        eigenvectors refines these maps. The comparison is repeated for each set of radii in the settings. The
+        smallest evidence is returned, because one of two wrong maps can be much better than the other by
+        chance. The method stops as soon as the evidence is clearly too small to support the mirror image.
 
         **Returns:** The evidence, a number without unit. Positive evidence supports the mirror image.
 
@@ -185,7 +185,7 @@ class Hands:
 
 
 class _Hand(NamedTuple):
-    """A shape or its mirror image, with SHOT at its samples and the principal components of SHOT."""
+    """A shape or its mirror image, with SHOT descriptors at its samples and their principal components."""
 
     shape: Proxy
     shot: Float[np.ndarray, "s r"]
@@ -212,8 +212,9 @@ class Decision(NamedTuple):
     - `evidence`: the evidence for the mirror image; see `Hands`. None if no evidence was computed, for
       example because the shapes are their own mirror images.
     - `doubtful`: whether the decision is uncertain. For asymmetric shapes, the decision is uncertain if the
-      evidence is near `mirrored_from`. If the asymmetry is up to `asymmetry_doubt` below `asymmetric_from`,
-      evidence for the mirror image makes the decision uncertain. `ChiralitySettings` contains the thresholds.
+      evidence is near `mirrored_from`. With an asymmetry from `asymmetric_from - asymmetry_doubt` to
+      `asymmetric_from`, the decision is uncertain if the evidence is at least `mirrored_from`.
+      `ChiralitySettings` contains the thresholds.
     - `asymmetric`: whether the mean asymmetry of X and Y is at least `asymmetric_from`.
     """
 

@@ -47,7 +47,7 @@ def expected_error(
     - `reverse_map`: a map Y -> X (n,), 0-based vertices of X.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, in `Pair.units_of_length` and without padding.
     - `settings`: the weights of the estimate.
-    - `scores`: the settings of the faults and of the area-based shape difference.
+    - `scores`: the settings of `discontinuous_parts`, `orientation_reversal` and `area_shape_difference`.
 
     **Returns:** The expected geodesic distance between every match and the true match (m,), divided by the
     square root of Y's area.

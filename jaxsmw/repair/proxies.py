@@ -87,7 +87,7 @@ def distance_error(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"]) -> float:
 
 
 def deformation(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"], radius: float) -> float:
-    """Measure how far a map is from moving every patch of X rigidly.
+    """Measure how far a map deviates from a rigid motion on each patch of X.
 
     The patch of a sample consists of all samples at a geodesic distance below `radius`. A rotation and a
     translation carry the patch as close as possible to its matches. The residual is the mean squared distance

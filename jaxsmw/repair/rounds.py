@@ -39,14 +39,15 @@ def refine_in_stages(
     position `repair.stage` is called the repeated stage.
 
     1. Alternatives: `jaxsmw.repair.alternatives` refines many initial maps on a thousand samples. The best of
-       these maps, at most `finalists`, are then refined by the repeated stage and all later stages. Of these
-       outcomes and the first outcome, the outcome with the best score is kept. If it looks right, repair
-       ends.
+       these maps, at most `finalists`, are then refined by the repeated stage and all later stages. The
+       outcome with the best score is kept, which can also be the outcome of the original initial map. If the
+       kept outcome looks right, repair ends.
     2. Rounds: each round runs the repeated stage and all later stages again. The first functional map of the
        repeated stage is computed without the vertices that have a fault in the previous map. If a map has
-       both orientation reversal and discontinuous parts, successive rounds leave out these two faults
-       alternately. The outcome with the second-best score is repaired in the same way if it has faults. It is
-       used if all its faults disappear and its score is the best.
+       both orientation reversal and discontinuities, each round leaves out the vertices of only one of these
+       faults, and successive rounds alternate. The outcome of step 1 with the second-best score is also
+       repaired by rounds and by the fallback if it has faults. It is used if all its faults disappear and its
+       score is the best.
     3. Fallback: the repeated stage and all later stages run once more, from the best outcome of the rounds.
        The repeated stage then uses the numbers of eigenvectors in `fallback_levels`. The map of the fallback
        is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
@@ -273,7 +274,8 @@ class _Repairer:
 
         **Arguments:**
 
-        - `outcome`: the outcome. The refinements of its stages before the repeated stage are kept.
+        - `outcome`: the outcome. If it contains refinements of all stages, its refinements before the
+          repeated stage are kept.
         - `stage`: a stage that runs instead of the repeated stage.
         - `excluded`: a mask of the vertices of X (m,) that the repeated stage leaves out. If the stage uses
           samples, the vertices are left out only in its first functional map.

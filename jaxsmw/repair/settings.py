@@ -22,8 +22,8 @@ class ScoreSettings:
       discontinuous if the distance between the matches of its ends is at least `discontinuity_distance` and
       at least `discontinuity_ratio` times the length of the edge. On bodies of 5000 vertices, the distance
       between the matches of neighbouring vertices is 0.03 times the square root of the area.
-    - `orientation_eigenvectors`: the number of eigenvectors in whose span the density of signed area is
-      smoothed.
+    - `orientation_eigenvectors`: the number of eigenvectors that smooth the density of signed area. The
+      density is projected onto the span of these eigenvectors.
     - `orientation_threshold`: a map reverses the orientation where the smoothed density of signed area is
       below this value. For an isometry, the density is 1.
     - `orientation_weight` (Table R6): the weight of orientation reversal in the distortion. This weight
@@ -115,16 +115,17 @@ class AlternativeSettings:
     - `radii`: a tuple with one entry for each initial map from SHOT alone. Each entry is a tuple of radii,
       which are positive integers in units of 0.06.
     - `extremities`: the settings of the search for extremities, an `ExtremitySettings`.
-    - `compared_pairings`: the number of pairings of extremities that are ranked by the similarity of
-      features. Only the pairings that best preserve the distances between extremities are ranked.
+    - `compared_pairings`: the largest number of pairings of extremities in the comparison of features. The
+      most plausible pairings are compared; see `jaxsmw.repair.extremities.plausible_pairings`.
     - `pairings` (Table R27): the number of initial maps from pairings of extremities.
-    - `distance_weight`, `position_weight`: the weights of squared differences of relative distances and of
-      relative positions. In the initial maps, squared differences of SHOT have the weight 1.
+    - `distance_weight`: the weight of the distances to extremities in the search for initial maps. SHOT has
+      the weight 1.
+    - `position_weight`: the weight of the positions along the principal axes in the same search.
     - `levels`, `descriptors`: the levels and the number of descriptors of the feature regression that refines
       the initial maps.
     - `repaired`: the number of refined maps that are refined again without their faults.
     - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
-    - `patch_radius` (Table R28): the radius of the patches of the deformation.
+    - `patch_radius` (Table R28): the radius of the patches on which the deformation is measured.
     - `different_areas` (Table R27): a tuple of shares of X's area, each above 0. The second alternative map
       must differ from the first map on at least the first share. Each further map must differ from all maps
       before it on at least the next share. The last share also applies to all remaining maps.
@@ -154,8 +155,10 @@ class RepairSettings:
 
     The settings are passed as `Preset(stages, repair=RepairSettings(...))` and take effect in `jaxsmw.match`.
     A map is judged by its distortion and by its faults. The distortion is 1 for isometries and larger for
-    worse maps. The faults are vertices with orientation reversal, and parts that discontinuities separate
-    from the rest of X. Tables and entries R1, R2, … are in `docs/research_log.md`.
+    worse maps. There are two kinds of faults: vertices where the map reverses the orientation, and parts of X
+    that discontinuous edges separate from the rest.
+
+    Tables and entries R1, R2, … are in `docs/research_log.md`.
 
     **Attributes:**
 
@@ -196,13 +199,13 @@ class RepairSettings:
       of one body.
     - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
       value, coarse passes and one usual pass run instead of the usual passes. A value below `non_isometric`
-      has the same effect as `non_isometric`. Coarse passes also run for all maps of full shapes that start
-      from `"aligned"` (entry R24).
+      has the same effect as `non_isometric`. For two full shapes with the initial map
+      `"aligned"`, coarse passes always run (entry R24).
     - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass. If
-      the refiner of the last stage has no levels, coarse passes are usual passes.
-    - `rivals` (Table R36): the largest number of rivals. If the best outcome of the repair still looks wrong,
-      the passes also refine its rivals, which have the next best scores. The best outcome after the passes is
-      chosen.
+      the refiner of the last stage has no levels, each coarse pass is the same as a usual pass.
+    - `rivals` (Table R36): the largest number of rivals. Rivals are the outcomes of the repair with the next
+      best scores after the best outcome. If the best outcome still looks wrong, the passes also refine the
+      rivals. The best outcome after the passes is chosen.
     - `aligned_preference` (entry R24): a number of at least 0. With `init="auto"`, asymmetric shapes are
       matched from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean
       expected error is below this multiple of the other map's mean expected error. Both expected errors are
@@ -274,12 +277,13 @@ class ChiralitySettings:
       descriptors hardly distinguish a tooth from its mirror image.
     - `descriptors`, `levels`: the number of descriptors and the levels of the feature regression
       that refines coarse maps.
-    - `asymmetry_radii` (entry R23): the radii of SHOT for the asymmetry, in the same unit.
+    - `asymmetry_radii` (entry R23): the radii of SHOT when the asymmetry is computed, in the unit of
+      `radii`.
     - `asymmetric_from` (entry R23): shapes are asymmetric if the mean asymmetry of X and Y is at least this
       value. If the mean asymmetry is smaller, X itself is matched.
-    - `asymmetry_doubt` (entry R23): evidence is also computed if the mean asymmetry is below
-      `asymmetric_from` by at most this value. In this case, the decision is doubtful if the evidence supports
-      the mirror image.
+    - `asymmetry_doubt` (entry R23): evidence is computed if the mean asymmetry is at least
+      `asymmetric_from - asymmetry_doubt`. For shapes that are not asymmetric, the decision is doubtful if the
+      evidence supports the mirror image.
     - `mirrored_from` (entry R21): for asymmetric shapes, the mirror image of X is matched if the evidence is
       at least this value.
     - `doubt` (entry R21): for asymmetric shapes, the decision is doubtful if the difference between the

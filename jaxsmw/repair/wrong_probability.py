@@ -14,7 +14,7 @@ def wrong_probability(
 ) -> float:
     """Estimate the probability that a map is wrong, without ground truth.
 
-    A map is called wrong if at least 2 % of X's area have errors above 0.25 times the square root of Y's
+    A map is called wrong if its errors exceed 0.25 times the square root of Y's area on at least 2 % of X's
     area. Maps with swapped limbs, mirrored maps and upside-down maps are wrong in this sense. A map with only
     small errors is not wrong in this sense. The estimate is a logistic regression on the logarithms of the
     distortion and of the mean expected error.

@@ -201,8 +201,8 @@ def layout(
 ) -> Float64[np.ndarray, "N 2"]:
     """Place shapes as points in the plane. The distances of the points resemble the distances of the shapes.
 
-    The distance of two aligned shapes is the root mean square, over the surface, of the distances of
-    corresponding points. Classical multidimensional scaling gives the initial places (Torgerson 1952).
+    The distance between two aligned shapes is the weighted root mean square of the distances between
+    corresponding vertices. Classical multidimensional scaling gives the initial places (Torgerson 1952).
     Majorisation then reduces the sum of the squared differences between the distances in the plane and the
     distances of the shapes (de Leeuw, "Applications of convex analysis to multidimensional scaling", 1977).
 

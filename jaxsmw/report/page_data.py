@@ -93,9 +93,10 @@ def encode_shape(mesh: Mesh, standing: Mesh) -> dict[str, Any]:
     """Encode a shape: its upright mesh, its name, and the transformation from the page to its file.
 
     The page stores the positions of vertices in float32, but computes in float64. To convert a point on a
-    triangle to the coordinates of the file, the page interpolates the shown corners. The page then applies a
-    similarity transformation (`jaxsmw.report.standing.placement`). The error of a point is at most 1e-7 times
-    the diagonal of the bounding box, plus the float64 rounding of the file's own coordinates.
+    triangle to the coordinates of the file, the page interpolates the stored positions of the triangle's
+    corners. The page then applies a similarity transformation (`jaxsmw.report.standing.placement`). The error
+    of a point is at most 1e-7 times the diagonal of the bounding box, plus the float64 rounding of the file's
+    own coordinates.
 
     **Arguments:**
 

@@ -105,9 +105,9 @@ def write_report(
       default, `Correspondence.expected_error` computes it.
     - `settings`: a dictionary of settings to include in `summary.json`. The settings must be serialisable as
       JSON.
-    - `seconds`: a dictionary from the name of each step of the run so far to its wall time in seconds; by
-      default `correspondence.seconds`. The steps must not overlap, because the report adds its own steps and
-      prints the sum as the total time.
+    - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds. The
+      default is `correspondence.seconds`. The steps must not overlap, because the report adds its own steps
+      and prints the sum as the total time.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
     - `registered`: the registered mesh that the page shows. By default, the page shows the result of
@@ -196,7 +196,10 @@ def _save_figures(
     errors: Mapping[str, GeodesicError],
     up: Axis | None,
 ) -> tuple[list[Path], dict[Path, str]]:
-    """Write all figures. Return their files, and the captions of those figures that are also on the page."""
+    """Write all figures. Return their files, and a dictionary from files to captions.
+
+    The dictionary contains only figures that are also on the page.
+    """
     mesh_x, mesh_y = correspondence.mesh_x, correspondence.mesh_y
     convention = correspondence.preset.stages[-1].refiner.convention
     figures = {
@@ -255,8 +258,8 @@ def write_comparison(
     - `errors`: a dictionary from the same names to the `GeodesicError` of each map. The page shows these
       errors as colours. The page also contains the correspondence quality curves, and a table of statistics
       such as the mean errors.
-    - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
-      length.
+    - `partial`: whether one mesh is a partial shape and the other mesh the full shape. If True, both meshes
+      must have the same unit of length.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
 
@@ -391,8 +394,8 @@ def summarize(
     - `correspondence`: the result of `match`.
     - `errors`: a dictionary from the name of each map to its `GeodesicError`.
     - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
-    - `seconds`: a dictionary from the name of each step of the run so far to its wall time in seconds; by
-      default `correspondence.seconds`.
+    - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds. The
+      default is `correspondence.seconds`.
 
     **Returns:** A dictionary from the label of each value to the value as text, in the order of display.
     """

@@ -98,7 +98,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
 
 
 def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
-    """Return a dictionary from each pair (source, target) to its mean error, without failed pairs.
+    """Return a dictionary from each pair (source, target) to its mean error. Failed pairs are left out.
 
     The errors are in the unit of `MethodSummary.mean`.
     """

@@ -63,9 +63,9 @@ def stack(spectra: Sequence[Spectrum]) -> Spectrum:
 
 
 def check_devices(devices: Sequence[jax.Device] | None) -> None:
-    """Check that devices are a list of at least one JAX device, or None.
+    """Check that `devices` is None or contains at least one JAX device and nothing else.
 
-    **Raises:** `InputError` if they are anything else.
+    **Raises:** `InputError` if not.
     """
     if devices is None:
         return

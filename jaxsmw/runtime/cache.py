@@ -139,7 +139,7 @@ _recomputing: ContextVar[bool] = ContextVar("recomputing", default=False)
 
 @contextmanager
 def recomputing() -> Iterator[None]:
-    """Ignore existing entries of the cache in the block, so that computation times can be measured.
+    """Make `cached` compute all results again within the `with` block, to measure computation times.
 
     The results are still written to the cache.
     """

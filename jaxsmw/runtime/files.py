@@ -144,7 +144,7 @@ def remove_leftovers(directory: Path) -> None:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check that `atomic_write` can write a file, without leaving a new file behind.
+    """Check that `atomic_write` can write a file. The check leaves no new file.
 
     **Raises:**
 
@@ -214,7 +214,7 @@ def _reason(error: OSError | ValueError) -> str:
 
 
 def check_directory(path: str | os.PathLike[str]) -> None:
-    """Check that `make_directory` can succeed, without leaving a new directory behind.
+    """Check that `make_directory` can succeed. The check leaves no new directory.
 
     **Raises:**
 

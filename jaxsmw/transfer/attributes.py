@@ -242,7 +242,11 @@ def _without(values: Mapping[str, _Value], names: Collection[str]) -> dict[str, 
 
 
 def _notes(data: MeshData, target: MeshData, registered: RegisteredMesh) -> list[str]:
-    """Return sentences about normals, replaced data of the target, and vertices far from the source."""
+    """Return notes about the transfer, each as a sentence.
+
+    A note says that normals were not transferred, which data of the target were replaced, or how many
+    vertices of the target are far from the registered mesh.
+    """
     notes = []
     if NORMALS in data.vertex_data:
         notes.append("normals were not transferred, because they describe the shape of the source.")

@@ -19,7 +19,7 @@ _UNCOVERED, _MISSING = 0.005, 0.03
 
 
 class Attraction(NamedTuple):
-    """Points of the source (c,) that are drawn to vertices of the target.
+    """The c pairs of a point of the source and a vertex of the target that attracts this point.
 
     **Attributes:**
 
@@ -65,10 +65,10 @@ class UncoveredVertices:
     def attraction(
         self, positions: Float64[np.ndarray, "m 3"], strengths: Float64[np.ndarray, " m"]
     ) -> Attraction | None:
-        """Return the attraction of points of a deformed X to the uncovered vertices of Y.
+        """Return the uncovered vertices of Y, each with the point of the deformed X that it attracts.
 
-        The first call excludes the vertices whose distance from X is at most half of the limit. Later calls
-        ignore these vertices.
+        The first call excludes each vertex of Y whose distance from X is at most half of the limit
+        `_UNCOVERED`. Later calls also ignore these vertices.
 
         **Arguments:**
 

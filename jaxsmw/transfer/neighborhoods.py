@@ -14,9 +14,9 @@ from scipy.sparse import csr_array, diags_array
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.rotations import nearest_rotations
 
-# Moments are averaged over neighbouring vertices this number of times. More averagings enlarge the
-# neighbourhood of each vertex. With fewer averagings, the similarity transformations follow the noise of the
-# map. (Entry R22 of docs/research_log.md)
+# `similarities` averages its moments over neighbouring vertices _AVERAGINGS times. More averagings enlarge
+# the neighbourhood of each vertex. With fewer averagings, the similarity transformations follow the noise of
+# the map. (Entry R22 of docs/research_log.md)
 _AVERAGINGS = 8
 # Cotangent weights of very obtuse triangles are negative, and those of slivers are huge. Weights are limited
 # to the range from 1/_WEIGHT_RANGE to _WEIGHT_RANGE times the median weight.
@@ -100,12 +100,12 @@ class Neighborhoods:
 
     @cached_property
     def squared_lengths(self) -> Float64[np.ndarray, " n"]:
-        """For each vertex, the weighted sum of its squared edge lengths, averaged like the moments."""
+        """The weighted sum of the squared edge lengths at each vertex, averaged over its neighbourhood."""
         of_edges = self.weights * (self.vectors**2).sum(axis=1)
         return self._averaged(self._matrix(of_edges, of_edges).sum(axis=1))
 
     def _matrix(self, forward: Float64[np.ndarray, " e"], backward: Float64[np.ndarray, " e"]) -> csr_array:
-        """Return the matrix (n, n) with an entry for each edge in both directions."""
+        """Return a matrix (n, n) with two entries per edge: `forward` at (i, j) and `backward` at (j, i)."""
         first, second = self.edges.T
         at = np.concatenate([first, second]), np.concatenate([second, first])
         n = len(self.mesh.vertices)

@@ -37,11 +37,10 @@ class _Round(NamedTuple):
       nothing is pulled or drawn to the target.
     - `factor`: the factor by which weights at flipped faces and at their neighbours are multiplied.
     - `neighbors`: the largest distance to these neighbours, in edges.
-    - `pull`: if positive, the round pulls vertices with reduced weights to the target. The goal of a vertex
-      is its nearest point of the target, moved along the target halfway to the vertex's point of the map. The
-      number is the weight of these goals, relative to the weight of the map elsewhere.
+    - `pull`: if positive, vertices with reduced weights are pulled to the target. The function `_halfway`
+      computes the goals of these vertices. The weight of a goal is `pull` times the usual weight of the map.
     - `cover`: if positive, the round draws the source to vertices of the target that the source does not
-      reach. The number is the weight of these vertices, relative to the weight of the map elsewhere.
+      reach. The weight of such a vertex is `cover` times the usual weight of the map.
     """
 
     deformations: int
@@ -82,7 +81,7 @@ class RegisteredMesh:
       to the registered mesh. The scales include the change from X's unit of length to Y's.
 
     An unreferenced vertex of X moves with the nearest referenced vertex. Both vertices have the same
-    similarity transformation. A duplicate that welding replaced has exactly the position of its twin.
+    similarity transformation. Vertices that welding merges keep exactly the same position.
     """
 
     mesh_x: Mesh
@@ -392,8 +391,9 @@ def _follow(
         system, right = system + attraction.matrix(), right + attraction.right_side()
     residual = right - system @ positions
     # Without an attraction, the row sums of the system are `weights`, and all entries off the diagonal are
-    # negative. Therefore the error of every position is at most the largest ratio of a residual to the weight
-    # of the same vertex. The criterion stays correct where small weights make the system ill-conditioned.
+    # negative. If the residual of each vertex is divided by its weight, the largest quotient bounds the
+    # errors of all positions. This criterion stays correct where small weights make the system
+    # ill-conditioned.
     moving = (np.abs(residual).max(axis=1) > _KEPT * stiffness * weights).astype(float)
     rows = np.flatnonzero(around.averaging @ moving)
     if not len(rows):

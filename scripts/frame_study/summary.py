@@ -124,8 +124,8 @@ class Study:
     def contrast(self, variant: Variant, reference: Variant, data_set: str) -> str:
         """Return a text with the mean difference between the errors of two variants.
 
-        The mean leaves out pairs on which at least one of the variants failed. The text states the number of
-        these pairs.
+        The mean leaves out pairs on which at least one of the variants failed. If only some pairs are left
+        out, the text states their number.
         """
         differences = self.errors(variant, data_set) - self.errors(reference, data_set)
         both = np.isfinite(differences)

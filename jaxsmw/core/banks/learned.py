@@ -50,7 +50,7 @@ class SoftmaxFrame(FilterBank):
 
         At each knot, the squared filters of the frame are proportional to the squared filters of the bank.
         The bank is evaluated at `knots` evenly spaced points from 0 to 1. The bank also receives these points
-        as the eigenvalues of a shape.
+        as its argument `eigenvalues`.
 
         **Arguments:**
 

@@ -117,8 +117,8 @@ class Gabor(FilterBank):
     **Arguments:**
 
     - `filters`: the number of filters, at least 2. The default is 6.
-    - `width`: the standard deviation of the Gaussians, in units of the spacing between their centres, by
-      default 0.5. The value is a single positive number, or an array of shape ().
+    - `width`: the standard deviation of the Gaussians, in units of the spacing between their centres. The
+      value is a single positive number, or an array of shape (). The default is 0.5.
 
     **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
     `width` is not a single positive, finite number.

@@ -211,7 +211,8 @@ class Prediction(NamedTuple):
       and this matrix is the query point in the nearest-neighbour search.
     - `database`: the matrix (d_in, d_out) for target vertices. The product of the features of a target vertex
       and this matrix is the target point in the nearest-neighbour search.
-    - `uncertainty`: half the log-determinant of the residual covariance, restricted to the active features.
+    - `uncertainty`: half the log-determinant of the covariance of the residuals. Eigenvectors that the
+      iteration does not use are left out.
     """
 
     queries: Float[Array, "d_out d_out"]

@@ -159,10 +159,10 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
         """Return points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
-        The coordinates are weighted positions, normals and eigenfunctions, with and without deformation, and
-        then weighted descriptors. In the first array, the coordinates after deformation of X onto Y come
-        first. In the second array, the coordinates after deformation of Y onto X come second. Positions are
-        in units of the square root of the area.
+        Each point contains the weighted position, normal and eigenfunctions of a vertex twice, after
+        deformation and without deformation. The weighted descriptors of the vertex follow. In the first
+        array, the coordinates after deformation of X onto Y come first. In the second array, the coordinates
+        after deformation of Y onto X come second. Positions are in units of the square root of the area.
         """
         return _product_space(prepared.x, prepared.all_y, state, state.descriptor_weight)
 
@@ -217,7 +217,7 @@ class _Surface(NamedTuple):
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
-        """Return the surface restricted to the given vertices (s,), which have the given spectrum."""
+        """Return the data of the given vertices (s,). `spectrum` must be the spectrum of these vertices."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)

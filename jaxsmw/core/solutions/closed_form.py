@@ -37,7 +37,7 @@ class PreparedFiltering(NamedTuple):
 
 
 class Filtering(Solution[PreparedFiltering]):
-    """A solution for Parseval frames, which filters the functional map C_0 of a pointwise map T.
+    """A solution that filters the functional map C_0 of a pointwise map T. It is meant for Parseval frames.
 
     The result is `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (equation (8) of the MWP paper), where g_l
     are the filters of the bank. The diagonal matrix Lambda_out contains the eigenvalues of the shape that C

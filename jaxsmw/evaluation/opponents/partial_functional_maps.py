@@ -28,10 +28,10 @@ This implementation differs from the paper in the following points.
 
 - **Initial values.** The paper starts from v = 1 and a C that does not depend on the pair. In this
   implementation, the first C is computed from the initial map, from which all compared methods start.
-- **Iterations.** A few steps of spectral ICP follow each minimisation over C. Each step makes the rows of C
-  orthonormal, like the final refinement in the paper. Without steps of spectral ICP, the computed regions are
-  wrong. The computed region was compared with the true region on three real pairs. The intersection over
-  union of both regions is 39, 21 and 21 % without spectral ICP, and 83, 81 and 43 % with spectral ICP.
+- **Iterations.** A few steps of spectral ICP follow each minimisation over C. Like the final refinement in
+  the paper, each step makes the rows of C orthonormal. Without spectral ICP, the computed regions are wrong.
+  The computed region was compared with the true region on three real pairs. The intersection over union of
+  both regions is 39, 21 and 21 % without spectral ICP, and 83, 81 and 43 % with spectral ICP.
 - **Region.** Each minimisation over v starts from the image of the constant function under C, clipped to
   [0, 1]. If a minimisation starts from v = 1 or from the previous v, it does not correct wrong regions. The
   reason is that the derivative of eta nearly vanishes where v is near 0 or 1.
@@ -46,8 +46,8 @@ This implementation differs from the paper in the following points.
   v. In the paper, xi(v) vanishes unless v is near 1/2.
 - **Weights.** Y has area 1, and column norms are averaged instead of summed. The units of the weights
   therefore differ from those in the paper. The weights mu_1 = mu_3 = 1 and mu_2 = 100 have the published
-  values, and the fidelity term is multiplied by `FIDELITY` in the minimisation over C. `FIDELITY` and mu_5
-  were chosen on four real pairs. No other value of mu_4 was tested.
+  values. The minimisation over C multiplies the fidelity term by `FIDELITY`. `FIDELITY` and mu_5 were chosen
+  on four real pairs. No other value of mu_4 was tested.
 - **Recovery.** The nearest-neighbour search includes all vertices of Y. A search among only the vertices of
   the region gave the same maps, or worse maps if the region was wrong.
 - **Solver.** Limited-memory BFGS (L-BFGS) of the library optimistix minimises the energies in a bounded
@@ -151,7 +151,7 @@ class SurfaceGradient(eqx.Module):
         )
 
     def total_variation(self, function: Float[Array, " n"]) -> Float[Array, ""]:
-        """Return the total variation of a function, the integral of the gradient's length over the surface.
+        """Return the total variation of a function: the integral of the gradient's length over the surface.
 
         The Mumford-Shah term of the paper is the total variation if xi = 1. The length of the gradient is
         smoothed at zero.

@@ -39,7 +39,7 @@ MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.valu
 
 
 def known_methods() -> dict[str, Method]:
-    """Return a dictionary from name to method: `METHODS` and the methods of other installed libraries."""
+    """Return `METHODS` and the methods of other installed libraries, as a dictionary from name to method."""
     return METHODS | installed_peers()
 
 

@@ -15,8 +15,8 @@ from jaxsmw.io.formats.data import COLORS, Polygons, Skin, unique_name, unique_n
 from jaxsmw.io.formats.gltf_accessors import COLUMNS, DAMAGED, Document, as_floats
 from jaxsmw.wording import count_of
 
-# Limits for the numbers of vertices, of corners, of displacements (one per vertex and blend shape), and of
-# weights (one per vertex and joint).
+# The largest accepted numbers of vertices, triangle corners, displacements and weights. There is one
+# displacement per vertex and blend shape, and one weight per vertex and joint.
 LARGEST_VERTICES, LARGEST_CORNERS, LARGEST_SHAPES, LARGEST_WEIGHTS = 10**7, 6 * 10**7, 2**24, 2**25
 RECORD = "jaxsmw"
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -306,7 +306,7 @@ class _Scene:
         return coordinates, number[corners]
 
     def _shapes(self, n: int) -> dict[str, np.ndarray]:
-        """Return all blend shapes. If a part lacks a blend shape, its displacements are zero."""
+        """Return all blend shapes. A blend shape that a part lacks does not displace the part's vertices."""
         names = list(dict.fromkeys(name for part in self.parts for name in part.shapes))
         if len(names) * n > LARGEST_SHAPES:
             raise InputError("has too many blend shapes for its vertices: export fewer blend shapes.")
@@ -345,7 +345,10 @@ def _has_copies(vertices: np.ndarray) -> bool:
 
 
 def _without_copies(polygons: Polygons, record: dict[str, Any], document: Document) -> Polygons:
-    """Join the copies of vertices that `format_gltf` made along texture seams and listed in `record`."""
+    """Join the vertices that `format_gltf` duplicated along texture seams.
+
+    `record` lists the original of each vertex.
+    """
     n = len(polygons.vertices)
     original, texture = (
         document.view(record.get(key), 0, n, "i4", 1)[:, 0].astype(np.int64)

@@ -204,7 +204,7 @@ class Document:
     def accessor(
         self, index: Any, columns: tuple[int, ...], rows: int | None = None
     ) -> tuple[np.ndarray, bool]:
-        """Return the numbers of an accessor (rows, columns), and whether they are stored fractions.
+        """Return the numbers of an accessor (rows, columns), and whether these numbers represent fractions.
 
         A fraction is stored as an integer, which `as_floats` divides by the largest integer of its type.
 

@@ -208,7 +208,10 @@ def _split(
 
 
 def _semantic(name: str, values: np.ndarray) -> str:
-    """Return the attribute's name for vertex data. Application-specific names begin with an underscore."""
+    """Return the name of the glTF attribute for an array of vertex data.
+
+    Application-specific names begin with an underscore.
+    """
     if is_color(name, values):
         return "COLOR_0"
     columns = values.shape[1] if values.ndim == 2 else 1

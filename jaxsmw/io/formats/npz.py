@@ -101,7 +101,7 @@ def check_header(stream: Any, size: int) -> None:
 
 
 def format_npz(data: MeshData) -> Written:
-    """Format everything as arrays, without any loss."""
+    """Format a mesh and all its data as arrays, without any loss."""
     arrays: dict[str, Any] = {"vertices": data.mesh.vertices, "faces": data.faces}
     for folder in _FOLDERS:
         for name, values in getattr(data, folder).items():

@@ -13,7 +13,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.io.formats.data import COLORS, MeshData, Polygons, Written, always, is_color, omissions
 from jaxsmw.io.formats.lines import excerpt, numbers, polygon_lines, text
 
-# The name of each label, and its keyword in OBJ files. A statement applies to all faces after it.
+# A dictionary from each kind of label to the keyword of its lines in OBJ files. Such a line sets the label of
+# all faces below it, up to the next line with this keyword.
 _LABELS = {"group": "g", "object": "o", "material": "usemtl"}
 _NO_NAME = "default"
 
@@ -172,7 +173,7 @@ def _fits_vertices(name: str, values: np.ndarray) -> bool:
 
 
 def _fits_faces(data: MeshData, name: str) -> bool:
-    """Return whether an array contains labels with names that an OBJ file can contain."""
+    """Return whether the face data `name` are labels that can be written to an OBJ file."""
     names = data.label_names.get(name, ())
     return (
         name in _LABELS

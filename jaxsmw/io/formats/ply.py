@@ -136,7 +136,7 @@ def _numbers_of(table: Mapping[str, _Column], properties: Mapping[str, _Property
 
 
 def _grouped(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Join the components of colours, the components of normals, and a_0, a_1, …, into one array each."""
+    """Join the components of colours and normals, and numbered properties such as a_0 and a_1, to arrays."""
     columns: dict[str, list[str]] = {}
     for group, components in _COLUMNS_OF.items():
         if all(name in data for name in components[:3]):

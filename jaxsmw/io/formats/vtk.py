@@ -241,7 +241,10 @@ class _File:
                 self.truncated(count)
 
     def take_cells(self, kind: int, count: int, size: int) -> Cells:
-        """Return cells. Files since version 5 store offsets and corners; older files, sizes and corners."""
+        """Return cells.
+
+        Files of version 5 store offsets and corners. Older files store sizes and corners.
+        """
         if self.major >= 5:
             parts = []
             for keyword, length in (("OFFSETS", count), ("CONNECTIVITY", size)):

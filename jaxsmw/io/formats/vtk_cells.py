@@ -1,4 +1,4 @@
-"""What VTK's two formats have in common: cells of several types, and arrays on points and cells."""
+"""Cells of several types, and arrays on points and cells, for both VTK formats."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def joined(groups: list[Cells]) -> Cells:
 
 
 def numbers_of(words: list[str], kind: str) -> np.ndarray:
-    """Return the numbers in words as an array of a type such as `f4`."""
+    """Convert texts such as `1.5` to an array of numbers of a type such as `f4`."""
     text = " ".join(words)
     try:
         if re.search(r"[^\x20-\x7e]|_", text):  # NumPy would read 1_0 as 10
@@ -127,7 +127,7 @@ def _within(corners: np.ndarray, n: int) -> bool:
 
 
 def _without_strips(cells: Cells, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Split triangle strips into triangles, and drop the cells that are not used.
+    """Drop the cells for which `used` is False, and split triangle strips into triangles.
 
     Return the size of each polygon, the corners of all polygons, and the cell from which each polygon comes.
     """

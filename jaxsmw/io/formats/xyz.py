@@ -22,9 +22,10 @@ _UNIT = 0.01
 def parse_xyz(data: bytes) -> Polygons:
     """Parse a text file whose lines begin with x, y and z, separated by spaces, tabs, commas or semicolons.
 
-    A line has decimal commas if spaces, tabs or semicolons separate at least three words and each word is a
-    number without a decimal point. A first line without any number is a header. A first line with one whole
-    number is the number of points.
+    Each line is first split at spaces, tabs and semicolons. If this gives at least three words, and all words
+    are numbers without a decimal point, commas are decimal commas. Otherwise, commas also separate words.
+
+    A first line without any number is a header. A first line with one whole number is the number of points.
     """
     if b"\0" in data[:4096]:
         raise InputError("is not a text file in ASCII or UTF-8: save the points as text.")
