@@ -27,6 +27,7 @@ from jaxsmw.transfer import (
     transfer_landmarks,
 )
 from jaxsmw.transfer.coverage import UncoveredVertices
+from jaxsmw.transfer.landmarks import nearest_vertices
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 from jaxsmw.transfer.registered_mesh import _follow
 
@@ -354,6 +355,17 @@ class TestLandmarks:
         assert moved.landmarks.names == landmarks.names and moved.landmarks.coordinates == "RAS"
         assert moved.source_distances.max() < 1e-12
         assert moved.expected_errors is None and moved.notes == ()
+
+    def test_landmarks_at_vertices_give_the_vertices(self):
+        shared = {"a": (3, 30), "b": (3, 30), "c": (5, 50), "d": (5, 51)}  # d contradicts c, b agrees with a
+
+        def at(mesh: Mesh, names: str, column: int) -> Landmarks:
+            return Landmarks(tuple(names), mesh.vertices[[shared[name][column] for name in names]])
+
+        landmarks = (at(self.mesh_x, "abc", 0), at(self.mesh_y, "abc", 1))
+        assert nearest_vertices(*landmarks, self.mesh_x, self.mesh_y).tolist() == [[3, 30], [3, 30], [5, 50]]
+        with pytest.raises(InputError, match="'c' and 'd' have the same nearest vertex"):
+            nearest_vertices(at(self.mesh_x, "abcd", 0), at(self.mesh_y, "abcd", 1), self.mesh_x, self.mesh_y)
 
     def test_a_far_landmark_is_noted(self):
         landmarks = self.landmarks()

@@ -107,13 +107,12 @@ def nearest_vertices(
             warnings.warn(far, stacklevel=2)
         points, _ = nearest_surface_points(landmarks.positions, mesh)
         pairs.append(points.nearest_corners(mesh))
-    _, first, counts = np.unique(pairs[0], return_index=True, return_counts=True)
-    if (counts > 1).any():
-        shared = np.flatnonzero(pairs[0] == pairs[0][first[counts > 1][0]])
-        if len(np.unique(pairs[1][shared])) > 1:
-            one, other = (landmarks_x.names[i] for i in shared[:2])
-            raise InputError(
-                f"{landmarks_x.name}: the landmarks {one!a} and {other!a} have the same nearest vertex of "
-                f"{mesh_x.name}: remove one of them."
-            )
+    matches, first = np.unique(np.stack(pairs, axis=1), axis=0, return_index=True)
+    conflicts = np.flatnonzero(np.diff(matches[:, 0]) == 0)
+    if len(conflicts):
+        one, other = (landmarks_x.names[first[row]] for row in (conflicts[0], conflicts[0] + 1))
+        raise InputError(
+            f"{landmarks_x.name}: the landmarks {one!a} and {other!a} have the same nearest vertex of "
+            f"{mesh_x.name}: remove one of them."
+        )
     return np.stack(pairs, axis=1)
