@@ -67,10 +67,10 @@ class SampledShape(NamedTuple):
         return cls(mesh, samples, spectrum)
 
     def rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
-        """Return the row number of each vertex (v,), for arrays with one row per compared vertex.
+        """Return the row of each vertex (v,) in an array with one row per compared vertex.
 
         A vertex that is not a sample shares the row of the nearest sample. On a shape without samples, the
-        row number of a vertex is the vertex index itself.
+        row of a vertex is the vertex index itself.
         """
         return vertices if self.samples is None else self.samples.nearest[vertices]
 

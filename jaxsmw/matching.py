@@ -70,10 +70,9 @@ def match(
       argument is a `Mesh`, a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
       `make_mesh`.
     - `preset`: the method of refinement, which is one of the following. The number of eigenvectors of a
-      preset (a name or a `Preset`) is limited to half the number of vertices of the smaller mesh. If the
-      number of samples of a preset is at least the number of vertices of the smaller mesh, the preset uses
-      all vertices instead of samples. If you give stages instead of a preset, `match` uses the stages
-      unchanged.
+      preset is limited to half the number of vertices of the smaller mesh. If the number of samples of a
+      preset is at least the number of vertices of the smaller mesh, the preset uses all vertices instead of
+      samples. If you give stages instead of a preset, `match` uses the stages unchanged.
 
         - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
@@ -86,9 +85,9 @@ def match(
 
         - `"auto"` (the default): `"shot"`. For shapes that differ from their own mirror images, such as
           teeth, the initial map `"aligned"` is refined as well. This happens only if `partial` is False and
-          the preset has repair. The map from `"aligned"` is then chosen unless the mean expected error of the
-          map from `"shot"` is more than 10 % smaller. Both expected errors are computed with
-          `ExpectedErrorSettings(area_weight=0)`.
+          the preset has repair. `match` then prefers the map from `"aligned"`. The map from `"shot"` is
+          chosen only if its mean expected error is more than 10 % smaller. Both expected errors are computed
+          with `ExpectedErrorSettings(area_weight=0)`.
         - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
           with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
           With `"shot"`, repair also tries alternative maps.
@@ -149,7 +148,7 @@ def match(
 
     automatic = isinstance(init, str) and init == "auto"
     first_init = DEFAULT_INITIAL_MAP if automatic else init
-    check_initial_map(pair, first_init)  # before the long computation of the eigenbases
+    check_initial_map(pair, first_init)  # the check runs before the slow computation of the eigenbases
     compiling = _compile_ahead(pair, chosen, history)
     seconds: dict[str, float] = {}
     with timed("eigenbases", seconds):

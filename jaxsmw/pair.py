@@ -98,7 +98,7 @@ class Pair:
 
     @property
     def units_of_length(self) -> tuple[float, float]:
-        """The units of length for X and for Y, each as a length in the coordinates of its own mesh.
+        """The unit of length for X, in the coordinates of X, and the unit for Y, in the coordinates of Y.
 
         For two full shapes, the units are the square roots of the areas of X and of Y, which compensates for
         a difference in size. For a partial pair, both units are the square root of the larger area.

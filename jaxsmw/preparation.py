@@ -137,8 +137,8 @@ def prepare(
     - `spectra`: the result of `jaxsmw.pair.paired_spectra` for this pair, if it was already computed.
 
     **Returns:** A `PreparedPair` with the attributes `spectrum_x`, `spectrum_y`, `initial_map` (m,) and
-    `samples`. The initial map contains 0-based vertices of Y. The samples are a pair of arrays, which contain
-    0-based vertices of X and of Y. They are None if no samples were requested.
+    `samples`. The initial map contains 0-based vertices of Y. The attribute `samples` is a pair of arrays,
+    with 0-based vertices of X and of Y. If no samples were requested, `samples` is None.
 
     **Raises:** `InputError` if a spectrum cannot be computed, if all requested eigenvalues of a mesh are
     zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required
@@ -146,7 +146,7 @@ def prepare(
     """
     seconds: dict[str, float] = {}
     if spectra is None:
-        # This check comes first, because the eigenbases take longer.
+        # The check runs before the slow computation of the eigenbases.
         check_initial_map(pair, init)
         with timed("eigenbases", seconds):
             spectra = paired_spectra(

@@ -32,9 +32,9 @@ class Preset:
 
     **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage has the
     position `repair.stage`. `InputError` is also raised if one of three rules is broken. The last stage must
-    not end on samples. After a stage that ends on samples, the next stage must start on at most as many
-    samples. The stage that repair repeats must have levels, and must not have fewer samples than the largest
-    of `repair.fallback_levels`.
+    not end on samples. If a stage ends on samples, the next stage must start on samples, and must not have
+    more samples. The stage that repair repeats must have levels, and must not have fewer samples than the
+    largest of `repair.fallback_levels`.
     """
 
     stages: tuple[Stage, ...]

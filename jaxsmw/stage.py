@@ -51,7 +51,7 @@ class Stage:
 
     **Raises:** `InputError` if `refiner` is not a `Refiner`, or if there are fewer samples than eigenvectors.
     `InputError` is also raised if `starts_on_samples` or `ends_on_samples` is True, but the stage has no
-    samples, or its refiner does not support this option. `WaveletPreservation` does not support it.
+    samples, or its refiner does not support the option. `WaveletPreservation` supports neither option.
     `InputError` is also raised if a number of eigenvectors, iterations, descriptors or samples is not an
     integer, is out of range or contradicts the refiner's levels.
     """
@@ -252,7 +252,7 @@ class Stage:
         return compile_ahead(refine, arguments, **self.settings, partial=False, history=history)
 
     def _outline(self, number_of_vertices: int) -> Spectrum:
-        """Return a spectrum of zeros, whose arrays have the shapes for which the program is compiled."""
+        """Return a spectrum of zeros for the compilation of the program."""
         n, k, d = number_of_vertices, self.number_of_eigenvectors, self.number_of_descriptors
         descriptors = jnp.zeros((n, d)) if d else None
         places = {"positions": jnp.zeros((n, 3)), "normals": jnp.zeros((n, 3))}

@@ -131,7 +131,7 @@ def fitted(maps: Sequence[Measured]) -> WrongProbabilitySettings:
     signs = np.where([one.wrong for one in maps], 1, -1)
 
     def loss(weights: Float64[np.ndarray, " 3"]) -> float:
-        # Without the small penalty, the weights grow without limit if a plane separates the two kinds of map.
+        # The penalty keeps the weights finite if a plane separates the right maps from the wrong maps.
         return float(np.logaddexp(0, -signs * (features @ weights)).mean() + 1e-3 * weights[1:] @ weights[1:])
 
     return WrongProbabilitySettings(*minimize(loss, np.zeros(3)).x.round(2).tolist())

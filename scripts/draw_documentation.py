@@ -96,7 +96,7 @@ def real_cases(data: Path) -> Iterator[Case]:
 
 
 def star(vertices: int, seed: int) -> tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]:
-    """Return a sphere that is deformed into a body with five equal arms, and the vertices of the sphere."""
+    """Deform a sphere into a body with five equal arms. Return the body, and the vertices of the sphere."""
     index = np.arange(vertices) + 0.5
     polar, turn = np.arccos(1 - 2 * index / vertices), np.pi * (1 + 5**0.5) * index
     sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)

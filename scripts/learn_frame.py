@@ -14,8 +14,8 @@ through `refine_softly` on samples of both shapes. The script trains one frame w
 - `cycles`: the distance between each point and its image under the forward map followed by the backward map.
   This loss needs no ground truth.
 
-A soft match is a weighted set of points, and its weights are the shares of the soft map. In both losses, the
-distance of a soft match is the weighted root mean square of the distances of these points.
+A soft match is a set of points, weighted with the shares of the soft map. In both losses, the distance from a
+soft match is the weighted root mean square of the distances from the points.
 
 The script then tests the frames on pairs of the other five people of FAUST and on pairs of TOSCA. From the
 same initial map, `jaxsmw.refine` refines each pair with the Meyer frame, with the untrained frame and with

@@ -119,7 +119,7 @@ def add_index_base(parser: argparse.ArgumentParser) -> None:
 def add_partial(
     parser: argparse.ArgumentParser, *, condition: str = "; both must have the same unit of length"
 ) -> None:
-    """Add `--partial`. The help text of the option ends with `condition`."""
+    """Add `--partial`. The help text of `--partial` ends with `condition`."""
     parser.add_argument(
         "--partial",
         action="store_true",

@@ -38,7 +38,7 @@ _MOST_FILTERS = 10_000
 
 
 def add_bank(parser: argparse._ActionsContainer) -> None:
-    """Add `--bank` and `--filters`. If the user omits one of these options, its value is None."""
+    """Add `--bank` and `--filters`. The value of an omitted option is None."""
     parser.add_argument(
         "--bank",
         choices=tuple(BANKS),

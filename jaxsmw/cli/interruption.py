@@ -117,7 +117,7 @@ def _remove_unfinished_files() -> None:
 
 
 def _die() -> None:
-    """End the process by SIGINT, because a shell ends a loop only if SIGINT terminated the loop's command."""
+    """End the process by SIGINT, which also ends a shell loop around the command."""
     with suppress(Exception):
         try:
             signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -146,9 +146,9 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
 
 
 def check_preset(options: argparse.Namespace) -> None:
-    """Refuse options that change the MWP paper's method if `--preset` names another method.
+    """Refuse any `--preset` other than `paper` if an option changes the MWP paper's method.
 
-    **Raises:** `InputError` that names the first of these options.
+    **Raises:** `InputError` that names the first option that changes the method.
     """
     if options.preset not in (None, _PAPER) and (changes := _changes(options)):
         raise InputError(

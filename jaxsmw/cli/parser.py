@@ -61,8 +61,7 @@ class Parser(argparse.ArgumentParser):
             # Like argparse, treat negative numbers and words with blanks as values.
             if name in known or " " in word or not re.match(r"-(?!\.?\d).", word):
                 continue
-            # A word such as `-z` after `--up` is not reported here, because argparse then reports that the
-            # value of `--up` is missing.
+            # The words `--up -z` are not reported here: argparse reports that the value of `--up` is missing.
             if len(word) > 2 or i == 0 or words[i - 1] not in known or known[words[i - 1]].nargs == 0:
                 return name
         return None

@@ -244,7 +244,7 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
             f"{options.landmarks}: the unit is {landmarks.unit[:40]!a}; the target is assumed to have the "
             "same unit."
         )
-    # Both checks precede the long computation.
+    # Errors in the landmarks are found before the long computation.
     if options.landmarks_output:
         check_known_system(options.landmarks_output, landmarks)
     check_frame(landmarks, source.mesh)

@@ -68,8 +68,9 @@ class ConsistentMaps:
             [_cycle_samples(shape, settings.cycle_samples) for shape in shapes],
             prior,
         )
-        # A small cycle error can arise by chance, so the error of a map is at least half of its prior. Wrong
-        # maps can be consistent with each other. Their distortions are then larger.
+        # A small cycle error can arise by chance, so the estimated error is raised to at least half of the
+        # prior. Wrong maps can be consistent with each other, but their distortions are large. A penalty for
+        # distortion is therefore added.
         errors = np.maximum(estimated, prior / 2) + distorted
         network = Network(
             meshes, points, dict(zip(maps, errors.tolist(), strict=True)), settings.synchronization
@@ -101,10 +102,10 @@ class ConsistentMaps:
         return vertex_map_between(self.points[i], self.points[j], meshes[self.template], meshes[i], meshes[j])
 
     def improvements(self, again: Mapping[Edge, EdgeMap]) -> dict[Edge, EdgeMap]:
-        """Return each new map that agrees better with the consistent maps than the old map of its edge does.
+        """Return each new map that agrees better with the consistent maps than the edge's old map.
 
         A new map is left out if its distortion exceeds the old distortion by more than the factor
-        `distortion_tolerance`. It then probably follows a wrong consistent map.
+        `distortion_tolerance`. Such a map probably follows a wrong consistent map.
 
         **Arguments:**
 

@@ -59,8 +59,8 @@ def write_maps(collection: Collection, directory: Path) -> list[Path]:
 def write_registered(collection: Collection, template: MeshData, directory: Path, suffix: str) -> list[Path]:
     """Write the registered mesh of each shape: the template's triangulation, with positions on the shape.
 
-    If the hand of a shape differs from that of the template, the corners of each face are listed in reverse
-    order. The normals of the registered mesh then point outward.
+    If a shape and the template have different values in `Collection.mirrored`, the corners of each face are
+    listed in reverse order. The normals of the registered mesh then point outward.
 
     **Arguments:**
 
@@ -325,7 +325,8 @@ def _summary(path: Path) -> dict[str, list[Any]]:
     return {}
 
 
-# `replace_results` removes only files that match this pattern. They lie in the directory of the results.
+# `replace_results` removes only files that match this pattern. All matching paths lie inside the directory of
+# the results.
 _LISTED = re.compile(rf"(?:(?:{'|'.join(RESULT_DIRECTORIES)})/(?!\.\.)[^/\0]+|mean\.\w+)")
 
 

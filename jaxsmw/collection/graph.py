@@ -110,8 +110,8 @@ def choose_edges(
     new = number - len(known)
     most = min(len(wanted), round(edges_per_shape * new)) if known else round(edges_per_shape * number)
     added: set[Edge] = set()
-    # The tree prefers edges that are already matched. Thus it joins known shapes by a new edge only if a
-    # shape that connected them was removed. Distances of zero would be missing edges in a sparse graph.
+    # The tree prefers edges that are already matched. Distances of zero would be missing edges in a sparse
+    # graph.
     lengths = distances + 1e-6 * (1 + distances.max(initial=0))
     for edge in chosen:
         lengths[edge] *= 1e-6
@@ -138,8 +138,8 @@ def extended_graph(
 ) -> list[Edge]:
     """Choose the pairs of a collection that are matched, and keep them in a store.
 
-    If an earlier call used the same store, settings and seed, its edges are chosen again, except edges of
-    shapes that were removed since. Edges of new shapes are added.
+    The edges of an earlier call with the same store, settings and seed are kept. Edges of removed shapes are
+    dropped, and edges of new shapes are added.
 
     **Arguments:**
 

@@ -24,7 +24,7 @@ _COMPARED_FIRST = 5
 
 
 def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.ndarray, " N"]:
-    """Divide the shapes of a collection into two hands that agree best with the evidence of all edges.
+    """Choose one of two hands for each shape of a collection, from the evidence of all edges.
 
     The evidence of an edge is positive if the two shapes seem to be of opposite hands. A symmetric matrix
     contains the negated evidence of each edge. The signs of the leading eigenvector of this matrix give the
@@ -70,9 +70,10 @@ def compare_hands(
     store: Store = Store(),  # noqa: B008 (immutable)
     progress: Progress = no_progress,
 ) -> dict[Edge, Decision]:
-    """Compare the hands of a few pairs of shapes, and of further pairs if one of these pairs is asymmetric.
+    """Compare the hands of pairs of shapes.
 
-    The pairs are edges of a sparse graph.
+    The pairs are the edges of a sparse graph. A few pairs are compared first. If one of the first pairs is
+    asymmetric, all other pairs are compared as well.
 
     **Arguments:**
 
@@ -80,7 +81,8 @@ def compare_hands(
     - `preset`: the preset with which the shapes were prepared.
     - `seed`: the seed of the random edges of the graph.
     - `store`: the store in which decisions are kept.
-    - `progress`: a function that is called for each edge of the graph, unless only a few pairs are compared.
+    - `progress`: a function that is called for each edge of the graph. The function is not called if only the
+      first pairs are compared.
 
     **Returns:** The `Decision` of each compared edge; see `jaxsmw.repair.chirality.Hands`.
     """

@@ -23,7 +23,7 @@ _MANY_OUTLIERS = 1 / 3
 
 @dataclass(frozen=True)
 class MatchedEdge:
-    """An edge of the graph of a collection: a matched pair of shapes, with the errors and the use of its map.
+    """An edge of the graph of a collection: a matched pair of shapes, and the errors of the map between them.
 
     Errors are distances on a shape, in units of the square root of this shape's area.
 
@@ -34,10 +34,10 @@ class MatchedEdge:
       match failed.
     - `distortion`: the distortion of the map; infinite if the match failed.
     - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The
-      estimate is the error that the cycles of the graph show (`edge_errors`), but at least half of the
-      prior. The prior is the expected error plus a term that grows with the distortion
-      (`CollectionSettings.distortion_weight`). The same term is then added to the estimate. The estimate is
-      infinite if the match failed.
+      penalty of a map grows with the distortion of the map (`CollectionSettings.distortion_weight`). The
+      prior is the expected error plus the penalty. The cycle error is the error that the cycles of the graph
+      show (`edge_errors`). The estimate is the penalty plus the larger of the cycle error and half of the
+      prior. The estimate is infinite if the match failed.
     - `residual`: the mean distance between the map and the map through the template; infinite if the match
       failed. The mean is computed in both directions, and the larger value is used.
     - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. `"replaced"` means that the first map
@@ -86,9 +86,9 @@ class Collection:
     - `axes`: the axes of the descriptors; None if the preset uses no descriptors.
     - `cycle_errors`: two arrays with the errors of all triangles of the graph. The first array was computed
       from the first maps of the edges, the second from the final maps. Each error is the mean of three
-      values, one for each shape of the triangle, in units of the square root of the area of this shape. The
-      attribute is None if a `Collection` was made without cycle errors; `match_collection` always computes
-      them.
+      values, one for each shape of the triangle. The unit of a value is the square root of the area of the
+      shape. The attribute is None if a `Collection` was made without cycle errors; `match_collection` always
+      computes them.
     - `outliers`: the numbers (positions in `meshes`) of the shapes that differ much from all other shapes.
       All maps of such a shape have large errors or distortions. The shape may be another kind of body.
     - `left_out`: a dictionary of the meshes that could not be matched. The keys are the names of the meshes,

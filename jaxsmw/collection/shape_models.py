@@ -24,11 +24,10 @@ from jaxsmw.runtime.threads import one_blas_thread
 # The alignment ends when the mean changes by less than this multiple of its size, or after `_MOST_ROUNDS`.
 _TOLERANCE = 1e-10
 _MOST_ROUNDS = 1000
-# Modes are left out if their standard deviation is below this multiple of the size of the mean. Mesh files in
-# single precision have larger rounding errors.
+# Modes are left out if their standard deviation is below this multiple of the size of the mean.
 _SMALLEST_DEVIATION = 1e-6
-# Scores count as equal if they differ by less than this share, so that rounding does not choose the signs
-# of modes.
+# The absolute values of two scores count as equal if their relative difference is below this number.
+# Rounding errors therefore do not change the sign of a mode.
 _EQUAL_SCORES = 1e-6
 # The number of vertices for which displacements are computed at once.
 _BLOCK = 1024
@@ -73,8 +72,8 @@ def align(
     Each round moves every shape to the mean, in the least-squares sense, and then updates the mean (Gower,
     "Generalized Procrustes analysis", Psychometrika 1975; Goodall, "Procrustes methods in the statistical
     analysis of shape", JRSS B 1991). The first mean is the reference shape. The rounds end when the mean
-    changes by less than 1e-10 of its size, or after 1000 rounds. The time of a round grows with N² and does
-    not depend on n, because all rotations follow from the inner products of the coordinates of the shapes.
+    changes by less than 1e-10 of its size, or after 1000 rounds. The inner products of the coordinates of the
+    shapes are computed only once. Therefore the time of a round grows with N² and does not depend on n.
 
     The size of a shape is its centroid size: the square root of the weighted mean of the squared distances
     from the vertices to their weighted centroid.
@@ -229,8 +228,8 @@ class ShapeModel:
     def _common_factor(self, mean: Float64[np.ndarray, "n 3"]) -> float:
         """Return the factor that `align` applies to shapes after their least-squares fit to the mean.
 
-        Every aligned shape A satisfies |A|² = factor * <A, mean>. The sum of these equations over all shapes
-        gives the factor, because the mean of all aligned shapes is `mean`.
+        Every aligned shape A satisfies |A|² = factor * <A, mean>. The mean of all aligned shapes is `mean`.
+        Therefore the average of the equation over all shapes determines the factor.
         """
         squared_mean = float(self.weights @ (mean**2).sum(axis=1))
         count = len(self.scores)
@@ -323,8 +322,8 @@ class ShapeModel:
     ) -> Float64[np.ndarray, " p"]:
         """Return for each displacement field the mean length of its displacements over the surface.
 
-        `fields` and `coordinates` are the coordinates of the fields and of the shapes in the same orthonormal
-        basis (`_coordinates`).
+        `fields` contains one displacement field per row, and `coordinates` contains one shape per row. The
+        rows are coordinates in the orthonormal basis of `_coordinates`.
         """
         combinations = fields @ (coordinates / (coordinates**2).sum(axis=0)).T
         lengths = np.zeros(len(fields))
@@ -502,8 +501,8 @@ def _coordinates(alignment: Alignment) -> Float64[np.ndarray, "N r"]:
     """Return the scores of all modes: the coordinates of the shapes in the orthonormal basis of the modes.
 
     One QR decomposition per block of vertices reduces the displacements to an N x N matrix, which has the
-    same inner products. The small singular values of this matrix are accurate. A matrix of inner products
-    would contain their squares and lose this accuracy.
+    same inner products. The small singular values of this matrix are accurate. The small eigenvalues of a
+    matrix of inner products would be less accurate.
     """
     count = len(alignment.aligned)
     reduced = np.zeros((0, count))

@@ -33,7 +33,7 @@ logger = logging.getLogger("jaxsmw")
 
 
 def _warned_already() -> AbstractContextManager[object]:
-    """Ignore warnings about coarse meshes in a `with` block. `prepare_shape` has issued them before."""
+    """Return a context that ignores warnings, because `prepare_shape` has already issued the warnings."""
     return warnings.catch_warnings(action="ignore", category=UserWarning)
 
 
@@ -61,7 +61,7 @@ class PreparedShape:
         return SampledShape.make(self.mesh, self.compared, self.spectrum)
 
     def mirrored(self) -> PreparedShape:
-        """Return the mirror image of the shape, which must not have descriptors."""
+        """Return the mirror image of a shape without descriptors."""
         return replace(self, mesh=self.mesh.mirrored(), spectrum=self.spectrum.reflect())
 
     def arrays(self) -> dict[str, np.ndarray]:
@@ -112,7 +112,7 @@ def prepare_shape(
         samples = jax.device_put(farthest_point_samples(mesh, preset.number_of_samples))
     check_eigenvalues(mesh, spectrum)
     compared = compared_samples(mesh)
-    # This call stores the descriptors in the cache, and refuses meshes that are too coarse.
+    # `shot_descriptors` raises an error if the mesh is too coarse, and stores the descriptors in the cache.
     shot_descriptors(mesh, samples=compared, required=True)
     return PreparedShape(mesh, spectrum, compared, samples)
 
@@ -180,14 +180,16 @@ def describe_shapes(
     preset: Preset,
     store: Store = Store(),  # noqa: B008 (immutable)
 ) -> tuple[list[PreparedShape], DescriptorAxes | None]:
-    """Add descriptors along the axes of the whole collection, if the preset uses descriptors.
+    """Compute descriptors for all shapes of a collection, if the preset uses descriptors.
+
+    The descriptors are expressed in common axes, so the descriptors of any two shapes are comparable.
 
     **Arguments:**
 
     - `shapes`: the shapes.
     - `preset`: the preset, which determines the number of descriptors.
-    - `store`: the store in which the axes are kept. If shapes are added to a collection later, the axes do
-      not change, and so the matched edges do not change either.
+    - `store`: the store in which the axes are kept. The axes do not change if shapes are added to the
+      collection later. The stored maps therefore remain valid.
 
     **Returns:** The shapes with descriptors, and the axes. Without descriptors, the axes are None.
 
@@ -213,7 +215,7 @@ def describe_shapes(
 def prepare_shapes(
     meshes: Sequence[Mesh], preset: Preset
 ) -> tuple[list[PreparedShape], DescriptorAxes | None]:
-    """Prepare all shapes of a collection, with descriptors along common axes.
+    """Prepare all shapes of a collection, and compute comparable descriptors.
 
     **Arguments:**
 

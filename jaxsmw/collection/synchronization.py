@@ -147,7 +147,7 @@ class Network:
     def lengths(self) -> csr_array:
         """Return the errors of all edges as a symmetric sparse matrix (N, N)."""
         rows, columns = zip(*self._images, strict=True) if self._images else ((), ())
-        # An error of zero would be a missing edge.
+        # In the sparse matrix, an entry of zero would mean a missing edge.
         values = [max(self.error(i, j), 1e-6) for i, j in self._images]
         return csr_array((values, (rows, columns)), shape=(len(self.meshes),) * 2)
 

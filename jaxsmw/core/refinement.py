@@ -270,9 +270,9 @@ class _Loop:
 
         `pointwise_map` is the initial map of all vertices or, with `starts_on_samples`, of the samples.
 
-        The first iteration compares its map with `first_map` to count the changed matches. `first_map` is the
-        initial map of the vertices on which the loop runs. If the loop runs on samples, but does not start on
-        samples, all entries are -1.
+        The first iteration compares its map with `first_map` to count the changed matches. Usually
+        `first_map` is the same as `pointwise_map`. If samples are given without `starts_on_samples`, all
+        entries of `first_map` are -1.
         """
         state, result = self.refiner.update(in_full, pointwise_map, None)
         return _Progress(

@@ -140,8 +140,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def recover(self, prepared: PreparedT, state: StateT) -> Int32[Array, " m"]:
         """Recover the pointwise map X -> Y (m,) from a state.
 
-        The map contains one vertex of Y per vertex of `prepared.spectrum_x`. For the same `prepared`,
-        `update` must accept this map as its argument `pointwise_map`.
+        The map contains one vertex of Y per vertex of `prepared.spectrum_x`. The map must be
+        a valid argument `pointwise_map` of `update`.
         """
 
     @abc.abstractmethod

@@ -344,8 +344,8 @@ class _Boxes(NamedTuple):
 
     The box of a patch has orthonormal `axes` through the `center` of the patch. No point of the patch is
     farther than `radius` from the box. `local` contains the coordinates of the points along the axes. `low`
-    and `high` are the smallest and the largest of these coordinates along each axis. `counts` is False for
-    patches without points.
+    and `high` are the smallest and the largest of these coordinates along each axis. `counts` is a
+    Boolean array, which is False for patches without points.
     """
 
     points: Float[Array, "p s d"]
@@ -463,9 +463,10 @@ class _Found(NamedTuple):
 def _two_best_rows(
     boxes: _Boxes, block: Float[Array, "block d"], needed: Bool[Array, " p"]
 ) -> tuple[Int32[Array, "2 block"], Bool[Array, "2 block"]]:
-    """Find, for each query, the two best candidates from two different patches among the needed patches.
+    """Find, for each query, the two best candidates in the patches that `needed` selects.
 
-    Each step of the search compares the queries with _GROUP patches.
+    The two candidates are in different patches. Each step of the search compares the queries with _GROUP
+    patches.
 
     **Returns:** The indices of the candidates in the flattened array of all patches' points, and a Boolean
     array that is True for masked or missing candidates.

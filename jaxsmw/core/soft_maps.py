@@ -70,7 +70,8 @@ class SoftMap(eqx.Module):
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
         """Pull functions on Y, such as colours, back to the queries.
 
-        Each query receives the mean of the values at the database rows, weighted with its shares.
+        A query receives a weighted mean of the values at the database rows. The weights are the shares of the
+        query.
 
         **Arguments:**
 
@@ -126,7 +127,8 @@ class SparseSoftMap(eqx.Module):
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
         """Pull functions on Y, such as colours, back to the queries.
 
-        Each query receives the mean of the values at the database rows, weighted with its shares.
+        A query receives a weighted mean of the values at the database rows. The weights are the shares of the
+        query.
 
         **Arguments:**
 
@@ -142,7 +144,7 @@ class SparseSoftMap(eqx.Module):
                 f"functions on Y have shape {functions.shape}, but (n, p) is needed: give one row for each "
                 "vertex of Y"
             )
-        # This loop over the t rows of each query needs less memory than an array with all t rows.
+        # The loop saves memory: an array (m, t, p) would be large.
         taken = zip(self.rows.T, self.shares.T, strict=True)
         return sum((share[:, None] * functions[row] for row, share in taken), jnp.zeros((), functions.dtype))
 
@@ -306,7 +308,7 @@ class NearestFew(Recovery):
             return lax.top_k(closeness.T, min(self.number, b.shape[0]))[1]
 
         rows = in_blocks(nearest, settled_queries, _BLOCK)
-        # This loop over the t rows of each query needs less memory than an array with all differences.
+        # The loop saves memory: an array (m, t, d) would be large.
         squares = [jnp.sum((queries - database[row]) ** 2, axis=1) for row in rows.T]
         exponents = -jnp.stack(squares, axis=1) / temperature
         return SparseSoftMap(rows, jax.nn.softmax(exponents + _log(b)[rows], axis=1))
@@ -455,8 +457,7 @@ def _sinkhorn_potentials(
 
         arrived, _ = lax.scan(jax.checkpoint(add), jnp.zeros_like(b), blocks)
         # The area that arrives at a row can underflow to zero. The lower limit `least` keeps the logarithm
-        # finite. The limit also bounds `correction`, so the potential of such a row rises over several
-        # iterations.
+        # finite.
         least = jnp.finfo(dtype).tiny
         correction = jnp.where(b > 0, log_b - jnp.log(jnp.maximum(arrived, least)), 0)
         return potentials + correction, jnp.sum(jnp.abs(arrived - b)) / 2

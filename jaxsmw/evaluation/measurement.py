@@ -60,8 +60,8 @@ def read_curve(text: str) -> list[float]:
 
     - `text`: one share for each threshold in `CURVE`, separated by spaces.
 
-    **Returns:** A list that contains, for each threshold in `CURVE`, the share of points with at most this
-    error.
+    **Returns:** A list with one number for each threshold in `CURVE`: the share of points whose error is at
+    most the threshold.
 
     **Raises:** `ValueError` if the text does not contain one number for each threshold.
     """

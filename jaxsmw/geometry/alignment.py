@@ -16,8 +16,8 @@ _FIRST, _FURTHER = 10, 30
 _BEST = 5
 # The number of iterations with distances to tangent planes.
 _TO_PLANES = 10
-# The result of these iterations is used only if it reduces the mean distance to less than this fraction of
-# the earlier mean distance. (Entry R24)
+# The iterations with tangent planes must reduce the mean distance to less than this fraction. Otherwise the
+# result of these iterations is not used. (Entry R24)
 _MUCH_SMALLER = 0.5
 # The first iterations move at most this number of points of x.
 _MOVED_FIRST = 500
@@ -53,10 +53,10 @@ def align_rigidly(
     the nearest points of y, and from y to the nearest points of x. The motion with the smallest sum is
     chosen.
 
-    Iterative closest points hardly slide a nearly round surface along another surface, because each sample is
-    drawn to the sample that is already closest. If normals are given, further iterations therefore minimise
-    the distances to tangent planes (Chen, Medioni, "Object modelling by registration of multiple range
-    images", 1992). The result of these iterations is used only if the shapes fit each other.
+    The method of iterative closest points hardly slides one nearly round surface along another. If normals
+    are given, further iterations therefore minimise the distances to tangent planes (Chen, Medioni, "Object
+    modelling by registration of multiple range images", 1992). The result of these iterations is used only if
+    the shapes fit each other.
 
     **Arguments:**
 
@@ -101,8 +101,8 @@ def _slide(
 ) -> Alignment:
     """Minimise the distances of x to the tangent planes at the nearest points of y.
 
-    Shapes that only resemble each other slide too far. The new motion is therefore returned only if the mean
-    distance becomes much smaller, as it does for shapes that fit each other.
+    If the shapes do not fit each other, the iterations slide x too far. The mean distance then decreases only
+    slightly, and the given motion is returned.
     """
 
     def to_planes(

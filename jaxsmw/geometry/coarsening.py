@@ -112,9 +112,9 @@ class _Smoother:
     """A low-pass filter for functions on a mesh. Constant functions pass unchanged.
 
     The filter is a Chebyshev polynomial of D^-1 W, where W is the stiffness matrix and D is the diagonal of
-    W. The filter damps the eigenvectors of D^-1 W whose eigenvalues are above 1.5 / `size` times the largest
-    eigenvalue. Cells of `size` vertices cannot represent these eigenvectors. (On meshes of bodies, factors
-    from 1 to 3 instead of 1.5 give about the same accuracy.)
+    W. Let `largest` be the largest eigenvalue of D^-1 W. The filter damps the eigenvectors with eigenvalues
+    above `1.5 * largest / size`. Cells of `size` vertices cannot represent these eigenvectors. (On meshes
+    of bodies, factors from 1 to 3 instead of 1.5 give about the same accuracy.)
     """
 
     def __init__(self, stiffness: sp.csr_matrix, size: float):

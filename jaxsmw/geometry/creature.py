@@ -119,7 +119,7 @@ class _Body:
         self.joints: dict[str, int] = {}
         self.parents: list[int] = []
         self._pivots: list[np.ndarray] = []
-        self._guides: list[tuple[int, np.ndarray]] = []  # a joint, and two balls of a tube it moves
+        self._guides: list[tuple[int, np.ndarray]] = []  # a joint, and two balls that the joint moves
         self._tubes: list[_Tube] = []
         self._scale = np.exp(0.05 * random.normal(size=4))
         self._frequencies = 1.5 * random.normal(size=(3, 4))
@@ -338,8 +338,8 @@ def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple
     """
     vertices, faces = _isosurface(body, 0.05, random)
     area = igl.doublearea(vertices, faces).sum() / 2
-    # Marching cubes give 1.5 vertices per spacing² of surface area. The chosen spacing gives about four times
-    # `count` vertices, or more.
+    # Marching cubes give 1.5 vertices per spacing² of surface area. A spacing of `sqrt(1.5 area / (4 count))`
+    # thus gives 4 `count` vertices. The largest spacing is 0.018.
     spacing = min(0.018, np.sqrt(1.5 * area / (4 * count)))
     for _ in range(5):
         vertices, faces = _isosurface(body, spacing, random)

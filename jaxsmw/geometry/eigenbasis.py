@@ -27,9 +27,9 @@ from jaxsmw.runtime.threads import one_blas_thread
 # The shift that ARPACK uses for a surface of area 1. The first non-zero eigenvalue of a body of area 1 is
 # between 1 and 30.
 _SHIFT = -1e-2
-# `_solve_component` accepts an exact solver up to this relative residual, and every solver up to this
-# deviation from orthonormality.
+# The largest accepted relative residual of an exact solver.
 _RESIDUAL_TOLERANCE = 1e-6
+# The largest accepted deviation from orthonormality.
 _ORTHONORMALITY_TOLERANCE = 1e-8
 # Up to this number of vertices, a dense solver is as fast as the sparse solvers and always succeeds.
 _DENSE = 400
@@ -363,8 +363,8 @@ def _converged(
         before, start, end = max(0, end - size), end, end + size
         vectors[start:end] = block
         block = images(block)
-        # The overlaps with the last two blocks are large and are removed first. Otherwise their rounding
-        # errors would be larger than the small overlaps with earlier blocks.
+        # The large overlaps with the last two blocks are removed first. The rounding errors of large overlaps
+        # would hide the small overlaps with earlier blocks.
         large = _remove(vectors[before:end], block, weighted)
         overlaps = _remove(vectors[:end], block, weighted)
         overlaps[:, before:] += large

@@ -34,7 +34,8 @@ from jaxsmw.runtime.cache import cached
 _DEPTH = 10
 
 # Strips are unfolded from at most `_SIDES_AT_ONCE` sides at a time. `geodesic_distances_between` stores up to
-# about `_DISTANCES_AT_ONCE` distances at a time. With these sizes, the arrays fit into the processor's cache.
+# about `_DISTANCES_AT_ONCE` distances at a time. Both constants are chosen so that the arrays fit into the
+# processor's cache.
 _SIDES_AT_ONCE, _DISTANCES_AT_ONCE = 2**13, 2**20
 
 # `geodesic_distances_between` first searches within the smallest radius, then within the larger radii, and
@@ -88,12 +89,12 @@ class SurfacePoints:
 
 
 class _Sides(NamedTuple):
-    """The 6 f sides of all f triangles and of their mirror images.
+    """The sides of the f faces of a mesh and of their mirror images, 6 f sides in total.
 
     Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the mirror
     images: the faces 0 … f - 1 with reversed order of corners. A line leaves a triangle by one side. It
-    enters the next triangle by a side that joins the same two vertices in the opposite direction. Because of
-    the mirror images, all other faces at the edge have such a side, even if their orientations differ.
+    enters the next triangle by a side that joins the same two vertices in the opposite direction. If the next
+    face has no such side, the line enters the mirror image of the face.
     """
 
     tail: Int64[np.ndarray, " s"]
@@ -397,7 +398,10 @@ def _number_of_different(points: Int64[np.ndarray, " p"] | SurfacePoints) -> int
 
 
 def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the origins, sides and positions of three beams per point, one per side of its face."""
+    """Return the origins, sides and positions of the beams that start at the given points.
+
+    Three beams start at each point: one beam through each side of the face that contains the point.
+    """
     side = (3 * points.faces[:, None] + np.arange(3)).ravel()
     of_head, of_apex = (np.roll(points.weights, -k, axis=1).ravel() for k in (1, 2))
     return np.repeat(np.arange(len(points)), 3), side, of_head + of_apex * sides.shape[side]

@@ -611,8 +611,7 @@ def numeric_rows(values: ArrayLike, what: str, name: str) -> np.ndarray:
 
 def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
     """Check that faces are valid indices of n vertices, and return them as int64."""
-    # The comparison precedes the cast, because the cast would wrap around numbers that are too large for
-    # int64.
+    # The indices are checked first, because the conversion to int64 would change very large numbers.
     outside = ~((faces >= 0) & (faces < n))
     if outside.any():
         at = int(outside.any(axis=1).argmax())

@@ -98,7 +98,7 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     **Returns:** The samples, and the nearest sample of each vertex, as `SurfaceSamples`.
     """
     candidates = np.flatnonzero(mesh.referenced_vertices)
-    # A maximal set of samples has about 0.7 area / distance² samples.
+    # At a minimum distance d, a surface has room for about 0.7 area / d² samples.
     distance = (0.7 * mesh.area / number_of_samples) ** 0.5
     # In each box of a grid around the centroid, only the lowest-numbered vertex remains a candidate.
     positions = mesh.vertices - mesh.vertices[candidates].mean(axis=0)

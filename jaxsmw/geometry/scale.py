@@ -30,9 +30,9 @@ class ScaleSettings:
     - `distances` (Table R33): two samples of the partial shape are compared with their matches only if the
       distance between the samples is in this range. Larger distances vary more between poses.
     - `angle_tolerance` (Table R33): two samples are compared with their matches only if three angles at the
-      samples are similar to the same angles at the matches. The cosines of the angles must differ by less
-      than this number. One angle is between the two normals. The other two angles are between each normal
-      and the line that connects the two points.
+      samples are similar to the corresponding angles at the matches. The cosines of the angles must differ
+      by less than this number. One angle is between the two normals. The other two angles are between each
+      normal and the line that connects the two points.
     - `tolerance`: two ratios agree if their logarithms differ by less than this number.
     - `uncertain_below` (Table R33): an estimate with a smaller support is uncertain.
     """
@@ -168,8 +168,8 @@ def _vote(part: _Described, full: _Described, share: float, settings: ScaleSetti
     ratios = np.sort(np.log(after[compared] / before[compared]))
     if len(ratios) < _FEWEST:
         return _Vote(share, 0.0)
-    # The most frequent ratio is the ratio with the most other ratios within the tolerance. Ratios far from 1
-    # belong to other shares and are not counted.
+    # The most frequent ratio agrees with the largest number of other ratios. Ratios far from 1 belong to
+    # other shares and are not counted.
     tolerance = settings.tolerance
     counts = np.searchsorted(ratios, ratios + tolerance) - np.searchsorted(ratios, ratios - tolerance)
     counts = np.where(np.abs(ratios) < _FARTHEST, counts, 0)

@@ -19,7 +19,7 @@ _SMALL, _LARGEST = 0.01, 0.5
 
 
 def usable_positions(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return a mask, False for positions that are not finite or very far from the median position."""
+    """Return a mask of the positions that are finite and not very far from the median position."""
     usable = np.isfinite(position).all(axis=1)
     if usable.any():
         with np.errstate(over="ignore", invalid="ignore"):

@@ -208,8 +208,8 @@ def _local_frames(
     def towards_majority(axis: np.ndarray) -> np.ndarray:
         height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
         majority = np.bincount(center, np.sign(height), size)
-        # On regular meshes, equally many neighbours can lie in both directions of an axis. The sum of their
-        # weighted heights then decides, because the signs of eigenvectors are arbitrary.
+        # The axis points to the side with more neighbours. On regular meshes, both sides can have equally
+        # many neighbours. Then the axis points to the side with the larger weighted sum of heights.
         tied = majority == 0
         majority[tied] = np.bincount(center, weight * height, size)[tied]
         return np.where(majority >= 0, 1.0, -1.0)[:, None] * axis

@@ -11,7 +11,8 @@ from jaxtyping import Float64
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 
-# If more than this share of the nearest triangles face away, the triangles are not oriented consistently.
+# If more than this share of the nearest triangles face away from the given normals, the triangles are not
+# oriented consistently.
 _LARGEST_SHARE_AWAY = 0.2
 
 
@@ -57,7 +58,7 @@ class SurfaceTree:
         faces = np.atleast_1d(faces).astype(np.int64)
         corners = (np.ascontiguousarray(vertices[self._faces[faces, corner]]) for corner in range(3))
         weights = np.atleast_2d(igl.barycentric_coordinates(np.atleast_2d(nearest), *corners))
-        # A triangle without area has no barycentric coordinates, so its nearest corner represents the point.
+        # Barycentric weights are undefined on a triangle without area, so the nearest corner is used.
         undefined = ~np.isfinite(weights).all(axis=1)
         if undefined.any():
             offsets = vertices[self._faces[faces[undefined]]] - np.atleast_2d(nearest)[undefined, None]
@@ -73,16 +74,14 @@ def nearest_facing_points(
     nearest: SurfacePoints,
     mesh: Mesh,
 ) -> SurfacePoints:
-    """Replace the nearest points that lie on triangles that face away.
+    """Replace nearest points on triangles that face away from the given normals.
 
-    For example, if two legs touch, the nearest point of a point on one leg can lie on the other leg. A
-    triangle faces away if its normal and the normal at the point in space form an angle above 90 degrees.
+    A triangle faces away if the angle between its normal and the given normal is above 90 degrees. For
+    example, if two legs touch, a point on one leg can be nearest to a triangle of the other leg.
 
-    For each replacement, the function chooses the axis along which the point's normal has its largest
-    component in absolute value. The function searches only triangles whose normals have the same sign along
-    this axis as the point's normal. The new point is used if its triangle does not face away. Nothing is
-    replaced if more than 20 % of the nearest triangles face away, because the triangles of the mesh are then
-    not oriented consistently.
+    A second search considers only triangles whose normals have roughly the direction of the given normal. The
+    new point is used if its triangle does not face away. Nothing is replaced if more than 20 % of the nearest
+    triangles face away, because the triangles of the mesh are then not oriented consistently.
 
     **Arguments:**
 

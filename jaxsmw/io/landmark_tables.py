@@ -78,7 +78,7 @@ def _is_value(cell: str) -> bool:
 
 
 def _lines(text: str) -> list[str]:
-    """Split a text into lines, and refuse more or longer lines than a table of landmarks can have."""
+    """Split a text into lines. Refuse a text with too many lines or with a very long line."""
     check_count(max(text.count("\n"), text.count("\r")))
     lines = re.split("\r\n|\r|\n", text)
     longest = max(range(len(lines)), key=lambda i: len(lines[i]))
@@ -92,7 +92,8 @@ def _lines(text: str) -> list[str]:
 
 def _rows(lines: list[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the line number and the cells of each line that is not empty."""
-    # Lines keep their ends here. Thus a quoted name that spans lines contains a newline and is refused later.
+    # Each line ends with a newline. A quoted name over several lines therefore contains a newline, and is
+    # refused later.
     reader = csv.reader(
         (f"{line}\n" for line in lines), delimiter=separator, skipinitialspace=True, strict=True
     )

@@ -181,10 +181,10 @@ def match_landmarks(first: Landmarks, second: Landmarks) -> LandmarkMatch:
 
     **Arguments:**
 
-    - `first`, `second`: the `Landmarks` of two meshes. With the common names, `Landmarks.select` returns the
-      positions of each mesh in the same order.
+    - `first`, `second`: the `Landmarks` of two meshes.
 
     **Returns:** A `LandmarkMatch` with the attributes `names`, `only_first` and `only_second`, each a tuple.
+    Pass `names` to `Landmarks.select` to bring the landmarks of both meshes into the same order.
 
     **Raises:** `InputError` if the landmarks have no common name. Names that differ in case are different.
     """

@@ -98,11 +98,13 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
 
     If a file has no faces, `jaxsmw.geometry.triangulate_points` adds faces, with the help of `normals`.
 
-    A glTF file duplicates vertices along texture seams. All duplicates stay in the list of vertices, but
-    vertices at exactly the same position are welded, as if `weld` were True. The transforms of the nodes are
-    applied, and all meshes of the scene are joined in the order of the nodes. Skinned meshes stay in their
-    bind pose. Buffers in other files are read only if these files are in the folder of the glTF file or in
-    its subfolders. Normals, tangents, animations and pictures in glTF files are not read.
+    A glTF file duplicates vertices along texture seams. Duplicates that `write_mesh_data` recorded are
+    joined. `MeshData.mesh` keeps all other duplicates as vertices. However, the faces of `MeshData.mesh` use
+    only one vertex per position, as if `weld` were True.
+    The transforms of the nodes are applied, and all meshes of the scene are joined in the order of the nodes.
+    Skinned meshes stay in their bind pose. Buffers in other files are read only if these files are in the
+    folder of the glTF file or in its subfolders. Normals, tangents, animations and pictures in glTF files are
+    not read.
 
     **Arguments:**
 

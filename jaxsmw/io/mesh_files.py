@@ -65,7 +65,7 @@ def write_mesh(
 
     OFF files are text, and PLY files are binary and little endian. `read_mesh` reads the same faces and
     exactly the same vertex positions from the file. glTF and STL files are exceptions, because their
-    positions are float32. The write is atomic: an incomplete file never appears under this name.
+    positions are float32. The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 

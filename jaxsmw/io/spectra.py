@@ -332,7 +332,7 @@ def write_functional_map(
 ) -> None:
     """Write a functional map as the matrix `C21` to a `.mat` file.
 
-    The write is atomic: an incomplete file never appears under this name.
+    The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 

@@ -36,8 +36,9 @@ class Alternatives:
     """Alternative maps of a pair, computed and compared on proxies.
 
     Each shape is reduced to about a thousand samples. A feature regression with few eigenvectors refines many
-    initial maps of these samples. This takes about as long as one refinement at all vertices. An initial map
-    is the result of a nearest-neighbour search in features. There are three kinds of features:
+    initial maps of these samples. All refinements of samples take about as long as one refinement at all
+    vertices. An initial map is the result of a nearest-neighbour search in features. There are three kinds of
+    features:
 
     - SHOT with several radii. Each choice of radii gives one map.
     - SHOT and the distances to extremities, such as the ends of limbs. A pairing assigns extremities of X to

@@ -116,9 +116,10 @@ class Hands:
 
         The samples are spread evenly over each shape. The initial maps take each sample to the sample with
         the nearest SHOT descriptor. The SHOT descriptors have large radii. A feature regression with few
-        eigenvectors refines these maps. The comparison is repeated for each set of radii in the settings. The
-        smallest evidence is returned, because one of two wrong maps can be much better than the other by
-        chance. The method stops as soon as the evidence is clearly too small to support the mirror image.
+        eigenvectors refines these maps. The comparison is repeated for each set of radii in the settings. If
+        both maps are wrong, one map can be much better than the other map by chance. Therefore the method
+        returns the smallest evidence. The method stops as soon as the evidence is clearly too small to
+        support the mirror image.
 
         **Returns:** The evidence, a number without unit. Positive evidence supports the mirror image.
 
@@ -212,9 +213,8 @@ class Decision(NamedTuple):
     - `evidence`: the evidence for the mirror image; see `Hands`. None if no evidence was computed, for
       example because the shapes are their own mirror images.
     - `doubtful`: whether the decision is uncertain. For asymmetric shapes, the decision is uncertain if the
-      evidence is near `mirrored_from`. With an asymmetry from `asymmetric_from - asymmetry_doubt` to
-      `asymmetric_from`, the decision is uncertain if the evidence is at least `mirrored_from`.
-      `ChiralitySettings` contains the thresholds.
+      evidence is near `mirrored_from`. If the asymmetry is slightly below `asymmetric_from`, the decision is
+      uncertain if the evidence is at least `mirrored_from`. `ChiralitySettings` contains the thresholds.
     - `asymmetric`: whether the mean asymmetry of X and Y is at least `asymmetric_from`.
     """
 

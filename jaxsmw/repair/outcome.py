@@ -34,8 +34,8 @@ class Outcome(NamedTuple):
     - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed yet.
     - `deformation`: `jaxsmw.repair.proxies.deformation` of the final map; 0 if it was not computed.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
-    - `rivals`: the outcomes with the next best scores, from best to worst. There are no rivals unless the map
-      still looks wrong after repair. Further passes can make a rival better than the outcome itself.
+    - `rivals`: the outcomes with the next best scores, from best to worst. Rivals are kept only if the map
+      still looks wrong after repair.
     """
 
     refinements: list[Refinement]

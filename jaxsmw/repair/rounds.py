@@ -106,9 +106,8 @@ def refine_further(
     If repair did not find a map that looks right, the `rivals` of the outcome are refined as well. The map
     with the best score after the passes is returned.
 
-    In each usual pass, the repeated stage and all later stages run again. There are `repair.passes` usual
-    passes. For very different shapes, and for full shapes that start from `"aligned"`, coarse passes with the
-    levels `repair.coarse_levels` run instead. One usual pass follows the coarse passes.
+    In each pass, the repeated stage and all later stages run again. `RepairSettings` explains how many passes
+    run, and which passes are coarse.
 
     **Arguments:**
 
@@ -126,8 +125,8 @@ def refine_further(
         return outcome
     runner, judge = _runner_and_judge(prepared, stages, repair, history)
     change = judge.area_change(outcome)
-    # Rigidly aligned full shapes differ in form, not in pose. Coarse passes lower the errors of their maps
-    # for any area-based shape difference. (Entry R24)
+    # Rigidly aligned full shapes differ in form, not in pose. Coarse passes lower the errors of such pairs
+    # even if the area-based shape difference is small. (Entry R24)
     aligned = isinstance(prepared.init, str) and prepared.init == "aligned" and not prepared.pair.partial
     if change < repair.non_isometric and not aligned:
         return outcome
@@ -142,8 +141,8 @@ def refine_further(
         if further.successful:
             refined.append(judge.judged(further))
     best = min(refined, key=judge.score, default=outcome)
-    # Passes lower the distortion of wrong maps as well, and stay near the given map. Therefore they do not
-    # change whether the map is suspicious. (Table R36)
+    # Passes also lower the distortion of wrong maps. Therefore a low distortion after the passes does not
+    # show that a map is right. (Table R36)
     return best._replace(suspicious=outcome.suspicious)
 
 
@@ -190,7 +189,7 @@ class _Runner:
 
 
 def _with_levels(stage: Stage, levels: tuple[int, ...]) -> Stage:
-    """Return the stage with other levels, each limited to the stage's number of eigenvectors."""
+    """Return the stage with other levels. No level exceeds the number of eigenvectors of the stage."""
     return stage.with_levels(tuple(min(level, stage.number_of_eigenvectors) for level in levels))
 
 
@@ -221,7 +220,8 @@ class _Repairer:
         best, *others = sorted(outcomes, key=self.judge.score)
         if not self.judge.looks_right(best):
             # A right map with a fault can have a worse score than a wrong map without faults. The fallback
-            # lowers the scores of wrong maps as well, so only the removal of all faults counts.
+            # lowers the scores of wrong maps as well. Therefore the second-best map is used only if it
+            # has no faults after the repair.
             faulty = (outcome for outcome in others[:1] if self.judge.faults(outcome))
             mended = [other for other in map(self._by_rounds, faulty) if not self.judge.faults(other)]
             best = min([self._by_rounds(best), *mended], key=self.judge.score)
@@ -274,8 +274,8 @@ class _Repairer:
 
         **Arguments:**
 
-        - `outcome`: the outcome. If it contains refinements of all stages, its refinements before the
-          repeated stage are kept.
+        - `outcome`: the outcome. If the outcome contains refinements of all stages, the refinements before
+          the repeated stage are kept.
         - `stage`: a stage that runs instead of the repeated stage.
         - `excluded`: a mask of the vertices of X (m,) that the repeated stage leaves out. If the stage uses
           samples, the vertices are left out only in its first functional map.

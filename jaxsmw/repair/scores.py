@@ -150,8 +150,8 @@ def orientation_reversal(
     covered = 0.5 * np.sum(np.cross(b - a, c - a) * normals, axis=1) / unit_y**2
     if mesh_x.is_inside_out != mesh_y.is_inside_out:
         covered = -covered
-    # Without this limit, a single triangle whose corners have matches far apart could outweigh all of its
-    # neighbours.
+    # If the corners of a triangle have matches far apart, the area on Y is very large. The signed area is
+    # limited, so that a single triangle does not outweigh all of its neighbours.
     most = 2 * mesh_x.face_areas / unit_x**2
     covered = np.clip(covered, -most, most)
     at_vertices = np.bincount(mesh_x.faces.ravel(), np.repeat(covered / 3, 3), len(mesh_x.vertices))

@@ -51,7 +51,7 @@ class ExpectedErrorSettings:
     **Attributes:**
 
     - `detour_weight` (Tables R17 and R18): the weight of the detour of a vertex. The detour is the distance
-      from the vertex to its image under the map and then the reverse map.
+      between the vertex and its image under the map followed by the reverse map.
     - `distortion_weight`: the weight of the mean change in length of the edges at a vertex. With all default
       settings, the mean error of each tested data set is 0.9 to 1.6 times its mean expected error (Table
       R30).
@@ -123,7 +123,8 @@ class AlternativeSettings:
     - `position_weight`: the weight of the positions along the principal axes in the same search.
     - `levels`, `descriptors`: the levels and the number of descriptors of the feature regression that refines
       the initial maps.
-    - `repaired`: the number of refined maps that are refined again without their faults.
+    - `repaired`: the number of refined maps whose faults are repaired. For each fault of such a map, the map
+      is refined again without the faulty vertices.
     - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
     - `patch_radius` (Table R28): the radius of the patches on which the deformation is measured.
     - `different_areas` (Table R27): a tuple of shares of X's area, each above 0. The second alternative map
@@ -165,7 +166,7 @@ class RepairSettings:
     - `stage`: the stage that repair repeats, as a 0-based position in the stages of the preset. The refiner
       of this stage must have levels.
     - `fallback_levels` (entry R4): the numbers of eigenvectors in the iterations of the fallback. The
-      fallback is one further repetition of the stage after the rounds. By default, the fallback begins with
+      fallback repeats the stage once more after all rounds of repair. By default, the fallback begins with
       fewer eigenvectors than the stage.
     - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
       value is suspicious and is repaired. Correct maps between poses of one body have a distortion below this
@@ -194,13 +195,13 @@ class RepairSettings:
     - `non_isometric` (Table R29): a number of at least 0. If the final map of two full shapes has an
       area-based shape difference of at least this value, the map is refined further, even if it looks right.
       The difference is smaller between poses of one body.
-    - `passes` (Table R29): the number of usual passes for such shapes, at least 0. In each pass, the repeated
-      stage and all later stages run again. Maps of such shapes converge more slowly than maps between poses
-      of one body.
+    - `passes` (Table R29): the number of usual passes, at least 0. In a usual pass, the repeated stage and
+      all later stages run again. Maps between non-isometric shapes need further passes, because such maps
+      converge more slowly than maps between poses of one body.
     - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
-      value, coarse passes and one usual pass run instead of the usual passes. A value below `non_isometric`
-      has the same effect as `non_isometric`. For two full shapes with the initial map
-      `"aligned"`, coarse passes always run (entry R24).
+      value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
+      effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
+      run (entry R24).
     - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass. If
       the refiner of the last stage has no levels, each coarse pass is the same as a usual pass.
     - `rivals` (Table R36): the largest number of rivals. Rivals are the outcomes of the repair with the next

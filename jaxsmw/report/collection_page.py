@@ -118,7 +118,7 @@ def write_collection_page(
         if i == template or replace(first, vertices=shown_model.aligned[i]).area > 0
     ]
     if up is None:
-        # All shapes are aligned, so the guess for each shape is a guess for all shapes.
+        # The aligned shapes have a common upright axis, so the most frequent guess is used.
         guesses = [guess_up(replace(first, vertices=shown_model.aligned[i])) for i in some]
         up = Counter(guesses).most_common(1)[0][0]
     standing = stand(template_mesh, up)
@@ -199,12 +199,12 @@ def simplify(mesh: Mesh, most: int) -> tuple[Int64[np.ndarray, " q"], Int64[np.n
 def layout(
     shapes: Float64[np.ndarray, "N n 3"], weights: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "N 2"]:
-    """Place shapes as points in the plane. The distances of the points resemble the distances of the shapes.
+    """Place shapes as points in the plane. Similar shapes are close to each other.
 
     The distance between two aligned shapes is the weighted root mean square of the distances between
     corresponding vertices. Classical multidimensional scaling gives the initial places (Torgerson 1952).
-    Majorisation then reduces the sum of the squared differences between the distances in the plane and the
-    distances of the shapes (de Leeuw, "Applications of convex analysis to multidimensional scaling", 1977).
+    Majorisation then brings the distances in the plane closer to the distances between the shapes (de Leeuw,
+    "Applications of convex analysis to multidimensional scaling", 1977).
 
     **Arguments:**
 
@@ -220,7 +220,7 @@ def layout(
     values, vectors = np.linalg.eigh(products)
     order = np.argsort(-values)
     points = vectors[:, order] * np.sqrt(np.maximum(values[order], 0))
-    # The sign of an eigenvector is arbitrary. Its entry with the largest absolute value is made positive.
+    # The sign of an eigenvector is arbitrary. The entry with the largest absolute value is made positive.
     points *= np.where(points[np.abs(points).argmax(axis=0), np.arange(count)] < 0, -1, 1)
     distances = squareform(pdist(points))
     places = np.zeros((count, 2))

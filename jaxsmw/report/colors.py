@@ -93,7 +93,7 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """Return a colour for every vertex. The colours vary smoothly with the position on the body.
 
     The right side of the body is green, and the left side is red. The hue changes from yellow to blue along
-    the height or the length of the body, whichever is larger. Along the other of these two axes, only the
+    the height or the length of the body, whichever is larger. Along the shorter of the two axes, only the
     lightness changes. Each limb of people and animals therefore has its own hue, and swapped limbs are
     obvious.
 

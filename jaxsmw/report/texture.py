@@ -59,8 +59,8 @@ def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
     """
     used = mesh.vertices[mesh.referenced_vertices]
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
-    # The sign of a singular vector is arbitrary. Each vector receives the sign that makes its component with
-    # the largest absolute value positive.
+    # The sign of a singular vector is arbitrary. Here, the component with the largest absolute value is
+    # positive.
     longest = axes[:2] * np.sign(axes[:2][[0, 1], np.abs(axes[:2]).argmax(axis=1)])[:, None]
     flat, low = mesh.vertices @ longest.T, (used @ longest.T).min(axis=0)
     return (flat - low) / np.ptp(used @ longest.T, axis=0).max()

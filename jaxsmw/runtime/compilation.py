@@ -85,9 +85,9 @@ def compile_ahead(
 
     **Arguments:**
 
-    - `arguments`: a function without arguments, which returns the arrays for `function`. The result consists
-      of a tuple of positional arguments and a mapping of named arguments. JAX traces `arguments` to determine
-      the sizes of the arrays, and does not compute the arrays.
+    - `arguments`: a function without parameters. It returns the arrays that are passed to `function`: a
+      tuple of positional arguments and a mapping of named arguments. JAX traces `arguments` to determine the
+      sizes of the arrays, and does not compute the arrays.
     - `settings`: the remaining keyword arguments of `function`.
 
     **Returns:** A future that is done when the program is compiled. If compilation raises an exception, the

@@ -31,7 +31,7 @@ _Value = TypeVar("_Value")
 
 
 class _Corners(NamedTuple):
-    """Each of p results is computed from k weighted rows of an array."""
+    """For each of p results: k rows of an array, and the weights of these rows."""
 
     rows: Int64[np.ndarray, "p k"]
     weights: Float64[np.ndarray, "p k"]
@@ -79,10 +79,10 @@ def transfer_attributes(
     - `target`: a `MeshData` with the mesh `registered.mesh_y`, or this mesh itself. None (the default) stands
       for this mesh.
 
-    **Returns:** The `MeshData` of Y with the vertices and faces of `target`. The `notes` of its `mesh` tell
-    which data of Y were replaced. The notes also count the vertices of Y whose distance to the registered
-    mesh is above 3 % of the square root of Y's area. These vertices receive the values at the nearest point,
-    too.
+    **Returns:** The `MeshData` of Y with the vertices and faces of `target`. The notes in
+    `mesh.notes` name the data of Y that were replaced. The notes also count the vertices of Y whose distance
+    to the registered mesh is above 3 % of the square root of Y's area. These vertices receive the values at
+    the nearest point, too.
 
     **Raises:** `InputError` if `data` or `target` do not belong to the registered meshes.
     """

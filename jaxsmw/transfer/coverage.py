@@ -12,14 +12,14 @@ from scipy.sparse import csr_array, diags_array
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 
-# A vertex of the target is uncovered if its distance from the source lies between these two lengths, in units
-# of the square root of the target's area. Vertices at larger distances would stretch single triangles into
-# spikes. (Entry R37 of docs/research_log.md)
+# A vertex of the target is uncovered if its distance from the source is between `_UNCOVERED` and `_MISSING`.
+# Distances are in units of the square root of the target's area. Vertices at larger distances would stretch
+# single triangles into spikes. (Entry R37 of docs/research_log.md)
 _UNCOVERED, _MISSING = 0.005, 0.03
 
 
 class Attraction(NamedTuple):
-    """The c pairs of a point of the source and a vertex of the target that attracts this point.
+    """Vertices of the target (c,), each with the point of the source that the vertex attracts.
 
     **Attributes:**
 

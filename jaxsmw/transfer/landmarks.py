@@ -59,8 +59,8 @@ def transfer_landmarks(
     therefore have this coordinate system and this unit.
 
     **Raises:** `InputError` if `expected_error` does not contain one number for each vertex of X.
-    `InputError` is also raised if the landmarks lie off the surface of X, but would lie on it in the other
-    coordinate system (see `jaxsmw.io.check_frame`).
+    `InputError` is also raised if `jaxsmw.io.check_frame` finds that the landmarks are too far from the
+    surface of X.
     """
     mesh_x, mesh_y = registered.mesh_x, registered.mesh_y
     if expected_error is not None and expected_error.shape != (len(mesh_x.vertices),):
@@ -97,9 +97,8 @@ def nearest_vertices(
 
     The function issues a `UserWarning` for each landmark that is far from its surface.
 
-    **Raises:** `InputError` if landmarks lie off their surface, but would lie on it in the other coordinate
-    system. `InputError` is also raised if two landmarks have the same vertex of X, but different vertices of
-    Y.
+    **Raises:** `InputError` if `jaxsmw.io.check_frame` finds that the landmarks are too far from a surface.
+    `InputError` is also raised if two landmarks have the same vertex of X, but different vertices of Y.
     """
     pairs = []
     for landmarks, mesh in ((landmarks_x, mesh_x), (landmarks_y, mesh_y)):

@@ -33,8 +33,8 @@ class _Round(NamedTuple):
 
     **Attributes:**
 
-    - `deformations`: the largest number of deformations. The round ends earlier if no face is flipped, and if
-      nothing is pulled or drawn to the target.
+    - `deformations`: the largest number of deformations. If no vertex is pulled or drawn to the target, the
+      round ends as soon as no face is flipped.
     - `factor`: the factor by which weights at flipped faces and at their neighbours are multiplied.
     - `neighbors`: the largest distance to these neighbours, in edges.
     - `pull`: if positive, vertices with reduced weights are pulled to the target. The function `_halfway`
@@ -363,7 +363,7 @@ def points_of_map(
     **Raises:** `InputError` if the map does not fit the meshes.
     """
     vertices = check_indices(pointwise_map, len(mesh_y.vertices), f"map to {mesh_y.name}: vertex")
-    # An unreferenced vertex of Y has no face, so its nearest point represents it.
+    # An unreferenced vertex of Y is replaced by the nearest point of the surface.
     points, _ = nearest_surface_points(mesh_y.vertices[vertices], mesh_y)
     smooth = register_mesh(mesh_x, mesh_y, points, stiffness=_STIFFNESS_OF_MAPS, scale=scale)
     return smooth.surface_points
@@ -382,8 +382,8 @@ def _follow(
 
     The targets have weights. The edge vectors are those of X, transformed by `similarities`. `attraction`
     adds weighted squared distances from points of X to uncovered vertices of Y. The linear system is solved
-    for the vertices at which the given positions are not accurate, and for their neighbours. All other
-    vertices stay where they are. If these positions become inaccurate, the next deformation moves them.
+    only for the vertices whose given positions are not accurate, and for their neighbours. All other vertices
+    keep the given positions.
     """
     system = csr_array(diags_array(weights) + stiffness**2 * around.laplacian)
     right = stiffness**2 * around.divergence(similarities) + weights[:, None] * targets
@@ -422,14 +422,15 @@ def _halfway(
 ) -> Float64[np.ndarray, "p 3"]:
     """Move each point of Y halfway to a given position, in the plane of the point's triangle.
 
-    The nearest point alone would let a vertex slide along the surface, away from its point of the map.
+    Vertices that are pulled to the nearest points of Y can slide along the surface, away from the points of
+    the map. The halfway points hold the vertices back.
     """
     positions = nearest.positions(mesh_y)
     normals = mesh_y.area_vectors[nearest.faces]
     squares = (normals**2).sum(axis=1, keepdims=True)
     offsets = mapped - positions
     along = (offsets * normals).sum(axis=1, keepdims=True)
-    # A triangle without area has no normal, and its points move halfway in space.
+    # A triangle without area has no normal, so the offsets of its points are not projected.
     offsets -= normals * np.divide(along, squares, out=np.zeros_like(along), where=squares > 0)
     return positions + 0.5 * offsets
 

@@ -29,8 +29,7 @@ def transfer_texture(
 
     The registered mesh is cut along the seams of the texture. The centroid of each face of Y lies on one side
     of a seam. Each corner of the face receives the texture coordinates at its nearest point on the same side
-    as the centroid. Thus a seam that does not separate two charts, such as the seam of a cylinder, is
-    respected as well.
+    as the centroid. Seams inside one chart, such as the seam of a cylinder, are also respected.
 
     **Arguments:**
 
@@ -84,11 +83,10 @@ def _best_of_sides(
     near: Bool[np.ndarray, " f"],
     lengths: Float64[np.ndarray, " c"],
 ) -> Int64[np.ndarray, " c"]:
-    """Choose one corner for all corners that have the same vertex and lie on the same side of the seams.
+    """Group the corners by vertex and by side of the seams, and choose one corner of each group.
 
     The chosen corner is the corner whose walk ended nearest to the vertex. The result (c,) contains the
-    chosen corner for each of the c = 3 f corners. Without this choice, walks from different faces on one
-    side of a jagged seam could end at different points.
+    chosen corner for each of the c = 3 f corners.
     """
     tail, head = np.arange(3 * len(faces)), np.roll(np.arange(3 * len(faces)).reshape(-1, 3), -1, 1).ravel()
     vertex = faces.ravel()

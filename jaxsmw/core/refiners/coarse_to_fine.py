@@ -69,7 +69,7 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
 
     @property
     def matches_samples_with_all(self) -> bool:
-        """True: samples of X are matched with all vertices of Y."""
+        """Always True, because `recover` matches samples of X with all vertices of Y."""
         return True
 
     def active_eigenvectors(

@@ -375,9 +375,9 @@ def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array,
     """
     own, matched = moments[:, :3], moments[:, 3:6]
     products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
-    # The moments are averages, weighted by the heat kernel around each vertex. With these weights, positions
-    # have a variance of twice the heat time in each direction of the tangent plane. The division scales this
-    # variance to 1, which equals the squared length of a unit normal.
+    # The moments are averages, weighted by the heat kernel around each vertex. In each direction of the
+    # tangent plane, the weighted variance of positions is twice the heat time. After the division by
+    # `2 * surface.time`, the variance is 1, like the squared length of a unit normal.
     covariance = (products - own[:, :, None] * matched[:, None, :]) / (2 * surface.time) + normals
     mirrored = jnp.sum(surface.weights * jnp.linalg.det(covariance)) < 0
     sign = jnp.where(mirrored, -1, 1).astype(covariance.dtype)

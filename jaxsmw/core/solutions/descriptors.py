@@ -61,8 +61,8 @@ class DescriptorPair(eqx.Module):
     - `x`, `y`: d functions on X and the corresponding d functions on Y, expressed in the eigenbases. The
       shapes are (k_x, d) for `x.coefficients` and (k_y, d) for `y.coefficients`. Column j contains the
       coefficients of function j. The shapes are (d, k_x, k_x) for `x.operators` and (d, k_y, k_y) for
-      `y.operators`, each of which can be None. Matrix j multiplies other functions by function j, in the
-      eigenbasis.
+      `y.operators`. Matrix j multiplies other functions by function j, in the eigenbasis. The attribute
+      `operators` is None if no operators were computed.
 
     The term for descriptor commutativity needs the operators of both shapes. `RegularizedLeastSquares` raises
     `ValueError` if this term has a weight but the operators of a shape are None. `DescriptorPair.project`

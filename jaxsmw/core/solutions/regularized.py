@@ -207,8 +207,8 @@ class RegularizedLeastSquares(Solution[None]):
         determined = curvature > quadratic.rounding()
         finite = jnp.all(jnp.isfinite(curvature)) & jnp.all(jnp.isfinite(quadratic.cross))
         solvable = finite & jnp.all(determined)
-        # This scaling gives the quadratic terms the same curvature in each entry of C, so conjugate gradients
-        # need few steps.
+        # The quadratic terms have the same curvature in each entry of `C / unit`, so conjugate gradients need
+        # few steps.
         unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
         if initial is None:
             initial = quadratic.cross * unit**2
@@ -292,9 +292,8 @@ class RegularizedLeastSquares(Solution[None]):
         precision = 0.1 * self.tolerance
         inner = lx.Normal(lx.CG(precision, precision, max_steps=10 * max(unit.shape)))
         with jax.default_matmul_precision("highest"):
-            # The solver takes full Gauss–Newton steps, because a trust region never shortened a step on real
-            # pairs. The trust-region solvers of optimistix also do not accept float32 while jax_enable_x64 is
-            # set.
+            # The solver has no trust region. On real pairs, a trust region never shortened a step. The
+            # trust-region solvers of optimistix also do not accept float32 while jax_enable_x64 is set.
             solution: optx.Solution = optx.least_squares(
                 lambda scaled, _: [jnp.where(solvable, term.residual(scaled * unit), 0) for term in terms],
                 optx.GaussNewton(self.tolerance, self.tolerance, linear_solver=inner),
@@ -325,9 +324,8 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
     """Return the energy, up to a constant, as the squared norm of a residual (k_out, k_in).
 
     The energy is a sum of squares over many columns. The columns can be replaced by the Cholesky factor of
-    the gram matrix, because the factor has the same inner products as the columns. Adding the rounding error
-    to the diagonal of the gram matrix ensures that the factor exists, even if the energy alone does not
-    determine C.
+    the gram matrix, because the factor has the same inner products as the columns. The rounding error
+    is added to the diagonal, because a singular matrix has no Cholesky factor.
     """
     (k_out, k_in), dtype = energy.cross.shape, energy.gram.dtype
     factor = jnp.linalg.cholesky(energy.gram + energy.rounding() * jnp.eye(k_in, dtype=dtype))

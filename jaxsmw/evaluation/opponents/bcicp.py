@@ -248,15 +248,14 @@ def _bijective_step(
         Phi_X(x) = Phi_Y(y) C^T    for C = C_XY and for C = C_XX^T C_XY,
         Phi_X(x) C^T = Phi_Y(y)    for C = C_YX and for C = C_YY^T C_YX.
 
-    The functional map of a closed cycle is the identity, so `C_XX = C_XY C_YX` should be the identity. In
-    each of the two equations, the second C is the first C, multiplied from the left by C_XX^T or C_YY^T. If
-    `C_XX = C_XY C_YX`, this factor turns the cycle into the identity: `C_XX^T C_XY C_YX = I`.
+    The functional map of a cycle should be the identity. The factor C_XX^T corrects C_XY accordingly: if
+    `C_XX = C_XY C_YX`, then `C_XX^T C_XY C_YX = I`. The factor C_YY^T corrects C_YX in the same way.
 
     Each condition compares an embedding of X with an embedding of Y. The four embeddings of each shape are
     concatenated with equal weights. One search for nearest neighbours between the concatenated embeddings
     gives the new map X -> Y. A second search, with queries and targets exchanged, gives the new map Y -> X.
-    The equal weights and the form of the cycle conditions are our choice. On six pairs, the cycle condition
-    `Phi_X(x) = Phi_X(T_YX(y)) C_XX^T` gave worse maps.
+    The equal weights and the form of the cycle conditions are our choice. Another cycle condition,
+    `Phi_X(x) = Phi_X(T_YX(y)) C_XX^T`, gave worse maps on six pairs.
     """
     phi_x, phi_y = x.eigenvectors, y.eigenvectors
     dual_x, dual_y = phi_x * x.areas[:, None], phi_y * y.areas[:, None]

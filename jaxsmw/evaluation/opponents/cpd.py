@@ -36,8 +36,8 @@ regression of the displacements on the columns of L,
 
     (L^T diag(P 1) L + stiffness s I) b = L^T (P X - diag(P 1) Y).
 
-By Woodbury's identity, this system is equivalent to the linear system above if `L L^T` equals G. Solving this
-system needs no division by small numbers.
+By Woodbury's identity, the ridge regression is equivalent to the linear system for W if `L L^T` equals G. The
+ridge regression needs no division by small numbers.
 
 `CPD` has the settings of the benchmark: 30 eigenvectors and 3 iterations. Each iteration computes a
 functional map and recovers a pointwise map.

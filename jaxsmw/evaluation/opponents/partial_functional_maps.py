@@ -48,8 +48,9 @@ This implementation differs from the paper in the following points.
   therefore differ from those in the paper. The weights mu_1 = mu_3 = 1 and mu_2 = 100 have the published
   values. The minimisation over C multiplies the fidelity term by `FIDELITY`. `FIDELITY` and mu_5 were chosen
   on four real pairs. No other value of mu_4 was tested.
-- **Recovery.** The nearest-neighbour search includes all vertices of Y. A search among only the vertices of
-  the region gave the same maps, or worse maps if the region was wrong.
+- **Recovery.** The nearest-neighbour search includes all vertices of Y. If the computed region is correct, a
+  search among only the vertices of the region gives the same maps. If the region is wrong, the search in
+  the region gives worse maps.
 - **Solver.** Limited-memory BFGS (L-BFGS) of the library optimistix minimises the energies in a bounded
   number of steps. The variable v is scaled by the square roots of the vertex areas. All norms are smoothed at
   zero.
@@ -97,8 +98,8 @@ REGION_WEIGHTS = (10.0, 0.01)
 
 # The rate at which the slanted weights decay towards high frequencies (sigma of W in the paper).
 _DECAY = 0.03
-# `_smoothed_norm` smooths the norms of columns and of gradients below this threshold. A descriptor has a norm
-# of about 1, and a function that changes by 1 across Y has a gradient of about 1.
+# `_smoothed_norm` smooths the norms of columns and of gradients below this threshold. By comparison, the
+# norm of a descriptor is about 1.
 _SMOOTHING = 1e-3
 # The largest numbers of L-BFGS steps in a minimisation over C and in a minimisation over v.
 _MAP_STEPS, _REGION_STEPS = 100, 60
@@ -231,8 +232,8 @@ def partial_functional_map(
     state, _ = lax.scan(iterate, (initial, energies.covered(initial)), None, length=iterations)
     functional_map, membership = state
     region = jnp.where(spectrum_y.mask, eta(membership), 0)
-    # If an energy overflows, the minimisations leave C and v unchanged. C and v are then finite, so the
-    # fidelity term is checked as well.
+    # If an energy overflows, the minimisations leave C and v unchanged. The fidelity term shows the
+    # overflow.
     left = fidelity(functional_map, energies.coefficients_x, energies.inside(membership))
     finite = all_finite((functional_map, region, left))
     result = where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)

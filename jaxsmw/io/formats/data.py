@@ -328,7 +328,7 @@ def is_texture_of_vertices(data: MeshData) -> bool:
 
 def unique_name(name: str, taken: Collection[str]) -> str:
     """Return a name that is not taken: the name itself, or the name with a number in parentheses."""
-    chosen, number = name, len(taken)  # counting from 1 is slow for many equal names
+    chosen, number = name, len(taken)  # a search from number 1 is slow if many names are equal
     while chosen in taken:
         number += 1
         chosen = f"{name} ({number})"

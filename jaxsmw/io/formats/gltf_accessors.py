@@ -224,7 +224,7 @@ class Document:
         if "bufferView" in description:
             offset = self.integer(description, "byteOffset", 0)
             values = self.view(description["bufferView"], offset, count, kind, width)
-        elif rows is None:  # without data, an accessor could declare any number of elements
+        elif rows is None:  # limits memory: an accessor without data can state any number of elements
             raise InputError(f"accessor {index} has no buffer view, {DAMAGED}")
         else:
             values = np.zeros((count, width), kind)

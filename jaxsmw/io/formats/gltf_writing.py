@@ -108,7 +108,8 @@ class _File:
         order = np.argsort(-np.abs(weights), axis=1, kind="stable")
         used = max(int((weights != 0).sum(axis=1).max()), 1)
         order = order[:, : 4 * -(-used // 4)]
-        # In glTF, joints without weight must have the number 0. Zeros fill the last set of four columns.
+        # In glTF, joints without weight must have the number 0. The columns are padded with
+        # zeros to a multiple of four.
         largest = np.take_along_axis(weights, order, axis=1)
         columns = -order.shape[1] % 4
         joints = np.pad(np.where(largest != 0, order, 0), ((0, 0), (0, columns)))
@@ -128,7 +129,7 @@ class _File:
         identity = np.tile(np.eye(4, dtype=np.float32).ravel(), (len(names), 1))
         matrices = {"bufferView": self.view(identity), "componentType": _COMPONENTS["f4"]}
         self.json["accessors"].append(matrices | {"count": len(names), "type": "MAT4"})
-        # These matrices are optional in glTF, but VTK 9.7 ends the process if they are missing.
+        # Inverse bind matrices are optional in glTF, but VTK 9.7 ends the process if a file has none.
         self.json["skins"] = [{"joints": nodes, "inverseBindMatrices": len(self.json["accessors"]) - 1}]
 
     def view(self, values: np.ndarray, target: int | None = None) -> int:

@@ -49,7 +49,7 @@ def parse_mat(data: bytes) -> Polygons:
 
 
 def _with_data(polygons: Polygons, surface: Mapping[str, Any]) -> Polygons:
-    """Add the mesh data that `format_mat` writes into further fields of the struct."""
+    """Read the further mesh data of the struct, and add these data to the polygons."""
     n, f = len(polygons.vertices), len(polygons.sizes)
     texture, skin = surface.get("texture"), surface.get("skin")
     names = {name: tuple(_words(words)) for name, words in _struct(surface.get("label_names")).items()}

@@ -60,8 +60,8 @@ def _within(corners: np.ndarray, n: int) -> bool:
 def _vertex_data(lines: list[str], keyword: str) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
     """Return the vertex data (normals and colours) and the texture coordinates.
 
-    They are read from the columns after the positions. These columns are ignored if their number in any line
-    differs from what the keyword announces.
+    They are read from the columns after the positions. If any line has more or fewer columns than the keyword
+    announces, the function returns no data.
     """
     first = len(lines[0].split()) if keyword and lines else 0
     normals, coordinates = 3 * ("N" in keyword), 2 * ("ST" in keyword)
@@ -88,7 +88,7 @@ def _face_data(lines: list[str], sizes: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _columns(lines: list[str], width: int) -> Float64[np.ndarray, "lines columns"] | None:
-    """Return the numbers of all columns, or None if not every line has `width` finite numbers."""
+    """Return the lines as a table, or None if a line does not consist of `width` finite numbers."""
     if any(len(line.split()) != width for line in lines):
         return None
     try:

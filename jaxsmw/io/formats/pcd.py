@@ -14,7 +14,8 @@ from jaxsmw.wording import count_of
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _NORMAL_FIELDS = ("normal_x", "normal_y", "normal_z")
-# Compressed points may unpack to this number of bytes, or to four times the size of the file if this is more.
+# Compressed points may unpack to this number of bytes. In a large file, the points may unpack to four times
+# the size of the compressed data.
 _LARGEST = 2**28
 # The name of padding fields, which contain no data.
 _PADDING = "_"

@@ -354,7 +354,7 @@ def _columns(data: Mapping[str, np.ndarray], reserved: set[str]) -> tuple[dict[s
 
 
 def _storable(values: np.ndarray) -> np.ndarray | None:
-    """Return values in a data type of PLY files, or None if their integers are too large.
+    """Return the values in a data type that PLY files allow, or None if no such type can represent them.
 
     Long integers become int32 or float64 if these types can represent them.
     """

@@ -19,7 +19,7 @@ def parse_stl(data: bytes) -> Polygons:
     """Parse a text or binary file. Corners at the same position become one vertex."""
     header = 84
     count = int.from_bytes(data[80:header], "little")
-    # Both text files and some binary files begin with "solid". Therefore a file is treated as binary if its
+    # All text files and some binary files begin with "solid". Therefore a file is treated as binary if its
     # length fits its header.
     if len(data) >= header and len(data) == header + count * _FACET.itemsize:
         corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3)

@@ -37,7 +37,7 @@ _NAMES = {
     **{"u4": "unsigned_int", "i8": "vtktypeint64", "u8": "vtktypeuint64", "f4": "float", "f8": "double"},
 }
 _KINDS = {"VERTICES": VERTEX, "LINES": LINE, "POLYGONS": POLYGON, "TRIANGLE_STRIPS": STRIP}
-# The number of columns of each attribute whose first line does not declare it.
+# The attributes with a fixed number of columns.
 _COLUMNS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1}
 _COLUMNS["EDGE_FLAGS"] = 1
 
@@ -184,7 +184,7 @@ class _File:
         return None
 
     def take(self, rows: int, columns: int, name: str) -> np.ndarray:
-        """Return the next numbers as an array (rows, columns). `name` is the name of their type in VTK."""
+        """Return the next numbers as an array (rows, columns). `name` is the VTK type of the numbers."""
         kind = _TYPES.get(name.lower())
         if kind is None:
             raise InputError(

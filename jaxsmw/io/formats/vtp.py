@@ -38,7 +38,7 @@ _TYPES = {
     **{"Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8"},
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
-# The kinds of cells. The rows of cell data follow this order.
+# The kinds of cells, in the order of the rows of cell data.
 _KINDS = {"Verts": VERTEX, "Lines": LINE, "Polys": POLYGON, "Strips": STRIP}
 _COMPRESSORS = {"vtkZLibDataCompressor", "vtkLZMADataCompressor", "vtkLZ4DataCompressor"}
 
@@ -103,7 +103,7 @@ class _File:
         self.budget = largest_contents(len(data))
         try:
             if b"<!" in re.sub(rb"<!--.*?-->|<!\[CDATA\[", b"", xml, flags=re.DOTALL):
-                raise ValueError  # a document type can declare entities that expand without limit
+                raise ValueError  # refuses declarations of entities, which can expand without limit
             self.root = ElementTree.fromstring(xml)
         except (ElementTree.ParseError, LookupError, ValueError):
             raise InputError("is not a complete XML file: export the mesh again.") from None
