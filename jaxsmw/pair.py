@@ -268,8 +268,7 @@ def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, 
 
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the same unit of length.
 
-    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors. The spectrum whose largest eigenvalue
-    is the limit is unchanged.
+    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors. One of the spectra is unchanged.
     """
     spectra = spectrum_x, spectrum_y
     last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)

@@ -1,6 +1,6 @@
 """Surfaces of point clouds: triangle meshes whose vertices are the given points.
 
-All methods for meshes can be applied to a mesh through the points of a point cloud. The tetrahedra of the
+After triangulation, a point cloud is a mesh, so all methods for meshes can be applied. The tetrahedra of the
 Delaunay triangulation of the points are labelled inside or outside, and the surface consists of the triangles
 between inside and outside tetrahedra. Unlike triangulations in tangent planes, this method separates sheets
 that nearly touch, and orients the surface consistently.

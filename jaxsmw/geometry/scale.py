@@ -168,8 +168,8 @@ def _vote(part: _Described, full: _Described, share: float, settings: ScaleSetti
     ratios = np.sort(np.log(after[compared] / before[compared]))
     if len(ratios) < _FEWEST:
         return _Vote(share, 0.0)
-    # The most frequent ratio agrees with the largest number of other ratios. Ratios far from 1 belong to
-    # other shares and are not counted.
+    # Two ratios agree if their logarithms differ by at most the tolerance. The most frequent ratio is the
+    # ratio that agrees with the most other ratios. Ratios far from 1 belong to other shares and do not count.
     tolerance = settings.tolerance
     counts = np.searchsorted(ratios, ratios + tolerance) - np.searchsorted(ratios, ratios - tolerance)
     counts = np.where(np.abs(ratios) < _FARTHEST, counts, 0)

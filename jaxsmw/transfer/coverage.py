@@ -67,8 +67,8 @@ class UncoveredVertices:
     ) -> Attraction | None:
         """Return the uncovered vertices of Y, each with the point of the deformed X that it attracts.
 
-        The first call excludes each vertex of Y whose distance from X is at most half of the limit
-        `_UNCOVERED`. Later calls also ignore these vertices.
+        The first call finds the vertices of Y that are already close to X, within half of the distance
+        `_UNCOVERED`. No call returns these vertices.
 
         **Arguments:**
 

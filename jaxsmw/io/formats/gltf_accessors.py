@@ -181,7 +181,7 @@ class Document:
             ) from None
 
     def view(self, index: Any, offset: int, count: int, kind: str, columns: int) -> np.ndarray:
-        """Return `count` rows of a buffer view, from an offset on, as numbers (count, columns)."""
+        """Return `count` rows of a buffer view as numbers (count, columns). The rows start at `offset`."""
         description = self.item("bufferViews", index)
         if "EXT_meshopt_compression" in self.dict_of(description, "extensions"):
             raise InputError(
