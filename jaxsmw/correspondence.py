@@ -44,21 +44,21 @@ class Correspondence:
 
     - `pair`: the `Pair` of the source X (m vertices) and the target Y (n vertices).
     - `pointwise_map`: T: X -> Y (m,), int64. Entry i is the match of vertex i of X, as a 0-based vertex of Y.
-    - `functional_map`: the functional map of the last iteration, a property. Its shape is (k_X, k_Y) for a
-      pullback, which is the usual convention, and (k_Y, k_X) for a pushforward.
+    - `functional_map`: the functional map of the last iteration, a property without unit. Its shape is
+      (k_X, k_Y) for a pullback, which is the usual convention, and (k_Y, k_X) for a pushforward.
     - `initial_map`: the map from which refinement started (m,), int64, as 0-based vertices of Y.
     - `init`: the name of the initial map, such as `"shot"`; None if a map or landmarks were given. If repair
       chose an alternative initial map, `initial_map` is the alternative.
     - `preset`: the `Preset` with the stages of refinement and the settings of the repair. For small meshes,
       the stages of a preset differ from the stages in `PRESETS`; see `match`.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y. They contain the k_X and k_Y eigenvectors that the
-      last stage uses. Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by
-      one common factor, so that the larger shape has area 1.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. They contain the k_X and k_Y
+      eigenvectors that the last stage uses. Two full shapes are each scaled to area 1. The shapes of a
+      partial pair are scaled by one common factor, so that the larger shape has area 1.
     - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
-    - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), which is 1 for isometries
-      and larger for worse maps.
+    - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), a number without unit. The
+      distortion is 1 for isometries and larger for worse maps. The value is None if it was not computed.
     - `suspicious`: whether the map looks wrong. If the preset has repair, the value is True if limbs still
       look swapped or the body still looks upside down after repair. If the preset has no repair, the value is
       True if the distortion is at least 1.25. In both cases, the value is also True if `match` is uncertain
@@ -111,8 +111,8 @@ class Correspondence:
     def functional_map(self) -> Float[np.ndarray, "k_out k_in"]:
         """The functional map of the last iteration, in the convention of the last stage's refiner.
 
-        The shape is (k_X, k_Y) for a pullback, from functions on Y to functions on X. The shape is (k_Y, k_X)
-        for a pushforward, from functions on X to functions on Y.
+        The map has no unit. The shape is (k_X, k_Y) for a pullback, from functions on Y to functions on X.
+        The shape is (k_Y, k_X) for a pushforward, from functions on X to functions on Y.
         """
         return np.asarray(self.refinement.functional_map)
 
@@ -151,8 +151,8 @@ class Correspondence:
     def reverse_map(self) -> Int64[np.ndarray, " n"]:
         """Compute the map Y -> X from the embeddings of the last stage, without a second call of `match`.
 
-        **Returns:** The match of every vertex of Y (n,), as a 0-based vertex of X. An unreferenced vertex of
-        Y receives the match of the nearest referenced vertex.
+        **Returns:** The match of every vertex of Y (n,), int64, as a 0-based vertex of X. An unreferenced
+        vertex of Y receives the match of the nearest referenced vertex.
         """
         with self._precision():
             padded = np.asarray(compiled(reverse_map)(*self._last_stage()))
@@ -213,7 +213,7 @@ class Correspondence:
         shapes with different triangulations, the attribute `pointwise_map` has much smaller errors than the
         one-to-one map. An unreferenced vertex of X receives the match of the nearest referenced vertex.
 
-        **Returns:** The map X -> Y (m,), as 0-based vertices of Y.
+        **Returns:** The map X -> Y (m,), int64, as 0-based vertices of Y.
 
         **Raises:** `InputError` if X has more referenced vertices than Y, or if the product of the numbers of
         referenced vertices of X and Y is above 20 000².
@@ -311,7 +311,14 @@ class Correspondence:
         return self.estimate_error(ExpectedErrorSettings())
 
     def estimate_error(self, settings: ExpectedErrorSettings) -> Float[np.ndarray, " m"]:
-        """Estimate the geodesic error of every match (m,) with the given settings; see `expected_error`."""
+        """Estimate the geodesic error of every match (m,) with the given settings; see `expected_error`.
+
+        **Arguments:**
+
+        - `settings`: the `ExpectedErrorSettings`.
+
+        **Returns:** The expected errors (m,), divided by the square root of Y's area.
+        """
         expected = expected_error(
             self.pair.mirrored() if self.mirrored else self.pair,
             self.pointwise_map,

@@ -42,9 +42,9 @@ class SampledShape(NamedTuple):
 
     **Attributes:**
 
-    - `mesh`: the mesh with n vertices.
+    - `mesh`: the `Mesh` with n vertices.
     - `samples`: the `SurfaceSamples` of the mesh, or None if descriptors are compared at all vertices.
-    - `spectrum`: the spectrum of the mesh, restricted to the compared vertices.
+    - `spectrum`: the `Spectrum` of the mesh, restricted to the compared vertices.
     """
 
     mesh: Mesh
@@ -81,7 +81,7 @@ class SampledPair:
 
     **Attributes:**
 
-    - `pair`: the source X and the target Y.
+    - `pair`: the `Pair` of the source X and the target Y.
     - `x`, `y`: the source X and the target Y, each a `SampledShape`.
     """
 
@@ -96,7 +96,10 @@ class SampledPair:
 
     @cached_property
     def shot(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
-        """SHOT of X and Y at the compared vertices, with the usual radius; see `paired_shot`."""
+        """SHOT of X and Y at the compared vertices, with the usual radius; see `paired_shot`.
+
+        The arrays are dimensionless and have one row per compared vertex and 352 columns.
+        """
         return paired_shot(self)
 
 
@@ -146,10 +149,11 @@ def describe(
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, from `paired_spectra`.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum` from `paired_spectra`.
     - `number_of_descriptors`: the number d of components, from 1 to 352. The d components of largest variance
       are used.
-    - `sampled`: the result of `sample_pair` for this pair, if it was already computed.
+    - `sampled`: the `SampledPair` that `jaxsmw.descriptors.sample_pair` returns for this pair, if it was
+      already computed.
 
     **Returns:** The spectra of X and Y, with dimensionless `descriptors` of shapes (m, d) and (n, d). The
     function issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
@@ -188,7 +192,7 @@ class DescriptorAxes(NamedTuple):
 
     **Attributes:**
 
-    - `radii`: the radii of SHOT, in units of the square root of the area.
+    - `radii`: the radii of SHOT, a tuple of floats in units of the square root of the area.
     - `principal`: the `PrincipalAxes` of SHOT at all radii. All shapes have equal weights.
     """
 
@@ -203,7 +207,7 @@ class DescriptorAxes(NamedTuple):
 
         **Arguments:**
 
-        - `shapes`: the shapes of the collection.
+        - `shapes`: the shapes of the collection, each a `SampledShape`.
         - `number_of_descriptors`: the number d of axes, from 1 to 352.
 
         **Raises:** `InputError` if a mesh is too coarse for SHOT.
@@ -220,8 +224,10 @@ class DescriptorAxes(NamedTuple):
 
         **Arguments:**
 
-        - `shape`: the shape with its compared vertices.
-        - `spectrum`: the spectrum at all vertices.
+        - `shape`: the `SampledShape` with its compared vertices.
+        - `spectrum`: the `Spectrum` at all vertices.
+
+        **Returns:** The `Spectrum` with dimensionless `descriptors` (n, d), whose mean squares are about 1.
 
         **Raises:** `InputError` if the mesh is too coarse for SHOT.
         """
@@ -291,9 +297,9 @@ class PrincipalAxes(NamedTuple):
 
     **Attributes:**
 
-    - `mean`: the weighted mean of the rows (c,).
+    - `mean`: the weighted mean of the rows (c,), in the unit of the rows.
     - `axes`: the axes (c, d), in order of decreasing variance. Each axis is divided by the standard deviation
-      of the rows along the axis.
+      of the rows along the axis, so its unit is the inverse unit of the rows.
     """
 
     mean: Float[np.ndarray, " c"]

@@ -100,8 +100,9 @@ class Pair:
     def units_of_length(self) -> tuple[float, float]:
         """The unit of length for X, in the coordinates of X, and the unit for Y, in the coordinates of Y.
 
-        For two full shapes, the units are the square roots of the areas of X and of Y, which compensates for
-        a difference in size. For a partial pair, both units are the square root of the larger area.
+        Each unit is a float. For two full shapes, the units are the square roots of the areas of X and of Y,
+        which compensates for a difference in size. For a partial pair, both units are the square root of the
+        larger area.
         """
         root_x, root_y = self.mesh_x.area**0.5, self.mesh_y.area**0.5
         if not self.partial:
@@ -112,7 +113,8 @@ class Pair:
     def areas(self) -> tuple[float, float]:
         """The areas of X and of Y in `units_of_length`.
 
-        Two full shapes each have area 1. In a partial pair, the larger shape has area 1.
+        Each area is a float. Two full shapes each have area 1. In a partial pair, the larger shape has area
+        1.
         """
         unit_x, unit_y = self.units_of_length
         return self.mesh_x.area / unit_x**2, self.mesh_y.area / unit_y**2
@@ -266,9 +268,10 @@ def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, 
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in the same unit of length.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`, in the same unit of length.
 
-    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors. One of the spectra is unchanged.
+    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors, in the same unit. One of the spectra is
+    unchanged.
     """
     spectra = spectrum_x, spectrum_y
     last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)

@@ -48,10 +48,10 @@ class PreparedPair:
     **Attributes:**
 
     - `pair`: the `Pair` of the source X (m vertices) and the target Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in `Pair.units_of_length`, without padding. The
-      spectra contain descriptors if descriptors were requested.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum` in `Pair.units_of_length`, without
+      padding. The spectra contain descriptors if descriptors were requested.
     - `init`: the argument `init` of `prepare`, from which the initial map was computed.
-    - `initial_map`: T: X -> Y (m,), as 0-based vertices of Y.
+    - `initial_map`: T: X -> Y (m,), int64, as 0-based vertices of Y.
     - `samples`: the samples of X (s,) and of Y (s,), a pair of arrays of 0-based vertices in farthest-point
       order; None if no samples were requested.
     - `sampled`: the `SampledPair` with the vertices at which descriptors are compared; None if `init` is not
@@ -137,8 +137,9 @@ def prepare(
     - `spectra`: the result of `jaxsmw.pair.paired_spectra` for this pair, if it was already computed.
 
     **Returns:** A `PreparedPair` with the attributes `spectrum_x`, `spectrum_y`, `initial_map` (m,) and
-    `samples`. The initial map contains 0-based vertices of Y. The attribute `samples` is a pair of arrays,
-    with 0-based vertices of X and of Y. If no samples were requested, `samples` is None.
+    `samples`. The spectra are in `Pair.units_of_length`. The initial map contains 0-based vertices of Y. The
+    attribute `samples` is a pair of arrays (s,), with 0-based vertices of X and of Y. If no samples were
+    requested, `samples` is None.
 
     **Raises:** `InputError` if a spectrum cannot be computed, if all requested eigenvalues of a mesh are
     zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required

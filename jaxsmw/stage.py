@@ -189,7 +189,8 @@ class Stage:
 
         **Arguments:**
 
-        - `spectrum_x`, `spectrum_y`: the spectra of X and Y.
+        - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`, in the same scale; see
+          `paired_spectra`.
         - `partial`: whether one of the shapes is a partial shape.
         """
         spectra, seen = (spectrum_x, spectrum_y), []
@@ -218,14 +219,15 @@ class Stage:
         - `spectrum_x`, `spectrum_y`: the spectra of X (m vertices) and Y (n vertices), as returned by `view`.
         - `pointwise_map`: the map from which the stage starts (m,), as 0-based vertices of Y. If the stage
           starts on samples, only the entries of the samples are used.
-        - `samples`: the samples of X and of Y in farthest-point order, as a pair of integer arrays; None if
-          the stage uses no samples. Each array contains at least `number_of_samples` vertices.
+        - `samples`: the samples of X and of Y in farthest-point order, as a pair of arrays of 0-based
+          vertices; None if the stage uses no samples. Each array contains at least `number_of_samples`
+          vertices.
         - `partial`: whether one of the shapes is a partial shape.
         - `history`: whether to record a `History`; see `jaxsmw.refine`.
 
-        **Returns:** A `Refinement`, whose attribute `pointwise_map` (m,) is the refined map. If the stage
-        ends on samples, the map contains -1 for all vertices except the samples. The attribute `result` is
-        `RESULTS.successful`, or another member of `RESULTS` after a failure.
+        **Returns:** A `Refinement`, whose attribute `pointwise_map` (m,) is the refined map, with 0-based
+        vertices of Y. If the stage ends on samples, the map contains -1 for all vertices except the samples.
+        The attribute `result` is `RESULTS.successful`, or another member of `RESULTS` after a failure.
         """
         arrays, options = self._arguments(spectrum_x, spectrum_y, pointwise_map, samples)
         settings = {**options, **self.settings, "partial": partial, "history": history}

@@ -106,9 +106,10 @@ def edge_errors(
 
     **Arguments:**
 
-    - `cycles`: the three edges of each cycle (c, 3), as indices into `prior`.
-    - `errors`: the error of each cycle (c,), from `cycle_error`.
-    - `prior`: the first estimate of each edge's error (e,), for example the expected error.
+    - `cycles`: the three edges of each cycle (c, 3), as 0-based indices into `prior`.
+    - `errors`: the error of each cycle (c,), in units of the square root of the area. The error is the mean
+      distance between samples and their images under the three maps; distances above 0.5 count as 0.5.
+    - `prior`: the first estimate of each edge's error (e,), in the same unit, for example the expected error.
 
     **Returns:** The estimated errors (e,), in the unit of `errors`. An edge without cycles keeps its prior.
     """

@@ -29,7 +29,7 @@ def shape_distances(shapes: Sequence[PreparedShape]) -> Float64[np.ndarray, "N N
 
     **Arguments:**
 
-    - `shapes`: the N shapes. Without descriptors, only eigenvalues are compared.
+    - `shapes`: the N shapes, each a `PreparedShape`. Without descriptors, only eigenvalues are compared.
 
     **Returns:** A symmetric matrix of distances (N, N), without unit and with a zero diagonal.
     """
@@ -72,15 +72,16 @@ def choose_edges(
 
     **Arguments:**
 
-    - `distances`: the distances of the shapes (N, N); see `shape_distances`.
+    - `distances`: the distances of the shapes (N, N), in any unit; see `shape_distances`.
     - `edges_per_shape`: the number of edges divided by N. If the shapes form fewer pairs than this number of
       edges, all pairs are chosen.
-    - `random_share`: the share of random edges.
-    - `given`: edges that are already matched and are kept. If shapes were added to a collection, only edges
-      of the added shapes are new.
-    - `seed`: the seed of the random edges.
+    - `random_share`: the share of random edges, from 0 to 1.
+    - `given`: edges that are already matched and are kept, as tuples (i, j) of 0-based numbers. If shapes
+      were added to a collection, only edges of the added shapes are new.
+    - `seed`: the seed of the random edges, an integer of at least 0.
 
-    **Returns:** The edges (i, j) with i < j, in ascending order.
+    **Returns:** A list of the edges in ascending order. An edge is a tuple (i, j) of the 0-based numbers of
+    two shapes, with i < j.
 
     **Raises:** `InputError` if the distances are not a square matrix of finite numbers that are not negative.
     `InputError` is also raised if the number of edges is not positive, the share is not from 0 to 1, the seed

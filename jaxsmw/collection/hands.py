@@ -35,11 +35,11 @@ def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.nda
     **Arguments:**
 
     - `number`: the number N of shapes. The shapes are numbered from 0 to N - 1, in any fixed order.
-    - `decisions`: the `Decision` of each compared edge (i, j), where i and j are the numbers of two shapes.
-      Decisions without evidence, and decisions on symmetric shapes, are ignored.
+    - `decisions`: the `Decision` of each compared edge (i, j), where i and j are the 0-based numbers of two
+      shapes. Decisions without evidence, and decisions on symmetric shapes, are ignored.
 
-    **Returns:** An array (N,), whose entry i is True if the mirror image of shape i is matched. At most half
-    of the entries are True.
+    **Returns:** A Boolean array (N,), whose entry i is True if the mirror image of shape i is matched. At
+    most half of the entries are True.
     """
     agreement = np.zeros((number, number))
     for (i, j), decision in decisions.items():

@@ -58,7 +58,7 @@ def match_collection(
       a `Mesh`, or a mesh that `make_mesh` accepts.
     - `names`: the new names of the meshes, all different. By default, the meshes keep their names. If two of
       their names are equal, a number is appended to the name of each mesh.
-    - `preset`: see `match`.
+    - `preset`: `"accurate"` (the default), `"fast"`, `"paper"` or a `Preset`; see `match`.
     - `template`: the 0-based position of the template in the argument `meshes`. The default is the shape with
       the smallest sum of errors along the best paths to all other shapes (the medoid).
     - `mirror`: `"auto"` (the default) recognises shapes of opposite hands, such as left and right teeth, and
@@ -66,10 +66,10 @@ def match_collection(
     - `stiffness`: the stiffness of the registered meshes, a positive length in units of the square root of
       each shape's area; see `register_mesh`.
     - `settings`: the `CollectionSettings`.
-    - `seed`: the seed of the random edges of the graph.
+    - `seed`: the seed of the random edges of the graph, an integer of at least 0.
     - `directory`: an existing directory in which finished steps are kept. A second call with the same
-      directory continues an interrupted call. If the second call has additional
-      meshes, only edges of the additional meshes are matched.
+      directory continues an interrupted call. If the second call has additional meshes, only edges of the
+      additional meshes are matched.
     - `executor`: an executor that matches edges, for example `jaxsmw.runtime.workers.open_executor`. By
       default, edges are matched in this process.
     - `devices`: the JAX devices that match edges in this process; see `match_pairs`. The default is all

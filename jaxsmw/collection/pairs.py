@@ -43,9 +43,10 @@ def match_pairs(
 
     **Arguments:**
 
-    - `meshes`: the meshes of the shapes, each a `Mesh` or a mesh that `make_mesh` accepts.
+    - `meshes`: the meshes of the shapes, each a `Mesh` or a mesh that `make_mesh` accepts. The meshes may
+      have different units of length, because each shape is scaled to area 1.
     - `pairs`: a tuple (source X, target Y) for each pair, as 0-based positions in `meshes`.
-    - `preset`: the name of a preset, or a `Preset`; see `match`.
+    - `preset`: `"accurate"` (the default), `"fast"`, `"paper"` or a `Preset`; see `match`.
     - `alternatives`: whether repair tries alternative maps.
     - `batch_size`: the number of pairs that each device refines at the same time; see `refine_pairs`.
     - `devices`: the JAX devices. The default is all devices of the default backend.

@@ -25,21 +25,25 @@ _MANY_OUTLIERS = 1 / 3
 class MatchedEdge:
     """An edge of the graph of a collection: a matched pair of shapes, and the errors of the map between them.
 
-    Errors are distances on a shape, in units of the square root of this shape's area.
+    Each distance is divided by the square root of the area of the shape on which it is measured. Errors and
+    residuals therefore have no unit.
 
     **Attributes:**
 
-    - `source`, `target`: the 0-based numbers of the two shapes in `Collection.meshes`.
+    - `source`, `target`: the 0-based numbers of the two shapes in `Collection.meshes`, as integers.
     - `expected_error`: the mean expected error of the map, computed without the other maps; infinite if the
-      match failed.
-    - `distortion`: the distortion of the map; infinite if the match failed.
+      match failed. The distances are measured on the target.
+    - `distortion`: the distortion of the map (`jaxsmw.repair.scores.distortion`), a number of at least 1
+      without unit. The distortion is 1 for isometries, larger for worse maps, and infinite if the match
+      failed.
     - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The
       penalty of a map grows with the distortion of the map (`CollectionSettings.distortion_weight`). The
       prior is the expected error plus the penalty. The cycle error is the error that the cycles of the graph
       show (`edge_errors`). The estimate is the penalty plus the larger of the cycle error and half of the
       prior. The estimate is infinite if the match failed.
-    - `residual`: the mean distance between the map and the map through the template; infinite if the match
-      failed. The mean is computed in both directions, and the larger value is used.
+    - `residual`: the mean distance between the map and the map through the template, at most 0.5; infinite if
+      the match failed. The mean is computed on the target and, for the reverse map, on the source; the larger
+      value is used.
     - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. `"replaced"` means that the first map
       contradicted the other maps. A second match, started from the consistent map, replaced the first map.
       `"contradicted"` means that the map contradicts the other maps and has little weight, or that the match
@@ -76,19 +80,19 @@ class Collection:
 
     **Attributes:**
 
-    - `meshes`: the meshes of the N shapes.
+    - `meshes`: the meshes of the N shapes, each a `Mesh` in its own unit of length.
     - `template`: the number of the template, which has n vertices.
     - `points`: for each shape, one `SurfacePoints` on its mesh, with an entry per vertex of the template.
     - `mirrored`: a mask (N,), True for the shapes whose mirror images were matched, such as right teeth among
       left teeth. All points and positions refer to the meshes, not to the mirror images.
     - `registered`: for each shape, the `RegisteredMesh` of the template on the shape.
     - `edges`: the matched pairs, each a `MatchedEdge`.
-    - `axes`: the axes of the descriptors; None if the preset uses no descriptors.
-    - `cycle_errors`: two arrays with the errors of all triangles of the graph. The first array was computed
-      from the first maps of the edges, the second from the final maps. Each error is the mean of three
-      values, one for each shape of the triangle. The unit of a value is the square root of the area of the
-      shape. The attribute is None if a `Collection` was made without cycle errors; `match_collection` always
-      computes them.
+    - `axes`: the `DescriptorAxes` of the descriptors; None if the preset uses no descriptors.
+    - `cycle_errors`: a pair of arrays (c,) and (d,) with the errors of all triangles of the graph. The first
+      array was computed from the first maps of the edges, the second from the final maps. Each error is the
+      mean of three values, one for each shape of the triangle. The unit of a value is the square root of the
+      area of the shape. The attribute is None if a `Collection` was made without cycle errors;
+      `match_collection` always computes them.
     - `outliers`: the numbers (positions in `meshes`) of the shapes that differ much from all other shapes.
       All maps of such a shape have large errors or distortions. The shape may be another kind of body.
     - `left_out`: a dictionary of the meshes that could not be matched. The keys are the names of the meshes,
@@ -200,8 +204,8 @@ class Collection:
     def registered_mesh(self, source: int, target: int) -> RegisteredMesh:
         """Register one shape on another, by the map through the template; see `register_mesh`.
 
-        With the registered mesh, `jaxsmw.transfer` transfers landmarks and attributes from `source` to
-        `target`.
+        The positions are in the unit of `target`. With the registered mesh, `jaxsmw.transfer` transfers
+        landmarks and attributes from `source` to `target`.
 
         **Raises:** `InputError` if a number is not the number of a shape.
         """
@@ -224,13 +228,14 @@ class Collection:
     def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
         """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
 
-        Lengths are in the unit of the meshes, or without unit if `scale` is True. The weight of each vertex
-        is its vertex area on the template. If a shape and the template have different values in
-        `mirrored`, the mirror image of the shape enters the model.
+        Lengths are in the unit of the meshes. If `scale` is True, the mean has the average size of the
+        registered meshes. The weight of each vertex is its vertex area on the template. If a shape and the
+        template have different values in `mirrored`, the mirror image of the shape enters the model.
 
         **Arguments:**
 
         - `scale`: whether to remove differences in size. If the meshes have different units, use True.
+          Lengths then have no meaningful unit.
         - `number_of_modes`: the largest number of modes; None for all modes.
 
         **Returns:** A `ShapeModel` with n vertices.

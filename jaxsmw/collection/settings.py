@@ -18,7 +18,7 @@ class CollectionSettings:
     **Attributes:**
 
     - `edges_per_shape` (Table R26): the number of matched pairs divided by the number of shapes.
-    - `random_share` (Table R26): the share of random edges; see `choose_edges`.
+    - `random_share` (Table R26): the share of random edges, from 0 to 1; see `choose_edges`.
     - `cycle_samples`: the number of samples of each shape at which cycles are compared.
     - `contradicted_from` (Table R26): an edge contradicts the collection if the mean distance between its
       maps and the maps through the template is at least this value. The edge is then matched again, from the
@@ -30,7 +30,7 @@ class CollectionSettings:
     - `outlier_from`: a shape is an outlier if the errors of all its edges are at least this value. In
       collections of one kind of body, every shape had an edge with an error of at most 0.04.
     - `rounds`: the largest number of times that contradicted edges are matched again.
-    - `synchronization`: the settings of `synchronize`.
+    - `synchronization`: the settings of `synchronize`, a `SynchronizationSettings`.
 
     **Raises:** `InputError` if a setting is not valid.
     """

@@ -43,9 +43,9 @@ class Alignment:
     **Attributes:**
 
     - `aligned`: the aligned shapes (N, n, 3), in the unit of length of the shapes.
-    - `mean`: the mean of the aligned shapes (n, 3).
+    - `mean`: the mean of the aligned shapes (n, 3), in the same unit.
     - `rotations`: a rotation without reflection for each shape (N, 3, 3).
-    - `translations`: a translation for each shape (N, 3).
+    - `translations`: a translation for each shape (N, 3), in the same unit.
     - `scales`: a positive factor for each shape (N,). The factors are 1 if shapes keep their size.
     - `weights`: the weights of the vertices (n,), with the sum 1.
     - `scaled`: whether the alignment changed the sizes of shapes.
@@ -80,15 +80,16 @@ def align(
 
     **Arguments:**
 
-    - `shapes`: the positions of n corresponding vertices on N shapes (N, n, 3).
+    - `shapes`: the positions of n corresponding vertices on N shapes, as an array (N, n, 3) or a sequence of
+      arrays (n, 3). Without `scale`, all shapes need the same unit of length.
     - `scale`: whether to remove differences of size. If True, each shape is scaled to fit the mean in the
       least-squares sense. All shapes are then scaled by one common factor, so that the mean has the average
       size of the given shapes.
     - `weights`: non-negative weights of the vertices (n,). If the weights are the vertex areas of one shape,
       dense regions of the triangulation do not dominate. With None (the default), all weights are equal.
-    - `reference`: the index of the shape whose rotation and centroid do not change.
+    - `reference`: the 0-based index of the shape whose rotation and centroid do not change.
 
-    **Returns:** An `Alignment`.
+    **Returns:** An `Alignment`, in the unit of length of the shapes.
 
     **Raises:** `InputError` if there is no shape, if shapes have different numbers of vertices, if a
     coordinate is not finite, or if a shape is a single point. `InputError` is also raised if the weights or
@@ -122,9 +123,10 @@ class DistanceCurve(NamedTuple):
 
     **Attributes:**
 
-    - `numbers_of_modes`: the numbers of modes, in the given order.
-    - `mean`: the mean of the distances for each number of modes, in the unit of length of the shapes.
-    - `standard_error`: the standard error of each mean, in the same unit.
+    - `numbers_of_modes`: a tuple of the numbers of modes, in the given order.
+    - `mean`: an array with the mean of the distances for each number of modes, in the unit of length of the
+      shapes.
+    - `standard_error`: an array with the standard error of each mean, in the same unit.
     """
 
     numbers_of_modes: tuple[int, ...]
@@ -144,12 +146,14 @@ class ShapeModel:
     **Attributes:**
 
     - `alignment`: the `Alignment` of the N shapes.
-    - `modes`: the displacements of each mode (k, n, 3). The modes are orthonormal in the inner product above.
-      For each mode, the score with the largest absolute value is positive.
+    - `modes`: the displacements of each mode (k, n, 3), without unit. The modes are orthonormal in the inner
+      product above. For each mode, the score with the largest absolute value is positive.
     - `variances`: the variance of the scores of each mode (k,), decreasing, in squared units of length. Sums
       of squares are divided by N - 1.
-    - `scores`: the inner products (N, k) of the displacements of each shape with the modes.
-    - `total_variance`: the sum of the variances of all modes, including modes that the model leaves out.
+    - `scores`: the inner products (N, k) of the displacements of each shape with the modes, in units of
+      length.
+    - `total_variance`: the sum of the variances of all modes, including modes that the model leaves out, in
+      squared units of length.
     """
 
     alignment: Alignment
@@ -182,7 +186,10 @@ class ShapeModel:
 
         **Arguments:**
 
-        - `scores`: the scores of the first j modes (j,), where j is at most k. All other scores are 0.
+        - `scores`: the scores of the first j modes (j,), in units of length, where j is at most k. All other
+          scores are 0.
+
+        **Returns:** The positions of the vertices (n, 3), in the same unit.
 
         **Raises:** `InputError` if there are more scores than modes, or a score is not finite.
         """
@@ -202,8 +209,8 @@ class ShapeModel:
         - `shape`: positions of the n vertices (n, 3), in any coordinate system of the same unit of length. If
           the model removes differences of size, the unit does not matter.
 
-        **Returns:** The scores (k,). For a shape of the collection, the result equals the row of this shape
-        in the attribute `scores`.
+        **Returns:** The scores (k,), in units of length. For a shape of the collection, the result equals the
+        row of this shape in the attribute `scores`.
 
         **Raises:** `InputError` if the shape has another number of vertices, a coordinate is not finite, or
         the shape is a single point.
@@ -257,7 +264,8 @@ class ShapeModel:
 
         - `numbers_of_modes`: numbers of modes, from 0 (the mean alone) to N - 2.
 
-        **Returns:** The mean error of the N shapes for each number of modes, and its standard error.
+        **Returns:** A `DistanceCurve`: the mean error of the N shapes for each number of modes, and its
+        standard error, in units of length.
 
         **Raises:** `InputError` if there are fewer than two shapes, or if an entry of `numbers_of_modes` is
         not a whole number from 0 to N - 2.
@@ -295,7 +303,8 @@ class ShapeModel:
         - `samples`: the number of random shapes, at least 2.
         - `seed`: the random seed. The random numbers of a mode do not depend on `numbers_of_modes`.
 
-        **Returns:** The mean distance for each number of modes, and its standard error.
+        **Returns:** A `DistanceCurve`: the mean distance for each number of modes, and its standard error, in
+        units of length.
 
         **Raises:** `InputError` if `samples` is below 2, if `seed` is negative, or if an entry of
         `numbers_of_modes` is not a whole number from 0 to k.
@@ -345,13 +354,17 @@ def shape_model(
 
     **Arguments:**
 
-    - `shapes`: the positions of n corresponding vertices on N shapes (N, n, 3).
-    - `scale`, `weights`, `reference`: see `align`.
+    - `shapes`: the positions of n corresponding vertices on N shapes, as an array (N, n, 3) or a sequence of
+      arrays (n, 3). Without `scale`, all shapes need the same unit of length.
+    - `scale`: whether to remove differences of size, False by default; see `align`.
+    - `weights`: non-negative weights of the vertices (n,), such as vertex areas in any unit. With None (the
+      default), all weights are equal.
+    - `reference`: the 0-based index of the shape whose rotation and centroid do not change.
     - `number_of_modes`: the largest number of modes; None (the default) for all modes. A model of N shapes
       has at most N - 1 modes. Modes whose standard deviation is below 1e-6 of the size of the mean are
       left out as rounding errors. One shape and identical shapes therefore have no modes.
 
-    **Returns:** A `ShapeModel`.
+    **Returns:** A `ShapeModel`, in the unit of length of the shapes.
 
     **Raises:** `InputError` if `align` raises it, or if the number of modes is below 1.
     """

@@ -43,11 +43,11 @@ class PreparedShape:
 
     **Attributes:**
 
-    - `mesh`: the mesh (n vertices).
-    - `spectrum`: the spectrum in units in which the area is 1, with descriptors if the preset uses them.
+    - `mesh`: the `Mesh` (n vertices).
+    - `spectrum`: the `Spectrum` in units in which the area is 1, with descriptors if the preset uses them.
     - `compared`: the `SurfaceSamples` at which descriptors are compared; None for all vertices.
-    - `samples`: the samples (s,) on which stages iterate, in farthest-point order; None if no stage uses
-      samples.
+    - `samples`: the samples (s,) on which stages iterate, as 0-based vertices in farthest-point order; None
+      if no stage uses samples.
     """
 
     mesh: Mesh
@@ -219,10 +219,12 @@ def prepare_shapes(
 
     **Arguments:**
 
-    - `meshes`: the meshes, each a `Mesh`.
-    - `preset`: the preset.
+    - `meshes`: the meshes, each a `Mesh` in any unit of length.
+    - `preset`: the `Preset`, such as `jaxsmw.PRESETS["accurate"]`. Its stages determine the numbers of
+      eigenvectors, descriptors and samples.
 
-    **Returns:** The prepared shapes, and the axes of the descriptors. Without descriptors, the axes are None.
+    **Returns:** A list with one `PreparedShape` per mesh, and the `DescriptorAxes`. Without descriptors, the
+    axes are None.
 
     **Raises:** `InputError` if a mesh cannot be used.
     """

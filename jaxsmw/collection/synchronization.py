@@ -28,8 +28,8 @@ class SynchronizationSettings:
     **Attributes:**
 
     - `iterations` (Table R26): the number of iterations. Each iteration averages the points on every shape.
-    - `robust_scale` (Table R26): a distance from the mean. A point at this distance has half of the weight
-      of a point at the mean. Points of wrong maps are much farther away.
+    - `robust_scale` (Table R26): a distance from the mean. A point at this distance has half of the weight of
+      a point at the mean. Points of wrong maps are much farther away.
     - `discontinuity_distance`: if the matches of a triangle's corners are farther apart than this distance, a
       point inside the triangle follows the match of the nearest corner instead of an average.
 
@@ -109,22 +109,24 @@ def robust_mean(
 class Network:
     """The shapes of a collection and the maps along the edges of its graph.
 
-    The constructor only stores the data. The function `synchronize` computes consistent maps from a network.
-    The number of a shape is its 0-based position in `meshes`.
+    The constructor checks nothing. The function `synchronize` computes consistent maps from a network. The
+    number of a shape is its 0-based position in `meshes`.
 
     **Arguments:**
 
-    - `meshes`: the meshes of the N shapes.
-    - `maps`: for each edge, the maps in both directions. The value of the key (i, j) is one `SurfacePoints`
-      on mesh j, with one entry for every vertex of mesh i.
-    - `errors`: the estimated error of each edge, with the key (i, j) for i < j. An error is a distance on a
-      shape, in units of the square root of this shape's area.
-    - `settings`: the settings of the synchronisation.
+    - `meshes`: the meshes of the N shapes, each a `Mesh` in any unit of length.
+    - `maps`: a dictionary with the maps of each edge in both directions. The value of the key (i, j) is one
+      `SurfacePoints` on mesh j, with one entry for every vertex of mesh i.
+    - `errors`: a dictionary with the estimated error of each edge, a float, with the key (i, j) for i < j.
+      The error applies to the maps i -> j and j -> i. The error is a mean distance on the shape to which a
+      map leads. Its unit is the square root of this shape's area.
+    - `settings`: the settings of the synchronisation, a `SynchronizationSettings`.
 
     **Attributes:**
 
-    - `meshes`, `errors`, `settings`: the arguments.
-    - `units`: a list with the square root of the area of each mesh.
+    - `meshes`, `errors`, `settings`: the arguments. The argument `maps` is not kept; the network stores the
+      positions of its points instead.
+    - `units`: a list with the square root of the area of each mesh, in the unit of the mesh.
     """
 
     def __init__(
@@ -145,7 +147,10 @@ class Network:
         return self.errors[min(i, j), max(i, j)]
 
     def lengths(self) -> csr_array:
-        """Return the errors of all edges as a symmetric sparse matrix (N, N)."""
+        """Return the errors of all edges as a symmetric sparse matrix (N, N).
+
+        Each entry is in units of the square root of the area.
+        """
         rows, columns = zip(*self._images, strict=True) if self._images else ((), ())
         # In the sparse matrix, an entry of zero would mean a missing edge.
         values = [max(self.error(i, j), 1e-6) for i, j in self._images]
@@ -176,7 +181,10 @@ class Network:
         return [known for known in points if known is not None]
 
     def carried(self, points: SurfacePoints, source: int, target: int) -> Float64[np.ndarray, "p 3"]:
-        """Carry points on shape `source` along an edge. Return positions near to shape `target` (p, 3)."""
+        """Carry points on shape `source` along an edge. Return positions near to shape `target` (p, 3).
+
+        The positions are in the unit of mesh `target`.
+        """
         limit = self.settings.discontinuity_distance * self.units[target]
         return carry(points, self.meshes[source], self._images[source, target], limit)
 
@@ -234,7 +242,8 @@ def synchronize(network: Network, template: int) -> list[SurfacePoints]:
     - `network`: the `Network` of shapes and maps.
     - `template`: the 0-based number of the template in `network.meshes`.
 
-    **Returns:** For each shape, one `SurfacePoints` with n entries, one for each vertex of the template.
+    **Returns:** A list with one `SurfacePoints` on each shape, with n entries, one for each vertex of the
+    template.
 
     **Raises:** `ValueError` if a shape has no path to the template.
     """

@@ -94,6 +94,8 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
       evenly. The spectrum of samples (`Spectrum.sample`) needs `"least_squares"`, because its eigenvectors
       are not orthonormal.
 
+    **Returns:** The array (n, k), in units of length, where the eigenvectors are in units of 1 / length.
+
     **Raises:** `ValueError` for an unknown pseudo-inverse.
     """
     check_option("pseudo_inverse", pseudo_inverse, get_args(PseudoInverse))
@@ -118,9 +120,12 @@ def encode(
 
     **Arguments:**
 
-    - `pointwise_map`: the map T, given as one vertex of Y per vertex of X (m,) or as a soft map from X to Y.
+    - `pointwise_map`: the map T, as an integer array (m,) with one 0-based vertex of Y per vertex of X. T can
+      also be a `SoftMap` or a `SparseSoftMap` from X to Y.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
-      vertices, k_Y eigenvectors).
+      vertices, k_Y eigenvectors). Both need the same scale, because a change of one shape's scale multiplies
+      C_0 by a constant. Two full shapes need equal areas, such as the area 1 from `compute_spectrum`. The
+      shapes of a partial pair need the same unit of length.
     - `convention`: the direction of C_0. `"pullback"` (the default) gives `Phi_X^+ P Phi_Y` (k_X, k_Y), which
       maps functions on Y to functions on X. `"pushforward"` gives `Phi_Y^+ P^T Phi_X` (k_Y, k_X), which maps
       functions on X to functions on Y.
@@ -128,8 +133,8 @@ def encode(
       the vertex areas. `"least_squares"` uses `Phi^+ = (Phi^T Phi)^-1 Phi^T`, in which all vertices have the
       same weight.
 
-    **Returns:** C_0. Its shape is (k_X, k_Y) in the pullback convention and (k_Y, k_X) in the pushforward
-    convention.
+    **Returns:** C_0, a float array without unit. Its shape is (k_X, k_Y) in the pullback convention and
+    (k_Y, k_X) in the pushforward convention.
 
     **Raises:** `ValueError` for an unknown convention or pseudo-inverse.
     """
@@ -163,6 +168,8 @@ def multiscale_kernel(
     Lambda_out contains the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains
     the eigenvalues of the shape that C maps from.
 
+    The responses and the kernel are numbers without unit.
+
     **Arguments:**
 
     - `responses_out`: (filters, k_out), the responses g_l of the bank at the eigenvalues of the shape that C
@@ -177,16 +184,17 @@ class QuadraticEnergy(eqx.Module):
 
     Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares
     `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the
-    energy of C (k_out, k_in) as an array of shape (). `energy.minimizer()` returns the C of least energy,
-    (k_out, k_in). If `gram` is singular, the returned matrix is NaN or meaningless, and `energy.is_regular()`
-    is False. `energy + other` adds two energies, and `weight * energy` multiplies an energy by an array of
-    shape ().
+    energy of C (k_out, k_in) as an array of shape (), in the unit of `constant`. `energy.minimizer()` returns
+    the C of least energy, (k_out, k_in). If `gram` is singular, the returned matrix is NaN or meaningless,
+    and `energy.is_regular()` is False. `energy + other` adds two energies, and `weight * energy` multiplies
+    an energy by an array of shape ().
 
     **Attributes:**
 
     - `gram`: (k_in, k_in), `sum_i a_i a_i^T`, positive semi-definite.
     - `cross`: (k_out, k_in), `sum_i b_i a_i^T`.
-    - `constant`: (), `sum_i ||b_i||²`, which is the energy of C = 0.
+    - `constant`: (), `sum_i ||b_i||²`, which is the energy of C = 0. The unit depends on the vectors; the
+      energies of `WaveletProblem.energy` in the area norm have no unit.
     """
 
     gram: Float[Array, "k_in k_in"]
@@ -256,9 +264,10 @@ class WaveletProblem(eqx.Module):
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X and of target Y.
-    - `responses_x`, `responses_y`: the responses of the filter bank at the eigenvalues of X, (filters, k_x),
-      and of Y, (filters, k_y).
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices). Both
+      have the same scale; see `encode`.
+    - `responses_x`, `responses_y`: the responses of the filter bank, without unit, at the eigenvalues of X,
+      (filters, k_x), and of Y, (filters, k_y).
     - `convention`: `"pullback"` (the default) if C maps functions on Y to functions on X; `"pushforward"` if
       C maps functions on X to functions on Y.
     - `sampled`: whether the spectra contain only samples of the vertices, by default False. On samples, the
@@ -293,8 +302,8 @@ class WaveletProblem(eqx.Module):
 
         **Arguments:**
 
-        - `pointwise_map`: the map T, given as one vertex of Y per vertex of X (m,) or as a soft map from X to
-          Y.
+        - `pointwise_map`: the map T, as an integer array (m,) with one 0-based vertex of Y per vertex of X. T
+          can also be a `SoftMap` or a `SparseSoftMap` from X to Y.
         - `dual_out`: the `dual_eigenvectors` (n_out, k_out) of the shape that C maps to.
         """
         _, spectrum_in = self.spectra
@@ -315,13 +324,13 @@ class WaveletProblem(eqx.Module):
 
         **Arguments:**
 
-        - `pointwise_map`: the map T, given as one vertex of Y per vertex of X (m,) or as a soft map from X to
-          Y.
+        - `pointwise_map`: the map T, as an integer array (m,) with one 0-based vertex of Y per vertex of X. T
+          can also be a `SoftMap` or a `SparseSoftMap` from X to Y.
         - `norm`: `"area"` (the default) weights each vertex of X by its area. `"frobenius"` gives all
           vertices the same weight, as in equation (5) of the MWP paper.
 
         **Returns:** A `QuadraticEnergy` with the attributes `gram` (k_in, k_in), `cross` (k_out, k_in) and
-        `constant` ().
+        `constant` (). In the area norm, the energy has no unit.
         """
         weights, inputs, outputs = self._weights_inputs_outputs(pointwise_map, norm)
         responses_out, responses_in = self.responses

@@ -34,16 +34,16 @@ def spectral_embeddings(
 
     **Arguments:**
 
-    - `functional_map`: C, of shape (k_X, k_Y) in the pullback convention and of shape (k_Y, k_X) in the
-      pushforward convention.
+    - `functional_map`: C, without unit, of shape (k_X, k_Y) in the pullback convention and of shape
+      (k_Y, k_X) in the pushforward convention.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
-      vertices, k_Y eigenvectors).
+      vertices, k_Y eigenvectors), in the same scale; see `decode`.
     - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
       X. With `"pushforward"`, C maps functions on X to functions on Y.
 
     **Returns:** Two point sets: the queries (m, d) with one point per vertex of X, and the database (n, d)
     with one point per vertex of Y. The dimension d is the number of rows of C. The coordinates have the unit
-    of the eigenvectors.
+    of the eigenvectors, which is 1 / length.
 
     **Raises:** `ValueError` for an unknown convention.
     """
@@ -69,10 +69,12 @@ def decode(
 
     **Arguments:**
 
-    - `functional_map`: C, of shape (k_X, k_Y) in the pullback convention and of shape (k_Y, k_X) in the
-      pushforward convention.
+    - `functional_map`: C, without unit, of shape (k_X, k_Y) in the pullback convention and of shape
+      (k_Y, k_X) in the pushforward convention.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
-      vertices, k_Y eigenvectors).
+      vertices, k_Y eigenvectors). Both need the same scale, as in the computation of C. Two full shapes need
+      equal areas, such as the area 1 from `compute_spectrum`. The shapes of a partial pair need the same unit
+      of length.
     - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
       X. With `"pushforward"`, C maps functions on X to functions on Y.
     - `patches`: the result of `search_patches(spectrum_x, spectrum_y)`, which makes the search faster on
@@ -111,10 +113,10 @@ def decode_to_triangles(
 
     **Arguments:**
 
-    - `functional_map`: C, of shape (k_X, k_Y) in the pullback convention and of shape (k_Y, k_X) in the
-      pushforward convention.
+    - `functional_map`: C, without unit, of shape (k_X, k_Y) in the pullback convention and of shape
+      (k_Y, k_X) in the pushforward convention.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
-      vertices, k_Y eigenvectors).
+      vertices, k_Y eigenvectors), in the same scale; see `decode`.
     - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
       X. With `"pushforward"`, C maps functions on X to functions on Y.
     - `faces_y`: (f, 3), the triangles of Y, as vertex indices from 0 to n - 1.
@@ -141,9 +143,12 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X and of target Y.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X and of target Y, in any unit of length.
 
-    **Returns:** A pair of `Patches`: the patches of X (the queries) and the patches of Y (the database).
+    **Returns:** A pair of `Patches`: the patches of X (the queries) and the patches of Y (the database). Each
+    `Patches` contains three arrays for p patches of s vertices. `rows` (p, s) contains 0-based vertices, and
+    `mask` (p, s) is False for padding. `variations` (p, r, s) contains the coefficients of the main
+    directions of each patch, which speed up the search.
     """
     n = spectrum_y.mask.shape[0]
     size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** 0.5)

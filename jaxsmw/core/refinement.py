@@ -34,10 +34,11 @@ class History(eqx.Module):
       then NaN unless `starts_on_samples` is True, and the last entry is NaN unless `ends_on_samples` is True.
     - `energy`: (iterations,), the result of `Refiner.energy` in each iteration, computed from the state and
       from the pointwise map that produced this state. For `WaveletPreservation`, this is the energy of
-      equation (5) of the MWP paper.
+      equation (5) of the MWP paper, which has no unit.
     - `objective`: (iterations,), the result of `Refiner.objective` in each iteration, computed from the state
       and from the pointwise map that was recovered from this state. The objective is the mean squared
-      distance between matched points of the embeddings; lower is better.
+      distance between matched points of the embeddings, in the squared unit of the embeddings; lower is
+      better.
     - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. Each row
       contains a 0-based vertex of Y for each of the m vertices of X. The rows of skipped iterations repeat
       the final map. After a failure, all entries of `pointwise_maps` are -1. `pointwise_maps` is None if the
@@ -57,10 +58,10 @@ class Refinement(eqx.Module):
 
     - `pointwise_map`: the refined map T: X -> Y (m,), one 0-based vertex of Y per vertex of X; all entries
       are -1 after a failure.
-    - `functional_map`: the functional map C (k_out, k_in) from which the pointwise map was recovered. This
-      property returns `state.functional_map`. By default, C is a pullback (k_X, k_Y), which takes functions
-      on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y, k_X) takes functions
-      on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
+    - `functional_map`: the functional map C (k_out, k_in), without unit, from which the pointwise map was
+      recovered. This property returns `state.functional_map`. By default, C is a pullback (k_X, k_Y), which
+      takes functions on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y, k_X)
+      takes functions on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
     - `state`: the final `State` of the refiner, which contains the functional map.
     - `result`: the status code, a member of `RESULTS`. Compare `result` with `RESULTS.successful`.
       `RESULTS[result]` is a sentence that explains the status.
@@ -127,13 +128,15 @@ def refine(
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices). Unless
+      `partial` is True, each shape should have area 1, as from `compute_spectrum`. Not all refiners scale the
+      shapes.
     - `pointwise_map`: the initial map T, an integer array (m,). Entry i is the match of vertex i of X, as the
       index of a vertex of Y, from 0 to n - 1.
     - `refiner`: the method, a `Refiner`. The default is `WaveletPreservation()`, the method of the MWP paper.
     - `iterations`: the number of iterations, an integer of at least 1. Each iteration computes a functional
       map and then a pointwise map.
-    - `samples`: a tuple of two integer arrays: the vertices of X (s_x,) and of Y (s_y,) on which the
+    - `samples`: a tuple of two integer arrays: the 0-based vertices of X (s_x,) and of Y (s_y,) on which the
       refinement iterates. The samples should be evenly spread and outnumber the eigenvectors. With None, all
       iterations use all vertices.
     - `starts_on_samples`: whether the first functional map is computed from the samples only. If True, the
@@ -146,9 +149,9 @@ def refine(
       every pair takes as long as the slowest pair, but the results are the same as without `jax.vmap`.
     - `history`: whether to record a `History`. Recording increases the run time by about 10 %.
 
-    **Returns:** A `Refinement`, whose attributes include `pointwise_map` (m,), `functional_map` (k_out, k_in)
-    and `result`. Numerical failures raise no error, so compare `result` with `RESULTS.successful`. After a
-    failure, all entries of `pointwise_map` are -1.
+    **Returns:** A `Refinement`, whose attributes include `pointwise_map` (m,) with 0-based vertices of Y,
+    `functional_map` (k_out, k_in) without unit, and `result`. Numerical failures raise no error, so compare
+    `result` with `RESULTS.successful`. After a failure, all entries of `pointwise_map` are -1.
 
     **Raises:** `ValueError` if `iterations` is below 1, the initial map does not have shape (m,), `samples`
     is not a pair, or the two spectra have different float types. `ValueError` is also raised if

@@ -23,9 +23,10 @@ class Problem(eqx.Module):
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra of source X (m vertices) and target Y (n vertices).
-    - `samples`: the sampled vertices of X (s_x,) and of Y (s_y,), as a pair of integer arrays; None if the
-      refiner iterates on all vertices.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices). Unless
+      `partial` is True, each shape should have area 1.
+    - `samples`: the sampled 0-based vertices of X (s_x,) and of Y (s_y,), as a pair of integer arrays; None
+      if the refiner iterates on all vertices.
     - `partial`: whether one shape is a part of the other. If True, both shapes must have the same unit of
       length.
     """
@@ -52,8 +53,8 @@ class Prepared(eqx.Module):
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the two spectra that `Problem.query_spectra` returns. Pointwise maps have
-      one entry per vertex of `spectrum_x`.
+    - `spectrum_x`, `spectrum_y`: the two spectra that `Problem.query_spectra` returns, each a `Spectrum`.
+      Pointwise maps have one entry per vertex of `spectrum_x`.
     """
 
     spectrum_x: Spectrum
@@ -67,7 +68,8 @@ class State(eqx.Module):
 
     **Attributes:**
 
-    - `functional_map`: C (k_out, k_in), in the convention that `Refiner.convention` returns.
+    - `functional_map`: C (k_out, k_in), without unit, in the convention that `Refiner.convention` returns. A
+      pullback takes functions on Y ("in") to functions on X ("out").
     """
 
     functional_map: Float[Array, "k_out k_in"]
@@ -105,10 +107,12 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     - `update(prepared, pointwise_map, previous)`: takes a pointwise map X -> Y (m,) and the previous `State`
       (None in the first iteration). It returns the next `State` and a status code, which is a member of
       `RESULTS`.
-    - `recover(prepared, state)`: returns the pointwise map X -> Y, an int32 array (m,).
-    - `recover_reverse(prepared, state)`: returns the reverse map Y -> X, an int32 array (n,).
+    - `recover(prepared, state)`: returns the pointwise map X -> Y, an int32 array (m,) of 0-based vertices of
+      Y.
+    - `recover_reverse(prepared, state)`: returns the reverse map Y -> X, an int32 array (n,) of 0-based
+      vertices of X.
     - `energy(prepared, state, pointwise_map)`: returns the quantity that the method minimises, as a scalar
-      array. `jaxsmw.refine` stores this quantity in `History.energy`.
+      array in any unit. `jaxsmw.refine` stores this quantity in `History.energy`.
 
     **Methods that a subclass can override:** `embeddings`, `objective` and `is_settled`, and the properties
     `levels`, `convention` and `matches_samples_with_all`.
@@ -132,7 +136,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         **Arguments:**
 
         - `prepared`: the result of `prepare`.
-        - `pointwise_map`: T: X -> Y, one vertex of Y per vertex of `prepared.spectrum_x`.
+        - `pointwise_map`: T: X -> Y (m,), one 0-based vertex of Y per vertex of `prepared.spectrum_x`.
         - `previous`: the state from which the pointwise map was recovered; None in the first iteration.
         """
 
@@ -140,8 +144,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def recover(self, prepared: PreparedT, state: StateT) -> Int32[Array, " m"]:
         """Recover the pointwise map X -> Y (m,) from a state.
 
-        The map contains one vertex of Y per vertex of `prepared.spectrum_x`. The map must be
-        a valid argument `pointwise_map` of `update`.
+        The map contains one 0-based vertex of Y per vertex of `prepared.spectrum_x`. The map must be a valid
+        argument `pointwise_map` of `update`.
         """
 
     @abc.abstractmethod
@@ -171,7 +175,7 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
         - `prepared`: the result of `prepare`.
         - `state`: the state that `update` computed from the pointwise map.
-        - `pointwise_map`: T: X -> Y, one vertex of Y per vertex of `prepared.spectrum_x`.
+        - `pointwise_map`: T: X -> Y (m,), one 0-based vertex of Y per vertex of `prepared.spectrum_x`.
         """
 
     def embeddings(
@@ -197,13 +201,14 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     ) -> Float[Array, ""]:
         """Return the area-weighted mean squared distance between matched points of the `embeddings`.
 
-        The result is a scalar array, which `jaxsmw.refine` stores in `History.objective`.
+        The result is a scalar array in the squared unit of the embeddings. `jaxsmw.refine` stores it in
+        `History.objective`.
 
         **Arguments:**
 
         - `prepared`: the result of `prepare`.
         - `state`: the state that defines the `embeddings`.
-        - `pointwise_map`: T: X -> Y, the map that `recover` returns for this state.
+        - `pointwise_map`: T: X -> Y (m,), the map that `recover` returns for this state.
         """
         queries, database = self.embeddings(prepared, state)
         areas = prepared.spectrum_x.vertex_areas

@@ -152,10 +152,11 @@ class Patches(eqx.Module):
 
     **Attributes:**
 
-    - `rows`: (p, s), the indices of each patch's points in ascending order, with padding at the end.
+    - `rows`: (p, s), int32, the 0-based indices of the s points of each of p patches. The indices are in
+      ascending order, with padding at the end.
     - `mask`: (p, s), False for padding and for masked points, True for all other points.
-    - `variations`: (p, r, s), the coefficients of r linear combinations of the s points of each patch. These
-      combinations are the r directions along which the points of the patch differ most.
+    - `variations`: (p, r, s), the coefficients of r linear combinations of the s points of each patch,
+      without unit. These combinations are the r directions along which the points of the patch differ most.
     """
 
     rows: Int32[Array, "p s"]

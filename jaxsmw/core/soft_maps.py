@@ -35,22 +35,23 @@ class SoftMap(eqx.Module):
     sums to the area a_i. If `sinkhorn` computed the map, column j of P sums to the area b_j up to the
     `residual`.
 
-    `refine_softly`, `sinkhorn`, `Softmax` and `Sinkhorn` return soft maps. For maps between shapes, the
-    queries are the vertices of X, and the database rows are the vertices of Y.
+    `sinkhorn`, `Softmax` and `Sinkhorn` return soft maps, and the attribute `SoftRefinement.soft_map`
+    contains one. For maps between shapes, the queries are the vertices of X, and the database rows are the
+    vertices of Y.
 
     **Attributes:**
 
-    - `queries`, `database`: the points q (m, d) and y (n, d). The points are shifted so that the
-      area-weighted mean of the database is the origin.
-    - `query_areas`, `database_areas`: the areas a (m,) and b (n,), each with sum 1. Ignored points have area
-      zero. The shares of a query of area zero are still computed from its position.
+    - `queries`, `database`: the points q (m, d) and y (n, d), in the same unit. The points are shifted so
+      that the area-weighted mean of the database is the origin.
+    - `query_areas`, `database_areas`: the areas a (m,) and b (n,), without unit, each with sum 1. Ignored
+      points have area zero. The shares of a query of area zero are still computed from its position.
     - `potentials`: g (n,), dimensionless. A database row with a higher potential receives larger shares from
       all queries. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
       computed.
     - `temperature`: the temperature, a scalar array in squared units of the points.
-    - `residual`: the misplaced area divided by the total area, from 0 to 1. Misplaced area is the area that
-      database rows receive in excess of their own areas. The residual is NaN if `Softmax` computed the map,
-      because `Softmax` computes no residual.
+    - `residual`: the misplaced area divided by the total area, a number from 0 to 1 without unit. Misplaced
+      area is the area that database rows receive in excess of their own areas. The residual is NaN if
+      `Softmax` computed the map, because `Softmax` computes no residual.
     - `converged`: whether the residual is at most the argument `tolerance` of `sinkhorn`; False if the
       residual is NaN.
     - `iterations`: the number of iterations that `sinkhorn` ran; 0 if `Softmax` computed the map.
@@ -117,8 +118,9 @@ class SparseSoftMap(eqx.Module):
 
     **Attributes:**
 
-    - `rows`: (m, t), the indices of the t database rows of each query, nearest first.
-    - `shares`: (m, t), the share of each database row in `rows`. The shares of each query sum to 1.
+    - `rows`: (m, t), the 0-based indices of the t database rows of each query, int32, nearest first.
+    - `shares`: (m, t), the share of each database row in `rows`, a number from 0 to 1. The shares of each
+      query sum to 1.
     """
 
     rows: Int32[Array, "m t"]
@@ -166,8 +168,8 @@ def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) 
 
     **Arguments:**
 
-    - `pointwise_map`: an integer array (m,) with one vertex of Y per vertex of X, or a `SoftMap`, or a
-      `SparseSoftMap`.
+    - `pointwise_map`: an integer array (m,) with one 0-based vertex of Y per vertex of X, or a `SoftMap`, or
+      a `SparseSoftMap`.
     - `functions_on_y`: the values of p functions at the vertices of Y (n, p), in any unit.
 
     **Returns:** The values of the p functions at the vertices of X (m, p), in the same unit.
@@ -230,8 +232,7 @@ class Softmax(Recovery):
 
     - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
       0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
-      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
-      maps.
+      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper maps.
 
     **Raises:** `ValueError` if the temperature is not a single positive, finite number.
     """
@@ -274,8 +275,7 @@ class NearestFew(Recovery):
       have positive area, the remaining shares are zero.
     - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
       0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
-      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
-      maps.
+      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper maps.
 
     **Raises:** `TypeError` if `number` is not an integer; `ValueError` if `number` is below 1, or if the
     temperature is not a single positive, finite number.
@@ -330,10 +330,11 @@ class Sinkhorn(Recovery):
 
     - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
       0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
-      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper
-      maps and need more iterations.
+      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper maps and need more
+      iterations.
     - `iterations`: the maximum number of iterations of `sinkhorn`, an integer of at least 1.
-    - `tolerance`: a positive number. The iterations stop when `SoftMap.residual` is at most the tolerance.
+    - `tolerance`: a positive number, a share of the total area and therefore without unit. The iterations
+      stop when `SoftMap.residual`, the share of misplaced area, is at most the tolerance.
 
     **Raises:** `TypeError` if `iterations` is not an integer; `ValueError` if the temperature is not a single
     positive, finite number, `iterations` is below 1, or `tolerance` is not positive.
@@ -395,7 +396,8 @@ def sinkhorn(
 
     **Arguments:**
 
-    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
+    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit,
+      which is otherwise arbitrary.
     - `query_areas`, `database_areas`: the areas of the points, (m,) and (n,), in any unit. The areas of each
       point set are divided by their sum. Points of zero area send no area, receive no area, and do not affect
       other points.
@@ -408,10 +410,11 @@ def sinkhorn(
       temperature is not positive, the result is NaN.
     - `iterations`: the maximum number of iterations, an integer of at least 1. Iterations after convergence
       are skipped. Under `jax.vmap`, iterations after convergence run but change nothing.
-    - `tolerance`: a positive number. The iterations stop when `SoftMap.residual` is at most the tolerance.
+    - `tolerance`: a positive number, a share of the total area and therefore without unit. The iterations
+      stop when `SoftMap.residual`, the share of misplaced area, is at most the tolerance.
 
-    **Returns:** A `SoftMap` from the queries to the database. If the iterations do not converge, or if the
-    result is not finite, no error is raised, but the attribute `converged` of the map is False.
+    **Returns:** A `SoftMap` from the m queries to the n database rows. If the iterations do not converge, or
+    if the result is not finite, no error is raised, but the attribute `converged` of the map is False.
 
     **Raises:** `ValueError` if `iterations` is below 1.
     """

@@ -30,9 +30,10 @@ class SoftRefinement(eqx.Module):
 
     **Attributes:**
 
-    - `functional_map`: the final functional map C (k_out, k_in). By default, C is a pullback (k_X, k_Y),
-      which takes functions on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y,
-      k_X) takes functions on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
+    - `functional_map`: the final functional map C (k_out, k_in), without unit. By default, C is a pullback
+      (k_X, k_Y), which takes functions on Y to functions on X. If the refiner's `convention` is
+      `"pushforward"`, C (k_Y, k_X) takes functions on X to functions on Y. After a failure, C contains NaN or
+      meaningless numbers.
     - `soft_map`: the soft map from X (m vertices) to Y (n vertices), a `SoftMap` or a `SparseSoftMap`. The
       recovery computes the soft map from C. The method `pull_back` of the soft map transfers functions (n, p)
       on Y to X (m, p). The method `pointwise_map` returns an integer array (m,), one 0-based vertex of Y per
@@ -41,7 +42,7 @@ class SoftRefinement(eqx.Module):
       `RESULTS[result]` is a sentence that explains the status.
     - `iterations`: the number of functional maps that were computed after the first functional map.
     - `change`: the Frobenius norm of the change of C in the last iteration, divided by the Frobenius norm of
-      C. The change is 0 at a fixed point.
+      C. The change has no unit, and is 0 at a fixed point.
     """
 
     functional_map: Float[Array, "k_out k_in"]
@@ -73,9 +74,11 @@ def refine_softly(
 
     **Arguments:**
 
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
-    - `pointwise_map`: the initial map X -> Y: an integer array (m,) with one vertex of Y per vertex of X, or
-      a `SoftMap`, or a `SparseSoftMap`.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices). Two
+      full shapes should each have area 1, as from `compute_spectrum`. The shapes of a partial pair need the
+      same unit of length.
+    - `pointwise_map`: the initial map X -> Y: an integer array (m,) with one 0-based vertex of Y per vertex
+      of X, or a `SoftMap`, or a `SparseSoftMap`.
     - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps. The attribute
       `search` of the refiner has no effect.
     - `recovery`: the `Recovery` that computes soft maps from functional maps: `Softmax()`, `NearestFew()` or
@@ -96,9 +99,9 @@ def refine_softly(
     - `tolerance`: a positive number, which only `"implicit"` uses. The tolerance limits the error of the
       fixed point, relative to the largest entry of the first functional map. GMRES uses the same tolerance.
 
-    **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in), `soft_map` (a
-    soft map from X to Y) and `result`. Numerical failures raise no error, so compare `result` with
-    `RESULTS.successful`. If `"implicit"` has too few `iterations`, `result` is
+    **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in) without unit,
+    `soft_map` (a `SoftMap` or `SparseSoftMap` from X to Y) and `result`. Numerical failures raise no error,
+    so compare `result` with `RESULTS.successful`. If `"implicit"` has too few `iterations`, `result` is
     `RESULTS.fixed_point_not_reached`.
 
     **Raises:** `ValueError` if `iterations` is below 1, `tolerance` is not positive, `differentiation` is
@@ -169,11 +172,12 @@ class WaveletPreservationLayer(eqx.Module):
     """A neural-network layer that matches two shapes by features of their vertices.
 
     `layer(features_x, features_y, spectrum_x, spectrum_y)` computes a soft map from the distances between the
-    features of X (m, d) and the features of Y (n, d). The layer refines this soft map by `refine_softly` and
-    returns a `SoftRefinement`. The attribute `soft_map` of the result is a soft map from X to Y. By default,
-    the attribute `functional_map` is a pullback (k_X, k_Y), which takes functions on Y to functions on X. If
-    the refiner's `convention` is `"pushforward"`, the functional map (k_Y, k_X) takes functions on X to
-    functions on Y.
+    features of X (m, d) and the features of Y (n, d), in the same unit. The spectra are those of X and Y,
+    each a `Spectrum`, usually of area 1. The layer refines this soft map by `refine_softly` and returns a
+    `SoftRefinement`. The attribute `soft_map` of the result is a `SoftMap` or `SparseSoftMap` from X to Y. By
+    default, the attribute `functional_map` is a pullback (k_X, k_Y), which takes functions on Y to functions
+    on X. If the refiner's `convention` is `"pushforward"`, the functional map (k_Y, k_X) takes functions on X
+    to functions on Y.
 
     The layer is an equinox module. Its trainable parameters are its array leaves, such as the parameters of
     the filter bank and the temperatures of both recoveries. Train all parameters, or freeze some of them with

@@ -22,14 +22,18 @@ class Spectrum(eqx.Module):
     a new leading axis. `stack` pads smaller shapes with masked vertices, which have zero area and zero
     eigenvectors. Unreferenced vertices (vertices that no face references) are also masked.
 
+    The unit of length is the same in all attributes and otherwise arbitrary. `compute_spectrum` chooses the
+    unit in which the area is 1.
+
     **Attributes:**
 
     - `eigenvalues`: (k,), ascending, in units of 1 / length².
     - `eigenvectors`: (n, k), in units of 1 / length.
     - `vertex_areas`: (n,), in units of length², zero for masked vertices.
     - `mask`: (n,), True for vertices of the surface, False for masked vertices.
-    - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, zero for masked vertices;
-      or None (the default). Only the refiners `FeatureRegression` and `Registration` use descriptors.
+    - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, without unit, zero for
+      masked vertices; or None (the default). Only the refiners `FeatureRegression` and `Registration` use
+      descriptors.
     - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None (the
       default). Only the refiner `Registration` uses positions.
     - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None (the default). Only the

@@ -34,13 +34,13 @@ def nearest_point_on_triangles(
 
     - `queries`: (m, d), points in d dimensions, in any unit.
     - `points`: (n, d), the corners of the triangles, in the same unit.
-    - `faces`: (f, 3), for each triangle the indices of its corners in `points`.
+    - `faces`: (f, 3), for each triangle the 0-based indices of its corners in `points`.
     - `face_mask`: (f,), False for triangles that the search ignores. With None (the default), the search uses
       all triangles. If the search ignores all triangles, the result is meaningless.
 
-    **Returns:** Two arrays with one row per query. The first array (m,), int32, contains the index of the
-    triangle with the nearest point. The second array (m, 3) contains the barycentric weights of the
-    triangle's corners, which are not negative and sum to 1.
+    **Returns:** Two arrays with one row per query. The first array (m,), int32, contains the 0-based row of
+    `faces` with the nearest point. The second array (m, 3) contains the barycentric weights of the triangle's
+    corners, which are not negative and sum to 1.
     """
     corners = points[faces]
     edges = corners[:, 1:] - corners[:, :1]

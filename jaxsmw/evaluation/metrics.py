@@ -207,7 +207,7 @@ def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
     - `mesh_y`: the target Y, a `Mesh`.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
 
-    **Returns:** The coverage, a float.
+    **Returns:** The coverage, a float without unit.
 
     **Raises:** `InputError` if an entry of the map is not a vertex of Y.
     """

@@ -42,7 +42,9 @@ class CreaturePair:
     - `source`: the source, a `Mesh` with m vertices.
     - `target`: the target, a `Mesh` with n vertices.
     - `truth`: the ground truth as a `SurfacePoints` with m points on the target, one for each source vertex.
-    - `true_map`: the ground truth as a pointwise map (m,), int64, 0-based target vertices.
+      A `SurfacePoints` consists of triangles and barycentric weights.
+    - `true_map`: the ground truth as a pointwise map (m,), int64, 0-based target vertices. Entry i is the
+      corner nearest to point i of `truth`, among the corners of the triangle in which the point lies.
     """
 
     source: Mesh
@@ -632,9 +634,10 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     - `seed`: a random seed, an integer of at least 0. The seed determines the individual, the poses and the
       triangulations.
 
-    **Returns:** A `CreaturePair` with the attributes `source` and `target` (each a `Mesh`), `truth` (a
-    `SurfacePoints` with m points on the target) and `true_map` (m target vertices). Both bodies are about 1.5
-    units high. The x axis points to the creature's left, the y axis up and the z axis forward.
+    **Returns:** A `CreaturePair` with the attributes `source` and `target` (each a `Mesh`), `truth` and
+    `true_map`. `truth` is a `SurfacePoints` with m points on the target. `true_map` (m,), int64, contains
+    0-based target vertices: for each point of `truth`, the nearest corner of its triangle. Both bodies are
+    about 1.5 units high. The x axis points to the creature's left, the y axis up and the z axis forward.
 
     **Raises:** `InputError` for an unknown kind, fewer than 500 vertices, a negative seed, or (rarely) a seed
     whose body intersects itself.

@@ -53,9 +53,10 @@ class SurfacePoints:
 
     `len(points)` is the number p of points. `points[rows]` selects points by an array `rows` of 0-based
     indices. The method `positions(mesh)` returns the positions (p, 3) of the points, and
-    `interpolate(values, mesh)` returns the values of a function at the points. The method
-    `nearest_corners(mesh)` returns for each point the nearest corner of its face, as 0-based vertex indices
-    (p,). The constructor checks nothing. Functions that receive `SurfacePoints` check them.
+    `interpolate(values, mesh)` returns the values (p, x) of functions at the points, for values (n, x) at the
+    vertices. The method `nearest_corners(mesh)` returns for each point the nearest corner of its face, as
+    0-based vertex indices (p,). The constructor checks nothing. Functions that receive `SurfacePoints` check
+    them.
 
     **Attributes:**
 

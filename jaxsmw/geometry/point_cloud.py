@@ -83,8 +83,8 @@ def triangulate_points(
     - `name`: the name of the point cloud in messages.
     - `notes`: sentences that precede the notes of the mesh.
 
-    **Returns:** A `Mesh` with the n points as vertices. Its normals point outward. Its `notes` say how many
-    triangles join the points.
+    **Returns:** A `Mesh` with the n points as vertices, in the same unit. Its normals point outward. Its
+    `notes` say how many triangles join the points.
 
     **Raises:** `InputError` if an array has a wrong shape or type, or if there are fewer than 20 different
     points. `InputError` is also raised if the extent of the points is below 1e-60 or above 1e60, or if fewer

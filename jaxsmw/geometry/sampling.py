@@ -27,7 +27,7 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
     - `mesh`: the surface. Unreferenced vertices are never chosen.
     - `number_of_samples`: the number s of samples, from 1 to the number of referenced vertices.
 
-    **Returns:** The samples as 0-based vertex indices (s,), in the order in which they were chosen.
+    **Returns:** The samples as 0-based vertex indices (s,), int64, in the order in which they were chosen.
 
     **Raises:** `InputError` if the number of samples is below 1 or above the number of referenced vertices.
     """

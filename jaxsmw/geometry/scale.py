@@ -51,9 +51,9 @@ class ScaleEstimate(NamedTuple):
 
     **Attributes:**
 
-    - `scale`: the factor by which lengths on X are multiplied to become lengths in the unit of Y.
-    - `support`: the mean number of other matches that confirm a match. Two matches confirm each other if
-      their ratio of distances agrees with the most frequent ratio.
+    - `scale`: the factor by which lengths on X are multiplied to become lengths in the unit of Y, a float.
+    - `support`: the mean number of other matches that confirm a match, a float without unit. Two matches
+      confirm each other if their ratio of distances agrees with the most frequent ratio.
     - `uncertain`: whether `support` is below `ScaleSettings.uncertain_below`, so that the scale can be wrong.
     """
 
@@ -82,10 +82,11 @@ def estimate_scale(
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: a partial shape and a full shape, in either order and in any units of length.
-    - `settings`: the settings of the search.
+    - `settings`: the `ScaleSettings` of the search.
 
-    **Returns:** A `ScaleEstimate` with the attributes `scale`, `support` and `uncertain`. Lengths on X are
-    multiplied by `scale` to become lengths in the unit of Y, even if Y is the partial shape.
+    **Returns:** A `ScaleEstimate` with the attributes `scale` and `support`, which are floats, and
+    `uncertain`, a Boolean. Lengths on X are multiplied by `scale` to become lengths in the unit of Y, even if
+    Y is the partial shape.
 
     **Raises:** `InputError` if neither mesh has a boundary, or if the meshes are too coarse.
     """

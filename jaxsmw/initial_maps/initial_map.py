@@ -42,7 +42,8 @@ def initial_map(
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in comparable units, from `paired_spectra`.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in comparable units, each a `Spectrum` from
+      `paired_spectra`.
     - `init`: the name of a method, a given map, or landmarks.
         - `"shot"`: nearest neighbours in SHOT descriptors, which distinguish left from right.
         - `"wks"`, `"hks"`, `"wavelet"`: nearest neighbours in the wave kernel signature, the heat kernel
@@ -54,9 +55,11 @@ def initial_map(
         - an integer array (m,): a given pointwise map, as 0-based vertices of Y.
         - a `SurfacePoints` with m points on Y: a map to points on faces. Each point is replaced by the
           nearest corner of its face.
-        - an integer array (l, 2): landmarks, with a vertex of X and its match on Y in each row. The initial
-          map is then computed by nearest-neighbour search in SHOT and in geodesic distances to the landmarks.
-    - `sampled`: the result of `jaxsmw.descriptors.sample_pair` for this pair, if it was already computed.
+        - an integer array (l, 2): landmarks, with a vertex of X and its match on Y in each row, both 0-based.
+          The initial map is then computed by nearest-neighbour search in SHOT and in geodesic distances to
+          the landmarks.
+    - `sampled`: the `SampledPair` that `jaxsmw.descriptors.sample_pair` returns for this pair, if it was
+      already computed.
 
     **Returns:** The initial map as an integer array (m,), 0-based vertices of Y. With SHOT, the function
     issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.

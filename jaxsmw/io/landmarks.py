@@ -166,9 +166,9 @@ class LandmarkMatch(NamedTuple):
 
     **Attributes:**
 
-    - `names`: the names in both sets of landmarks, in the order of the first set.
-    - `only_first`: the names in the first set only, in the order of the first set.
-    - `only_second`: the names in the second set only, in the order of the second set.
+    - `names`: a tuple of the names in both sets of landmarks, in the order of the first set.
+    - `only_first`: a tuple of the names in the first set only, in the order of the first set.
+    - `only_second`: a tuple of the names in the second set only, in the order of the second set.
     """
 
     names: tuple[str, ...]
@@ -208,8 +208,9 @@ class FrameDistances(NamedTuple):
 
     **Attributes:**
 
-    - `as_read`: the mean distance from the landmarks to the surface.
-    - `flipped`: the mean distance after a change between LPS and RAS, which reverses the signs of x and y.
+    - `as_read`: the mean distance from the landmarks to the surface, a float.
+    - `flipped`: the mean distance after a change between LPS and RAS, which reverses the signs of x and y, a
+      float.
     """
 
     as_read: float
@@ -244,8 +245,8 @@ def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
     - `landmarks`: `Landmarks` in the unit of the mesh.
     - `mesh`: the `Mesh` to which the landmarks belong.
 
-    **Returns:** A sentence for each landmark whose distance to the surface is above 2 % of the diagonal of
-    the box around the mesh.
+    **Returns:** A tuple with a sentence for each landmark whose distance to the surface is above 2 % of the
+    diagonal of the box around the mesh.
 
     **Raises:** `InputError` if the median distance of the landmarks to the surface is above 3 % of the
     diagonal. `InputError` is also raised if their mean distance is above 5 % of the diagonal, but would be

@@ -77,7 +77,8 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
 
     - `.off`: colours of vertices and faces, normals, and texture coordinates (COFF, NOFF, STOFF).
     - `.obj`: the `vt` lines become the texture. The `g`, `o` and `usemtl` lines become the face data `group`,
-      `object` and `material`. Colours that follow the positions are read as well.
+      `object` and `material`. These arrays (f,) contain 0-based integers, and `label_names` contains the
+      names. Colours that follow the positions are read as well.
     - `.ply`: all properties with one number per row. Properties `a_0`, `a_1`, … become the columns of an
       array `a`. The texture comes from the face lists `texcoord`, or from the vertex properties `s` and `t`,
       `u` and `v`, or `texture_u` and `texture_v`.
@@ -88,8 +89,9 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     - `.vtp`: all arrays on points and cells. The file is a VTK XML file in any encoding, and may be
       compressed. Compression with LZ4 needs the extra `vtk`.
     - `.gltf`, `.glb`: glTF 2.0 files. The attribute TEXCOORD_0 is the texture, and COLOR_0 becomes `colors`.
-      Further attributes, morph targets and skins are read as well.
-    - `.npz`: arrays with the names of the attributes of a `MeshData`.
+      Further attributes, morph targets and skins are read as well. If the file has several parts, the face
+      data `group` contains 0-based integers, and `label_names` contains the names of the parts.
+    - `.npz`: the arrays that `write_mesh_data` writes, such as `vertices`, `faces` and `vertex_data/NAME`.
     - `.xyz`: a text file with one point per line. Columns 4 to 6 become `normals` if they are unit vectors.
       Further columns are ignored.
     - `.pcd`: all fields of a file of the Point Cloud Library, which may be text, binary or compressed. The
@@ -114,10 +116,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
 
     **Returns:**
 
-    A `MeshData` with n vertices and f triangles. Its attributes `mesh`, `faces` (f, 3), `vertex_data`,
-    `face_data` and `texture` contain the mesh, its triangles and its data, in the units of the file.
-    Triangle strips, and polygons with more than three corners, are split into triangles. Each triangle has
-    the data of its strip or polygon.
+    A `MeshData` with n vertices and f triangles, in the units of the file. Its attributes are `mesh`, `faces`
+    (f, 3), `vertex_data`, `face_data`, `texture`, `blend_shapes`, `skin` and `label_names`. Triangle strips,
+    and polygons with more than three corners, are split into triangles. Each triangle has the data of its
+    strip or polygon.
 
     **Raises:**
 

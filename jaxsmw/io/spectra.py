@@ -63,7 +63,8 @@ def make_spectrum(
         shape can be a `TriMesh` of pyFM after a call of its method `process`, or a shape of geomfum with an
         eigenbasis. Any other object with the attributes `eigenvalues`, `eigenvectors` and `vertex_areas` is
         also accepted.
-    - `eigenvectors`: the eigenvectors (n, k), orthonormal with respect to the vertex areas.
+    - `eigenvectors`: the eigenvectors (n, k), in units of 1 / length, orthonormal with respect to the vertex
+        areas.
     - `vertex_areas`: the vertex areas (n,), in units of length², or the lumped mass matrix (n, n), dense or
         sparse. Vertices of zero area are masked. The unit of length is arbitrary.
     - `name`: the name of the spectrum in messages.
@@ -239,8 +240,8 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
     **Arguments:**
 
     - `path`: the file to create or to replace. The suffix, `.npz` or `.mat`, determines the format.
-    - `spectrum`: a `Spectrum` (n vertices, k eigenvectors). The positions, normals, mask and descriptors of
-        the spectrum are not written.
+    - `spectrum`: a `Spectrum` (n vertices, k eigenvectors). The numbers in the file are in the unit of the
+        spectrum. The positions, normals, mask and descriptors of the spectrum are not written.
     - `mesh`: the mesh of the spectrum (n vertices), or None. A `.npz` file does not contain the mesh.
 
     **Raises:** `InputError` for another suffix, a mesh with another number of vertices, or a file that cannot
@@ -305,8 +306,10 @@ def read_functional_map(
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. The functional map may have fewer
         rows and columns than the spectra have eigenvectors.
 
-    **Returns:** The functional map C (k_X, k_Y), float64, with the values of the file. k_X and k_Y are at
-    most the numbers of eigenvectors of the spectra.
+    **Returns:** The functional map C (k_X, k_Y), float64, with the values of the file. C fits the spectra of
+    this library only if the eigenbases of the file belong to surfaces of area 1. Otherwise, C must be
+    multiplied by the factor that `make_spectrum` states. k_X and k_Y are at most the numbers of eigenvectors
+    of the spectra.
 
     **Raises:** `InputError` if the file cannot be read or contains no suitable matrix. `InputError` is also
     raised if the matrix is too large for the spectra, or has entries that are not finite. The message names
@@ -337,8 +340,8 @@ def write_functional_map(
     **Arguments:**
 
     - `path`: the file to create or to replace, with the suffix `.mat`.
-    - `functional_map`: the pullback C (k_X, k_Y), which takes functions on Y to functions on X. The
-        eigenbases must belong to surfaces of area 1, as the spectra of this library do.
+    - `functional_map`: the pullback C (k_X, k_Y), which takes functions on Y to functions on X. C has no
+        unit. The eigenbases must belong to surfaces of area 1, as the spectra of this library do.
 
     **Raises:** `InputError` for another suffix, entries that are not finite real numbers, or a file that
     cannot be written.

@@ -210,8 +210,9 @@ class Decision(NamedTuple):
     **Attributes:**
 
     - `mirrored`: whether the mirror image of X corresponds to Y.
-    - `evidence`: the evidence for the mirror image; see `Hands`. None if no evidence was computed, for
-      example because the shapes are their own mirror images.
+    - `evidence`: the evidence for the mirror image, a float without unit: the logarithm of a ratio of
+      distance errors; see `Hands`. None if no evidence was computed, for example because the shapes are their
+      own mirror images.
     - `doubtful`: whether the decision is uncertain. For asymmetric shapes, the decision is uncertain if the
       evidence is near `mirrored_from`. If the asymmetry is slightly below `asymmetric_from`, the decision is
       uncertain if the evidence is at least `mirrored_from`. `ChiralitySettings` contains the thresholds.

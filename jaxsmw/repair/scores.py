@@ -29,12 +29,13 @@ def dirichlet_energy_ratio(
 
     **Arguments:**
 
-    - `pair`: the source X (m vertices) and the target Y.
+    - `pair`: the `Pair` of the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the spectrum of X with a few hundred eigenvectors. The spectrum may be padded.
-    - `settings`: the settings of the scores.
+    - `spectrum_x`: the `Spectrum` of X in `Pair.units_of_length`, with a few hundred eigenvectors. The
+      spectrum may be padded.
+    - `settings`: the settings of the scores, a `ScoreSettings`.
 
-    **Returns:** The ratio, without unit, for positions in `Pair.units_of_length`.
+    **Returns:** The ratio, a float without unit, for positions in `Pair.units_of_length`.
     """
     m, n = (len(mesh.vertices) for mesh in pair.meshes)
     resolved = max(2, min(m, n) // settings.vertices_per_eigenvector)
@@ -77,12 +78,13 @@ def distortion(
 
     **Arguments:**
 
-    - `pair`: the source X (m vertices) and the target Y.
+    - `pair`: the `Pair` of the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the spectrum of X with a few hundred eigenvectors. The spectrum may be padded.
-    - `settings`: the settings of the scores.
+    - `spectrum_x`: the `Spectrum` of X in `Pair.units_of_length`, with a few hundred eigenvectors. The
+      spectrum may be padded.
+    - `settings`: the settings of the scores, a `ScoreSettings`.
 
-    **Returns:** The distortion, without unit.
+    **Returns:** The distortion, a float without unit. For two full shapes, the distortion is at least 1.
     """
     reversed_ = orientation_reversal(pair, pointwise_map, spectrum_x, settings)
     share = float(pair.mesh_x.average(reversed_))

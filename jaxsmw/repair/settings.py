@@ -57,8 +57,8 @@ class ExpectedErrorSettings:
       R30).
     - `misplaced_weight`: the increase of the expected error on a limb that looks swapped, in units of the
       square root of the limb's area.
-    - `heat_time`: the time of the heat flow that averages over neighbouring vertices. The default value
-      averages over a disk of radius 0.06.
+    - `heat_time`: the time of the heat flow that averages over neighbouring vertices, in units of the area.
+      The default value averages over a disk of radius 0.06.
     - `area_weight`, `isometric_difference` (Table R30): for two full shapes with the area-based shape
       difference d, the expected error is multiplied by `1 + area_weight * log(d / isometric_difference)`. If
       d is smaller than `isometric_difference`, the factor is 1.

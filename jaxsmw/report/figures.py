@@ -56,13 +56,14 @@ def draw_correspondence(
 ) -> Figure:
     """Draw a map by colours: each vertex of X has the colour of its match on Y.
 
-    The colour of each vertex of Y depends on its position on the body. Both bodies are shown at the same
-    scale and from the same direction. If the map is good, the colours of X are as smooth as the colours of Y,
-    and corresponding limbs have the same colours.
+    The colour of each vertex of Y depends on its position on the body. Both bodies are shown from the same
+    direction. Each body is scaled to area 1, unless the ratio of the areas suggests a partial shape; see
+    `jaxsmw.report.standing.stand_pair`. If the map is good, the colours of X are as smooth as the colours of
+    Y, and corresponding limbs have the same colours.
 
     **Arguments:**
 
-    - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
+    - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices), each a `Mesh` in any unit of length.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
     - `errors`: a dictionary from the name of each kind of error to an array (m,). The array contains the
       error of each match as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array,
@@ -105,7 +106,7 @@ def draw_mesh(
 
     **Arguments:**
 
-    - `mesh`: a surface with n vertices.
+    - `mesh`: a surface with n vertices, a `Mesh` in any unit of length.
     - `colors`: one sRGB colour in [0, 1] per vertex (n, 3); by default, the mesh is grey.
     - `up`, `azimuth`: the axis that points up and the direction of view, as in `draw_correspondence`.
 
@@ -233,8 +234,8 @@ def draw_quality_curves(
     - `curves`: a dictionary from the name of each map to its curve. A curve is a pair of two arrays,
       thresholds (p,) and shares (p,). The thresholds are fractions of sqrt(area of Y), in ascending order.
       The shares are numbers in [0, 1].
-    - `mean_errors`: a dictionary from the name of a map to its mean error, which the legend shows. The
-      dictionary need not contain all maps.
+    - `mean_errors`: a dictionary from the name of a map to its mean error, as a fraction of sqrt(area of Y),
+      which the legend shows. The dictionary need not contain all maps.
 
     **Returns:** A `matplotlib.figure.Figure`.
 
@@ -504,7 +505,10 @@ def draw_heat_maps(
 def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
     """Write a figure as PNG, PDF or SVG. The file is written completely or not at all.
 
-    The suffix of the file (`.png`, `.pdf` or `.svg`) determines the format.
+    **Arguments:**
+
+    - `path`: the file to create or to replace. The suffix (`.png`, `.pdf` or `.svg`) determines the format.
+    - `figure`: a `matplotlib.figure.Figure`.
 
     **Raises:** `InputError` for any other suffix, if the file cannot be written, or if matplotlib is missing.
     """

@@ -76,9 +76,9 @@ class ShownMap:
     - `errors`: a dictionary from the name of each kind of error to an array (m,). The array contains the
       error of each match as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array,
       the page has a mode that shows the errors as colours.
-    - `functional_map`: the functional map C, which the page shows as a picture. The shape is (k_X, k_Y) in
-      the pullback convention and (k_Y, k_X) in the pushforward convention. If C is None, the page shows no
-      functional map.
+    - `functional_map`: the functional map C, without unit, which the page shows as a picture. The shape is
+      (k_X, k_Y) in the pullback convention and (k_Y, k_X) in the pushforward convention. If C is None, the
+      page shows no functional map.
     - `convention`: the convention of C, `"pullback"` or `"pushforward"`.
     - `statistics`: a dictionary from labels to values as text. The page contains a table of these values,
       with one row per map and one column per label.
@@ -130,10 +130,10 @@ def write_page(
     - `path`: the HTML file. Any browser with WebGL opens the file from disk. The viewer takes about 0.6 MB of
       the file. The meshes take 50 bytes per vertex, and each map takes a few bytes per vertex. The spectra
       take 133 bytes per vertex, but at most 8 MB in total.
-    - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices).
+    - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices), each a `Mesh` in any unit of length.
     - `maps`: a dictionary from the name of each map to a `ShownMap`. The page opens with the first map.
     - `title`: the heading of the page.
-    - `spectra`: the spectra of X and Y; None (the default) for a page without wavelets.
+    - `spectra`: a pair with the `Spectrum` of X and of Y; None (the default) for a page without wavelets.
       `jaxsmw.report.page_data.eigenvectors_on_page` limits the number of eigenvectors on the page. Each entry
       of an eigenvector is rounded to one byte (`jaxsmw.report.page_data.encode_rounded`).
     - `refiner`: a `WaveletPreservation` refiner, whose filter bank defines the wavelets.
@@ -150,8 +150,9 @@ def write_page(
       default) for a page without these positions. The page can draw X at these positions, on top of Y. A
       slider on the page deforms X from its own shape to these positions. The positions take 16 bytes per
       vertex.
-    - `landmarks`: the landmarks on X and on Y with which the page opens, in the coordinates of the mesh
-      files. Landmarks of the same name correspond. With None (the default), the page opens without landmarks.
+    - `landmarks`: a pair of `Landmarks`, on X and on Y, with which the page opens, in the coordinates of the
+      mesh files. Landmarks of the same name correspond. With None (the default), the page opens without
+      landmarks.
 
     **Raises:** `InputError` if there is no map, or if the maps, errors or spectra do not fit the meshes.
     `InputError` is also raised if a functional map is not a matrix of finite numbers, the limit is not

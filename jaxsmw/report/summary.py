@@ -97,7 +97,7 @@ def write_report(
       writes `report.html`, `correspondence.png`, `functional_map.png` and `summary.json`. The file
       `report.html` is an interactive page with both bodies, the map and the initial map. The function writes
       `filters.png` if a stage has filters, and `quality.png` if errors are given.
-    - `correspondence`: the result of `match`.
+    - `correspondence`: the result of `match`, a `Correspondence`.
     - `errors`: a dictionary from the name of each map to its `GeodesicError`. The last entry must contain the
       errors of `correspondence.pointwise_map`. An entry named `initial` must contain the errors of
       `correspondence.initial_map`.
@@ -110,11 +110,12 @@ def write_report(
       and prints the sum as the total time.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
-    - `registered`: the registered mesh that the page shows. By default, the page shows the result of
+    - `registered`: the `RegisteredMesh` that the page shows. By default, the page shows the result of
       `Correspondence.registered_mesh`.
-    - `landmarks`: the landmarks on X and on Y with which the page opens; see `jaxsmw.report.page.write_page`.
+    - `landmarks`: a pair of `Landmarks`, on X and on Y, with which the page opens; see
+      `jaxsmw.report.page.write_page`.
 
-    **Returns:** The files that were written.
+    **Returns:** A list of the paths of the files that were written.
 
     **Raises:** `InputError` if the directory cannot be written to, if `up` is not an axis, or if matplotlib
     is missing.

@@ -45,8 +45,8 @@ def stack(spectra: Sequence[Spectrum]) -> Spectrum:
     - `spectra`: at least one `Spectrum`. All spectra need the same number k of eigenvectors and the same
       optional arrays, such as descriptors.
 
-    **Returns:** The stacked spectrum. For s shapes and n vertices in the largest shape, `eigenvectors` has
-    shape (s, n, k).
+    **Returns:** The stacked `Spectrum`, in the units of the given spectra. For s shapes and n vertices in the
+    largest shape, `eigenvectors` has shape (s, n, k).
 
     **Raises:** `InputError` if there are no shapes, if the shapes have different numbers of eigenvectors, or
     if only some of them have an optional array.
@@ -103,16 +103,18 @@ def refine_pairs(
 
     **Arguments:**
 
-    - `spectra`: a sequence of shapes, each a `Spectrum`. The shapes may have different numbers of
-      eigenvectors. All shapes must have the same number of descriptors, or no shape may have descriptors.
+    - `spectra`: a sequence of shapes, each a `Spectrum`. Unless `partial` is True, each shape should have
+      area 1, as from `compute_spectrum`. Not all refiners scale the shapes. The shapes may have different
+      numbers of eigenvectors. All shapes must have the same number of descriptors, or no shape may have
+      descriptors.
     - `pairs`: for each pair, a tuple of two integers: the indices of source X and target Y in `spectra`,
       counted from 0. A pair may occur several times with different initial maps.
-    - `pointwise_maps`: for each pair, the initial map T: X -> Y, an integer array (m,) with one vertex of Y
-      per vertex of X.
+    - `pointwise_maps`: for each pair, the initial map T: X -> Y, an integer array (m,) with one 0-based
+      vertex of Y per vertex of X.
     - `refiner`: the method, a `Refiner` such as `WaveletPreservation()`.
     - `iterations`: the number of iterations, an integer of at least 1.
-    - `samples`: for each shape, an integer array (s,) of the vertices on which the refiner iterates. The
-      number s must be the same for all shapes. If None, all iterations use all vertices.
+    - `samples`: for each shape, an integer array (s,) of the 0-based vertices on which the refiner iterates.
+      The number s must be the same for all shapes. If None, all iterations use all vertices.
     - `starts_on_samples`, `ends_on_samples`: whether the first and the last step of each refinement use only
       the samples; see `refine`.
     - `partial`: whether one shape of each pair is a partial shape and the other shape is the full shape. If
@@ -127,10 +129,10 @@ def refine_pairs(
       is half of the device's memory.
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
 
-    **Returns:** An iterator over tuples of two elements: the index of a pair in `pairs`, and the `Refinement`
-    of this pair. The iterator groups the pairs by their padded sizes, so their order differs from the order
-    in `pairs`. Numerical failures raise no error, so compare the `result` of each refinement with
-    `RESULTS.successful`.
+    **Returns:** An iterator over tuples of two elements: the 0-based index of a pair in `pairs`, and the
+    `Refinement` of this pair. The iterator groups the pairs by their padded sizes, so their order differs
+    from the order in `pairs`. Numerical failures raise no error, so compare the `result` of each refinement
+    with `RESULTS.successful`.
 
     **Raises:** `InputError` if the length of `pointwise_maps` differs from that of `pairs`, or the length of
     `samples` differs from that of `spectra`. `InputError` is also raised if a pair refers to a shape that

@@ -79,7 +79,7 @@ def transfer_attributes(
     - `target`: a `MeshData` with the mesh `registered.mesh_y`, or this mesh itself. None (the default) stands
       for this mesh.
 
-    **Returns:** The `MeshData` of Y with the vertices and faces of `target`. The notes in
+    **Returns:** The `MeshData` of Y with the vertices and faces of `target`, in the unit of Y. The notes in
     `mesh.notes` name the data of Y that were replaced. The notes also count the vertices of Y whose distance
     to the registered mesh is above 3 % of the square root of Y's area. These vertices receive the values at
     the nearest point, too.

@@ -35,7 +35,7 @@ class Similarities(NamedTuple):
     **Attributes:**
 
     - `rotations`: (n, 3, 3), orthogonal. All determinants are 1, or all determinants are -1.
-    - `scales`: (n,), positive.
+    - `scales`: (n,), positive: the factor by which lengths are multiplied.
     """
 
     rotations: Float64[np.ndarray, "n 3 3"]

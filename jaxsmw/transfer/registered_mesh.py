@@ -74,11 +74,12 @@ class RegisteredMesh:
 
     **Attributes:**
 
-    - `mesh_x`, `mesh_y`: the source X (m vertices, f faces) and the target Y.
+    - `mesh_x`, `mesh_y`: the source X (m vertices, f faces) and the target Y, each a `Mesh`.
     - `vertices`: the positions of X's vertices on Y (m, 3), in Y's unit of length. Together with the faces of
       X, they form the registered mesh.
-    - `similarities`: the rotation and the scale of each vertex's neighbourhood. These transformations take X
-      to the registered mesh. The scales include the change from X's unit of length to Y's.
+    - `similarities`: the rotation and the scale of each vertex's neighbourhood, as `Similarities` with
+      rotations (m, 3, 3) and scales (m,). These transformations take X to the registered mesh. The scales
+      include the change from X's unit of length to Y's.
 
     An unreferenced vertex of X moves with the nearest referenced vertex. Both vertices have the same
     similarity transformation. Vertices that welding merges keep exactly the same position.

@@ -16,11 +16,12 @@ def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
     """Return the values (k,) of the frame function G of a filter bank at k eigenvalues.
 
     The frame function `G(lambda) = sum_l g_l(lambda)²` is the sum of the squared filters g_l (equation (7) of
-    the MWP paper). G is constant for a tight frame, and 1 for a Parseval frame.
+    the MWP paper). G has no unit. G is constant for a tight frame, and 1 for a Parseval frame.
 
     **Arguments:**
 
-    - `responses`: (filters, k), the responses of the bank, such as `bank(eigenvalues, eigenvalues)`.
+    - `responses`: (filters, k), the dimensionless responses of the bank, such as
+      `bank(eigenvalues, eigenvalues)`.
     """
     return jnp.sum(responses**2, axis=0)
 
@@ -117,8 +118,8 @@ def tighten(bank: FilterBank) -> FilterBank:
 
     - `bank`: any `FilterBank`.
 
-    **Returns:** A `FilterBank` with the responses `g_l / sqrt(G)`, (filters, p) for p points. The new bank
-    has the same parameters (pytree leaves) as `bank`, and its responses are differentiable with respect to
-    these parameters.
+    **Returns:** A `FilterBank` with the dimensionless responses `g_l / sqrt(G)`, (filters, p) for p points.
+    The new bank has the same parameters (pytree leaves) as `bank`, and its responses are differentiable with
+    respect to these parameters.
     """
     return Tightened(bank)

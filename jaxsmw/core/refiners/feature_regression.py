@@ -185,9 +185,10 @@ class PreparedFeatures(Prepared):
 
     **Attributes:**
 
-    - `x`, `y`: the features of the vertices to be matched, which are the samples or all vertices.
-    - `all_x`, `all_y`: the features of all vertices.
-    - `patches`: the patches of X and Y, or None if the search uses no patches.
+    - `x`, `y`: the features of the vertices to be matched, which are the samples or all vertices, with one
+      row per vertex.
+    - `all_x`, `all_y`: the features of all vertices, with one row per vertex.
+    - `patches`: the `Patches` of X and of Y, or None if the search uses no patches.
     - `partial`: whether one shape is a part of the other.
     """
 
@@ -211,8 +212,8 @@ class Prediction(NamedTuple):
       and this matrix is the query point in the nearest-neighbour search.
     - `database`: the matrix (d_in, d_out) for target vertices. The product of the features of a target vertex
       and this matrix is the target point in the nearest-neighbour search.
-    - `uncertainty`: half the log-determinant of the covariance of the residuals. Eigenvectors that the
-      iteration does not use are left out.
+    - `uncertainty`: half the log-determinant of the covariance of the residuals, a scalar array without unit.
+      Eigenvectors that the iteration does not use are left out.
     """
 
     queries: Float[Array, "d_out d_out"]
@@ -242,8 +243,8 @@ class Regression(CoarseToFineState):
 
     **Attributes:**
 
-    - `forward`: the prediction of the features of X from the features of Y.
-    - `backward`: the prediction of the features of Y from the features of X.
+    - `forward`: the `Prediction` of the features of X from the features of Y.
+    - `backward`: the `Prediction` of the features of Y from the features of X.
     """
 
     forward: Prediction

@@ -239,10 +239,11 @@ class PreparedSurfaces(Prepared):
     **Attributes:**
 
     - `x`, `y`: the vertices to be matched, which are the samples or all vertices.
-    - `all_x`, `all_y`: all vertices.
-    - `patches`: the patches for searches among the vertices of Y; None if these searches are exhaustive.
-    - `reverse_patches`: the patches for searches among the vertices of X; None if these searches are
+    - `all_x`, `all_y`: all vertices. Positions are in units of the square root of the area.
+    - `patches`: the pair of `Patches` for searches among the vertices of Y; None if these searches are
       exhaustive.
+    - `reverse_patches`: the pair of `Patches` for searches among the vertices of X; None if these searches
+      are exhaustive.
     - `partial`: whether one shape is a part of the other.
     """
 
@@ -257,6 +258,8 @@ class PreparedSurfaces(Prepared):
 
 class Deformation(NamedTuple):
     """A deformation of one surface onto another, as coefficients in the eigenvectors of the first surface.
+
+    Positions are in units of the square root of the area.
 
     **Attributes:**
 
@@ -287,7 +290,7 @@ class Deformation(NamedTuple):
 
         - `surface`: the vertices to be matched.
         - `other`: all vertices of the other surface.
-        - `matches`: one vertex of `other` for each vertex of `surface` (s,).
+        - `matches`: one 0-based vertex of `other` for each vertex of `surface` (s,).
         - `active`: a Boolean array (k_x,), True for the eigenvectors that the iteration uses.
         """
 
@@ -324,8 +327,8 @@ class Registered(CoarseToFineState):
 
     **Attributes:**
 
-    - `forward`, `backward`: the deformations of X onto Y and of Y onto X.
-    - `descriptor_weight`: the weight of descriptors relative to positions.
+    - `forward`, `backward`: the deformations of X onto Y and of Y onto X, each a `Deformation`.
+    - `descriptor_weight`: the weight of descriptors relative to positions, a scalar array.
     """
 
     forward: Deformation

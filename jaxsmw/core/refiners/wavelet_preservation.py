@@ -29,7 +29,7 @@ class PreparedWavelets(Prepared):
 
     - `wavelets`: a `WaveletProblem`, which contains both spectra and the responses of the filter bank.
     - `solution`: the values that `Solution.prepare` returns.
-    - `patches`: the patches of X and Y, or None if the search uses no patches.
+    - `patches`: the `Patches` of X and of Y, or None if the search uses no patches.
     """
 
     wavelets: WaveletProblem

@@ -24,9 +24,11 @@ class Solution(eqx.Module, Generic[PreparedT]):
     A subclass must define `solve(problem, prepared, pointwise_map, previous)`, which returns C (k_out, k_in)
     and a status code (`RESULTS`). The argument `problem` is the `WaveletProblem` of both shapes, and
     `prepared` contains the values that `prepare` returned. The argument `pointwise_map` is the map T: X -> Y.
-    The argument `previous` is the functional map of the previous iteration (None in the first iteration). In
-    the pullback convention (the default), C maps functions on Y ("in") to functions on X ("out"). In the
-    pushforward convention, C maps functions on X ("in") to functions on Y ("out").
+    T is an integer array (m,) with one 0-based vertex of Y per vertex of X, or a `SoftMap` or
+    `SparseSoftMap`. The argument `previous` is the functional map (k_out, k_in) of the previous iteration
+    (None in the first iteration). C has no unit. In the pullback convention (the default), C maps functions
+    on Y ("in") to functions on X ("out"), so C has shape (k_X, k_Y). In the pushforward convention, C maps
+    functions on X ("in") to functions on Y ("out"), so C has shape (k_Y, k_X).
 
     A subclass may also define `prepare(problem)`. This method computes, once per refinement, values that
     `solve` needs in every iteration. The class is generic: if these values have the type `Values`, the
@@ -62,9 +64,10 @@ class Solution(eqx.Module, Generic[PreparedT]):
         - `prepared`: the values that `prepare` returned for this problem; None if the subclass does not
           define `prepare`.
         - `pointwise_map`: the map T. It is either an integer array (m,) with one 0-based vertex of Y per
-          vertex of X, or a soft map from X to Y.
+          vertex of X, or a `SoftMap` or `SparseSoftMap` from X to Y.
         - `previous`: the functional map (k_out, k_in) of the previous iteration, or None in the first
           iteration. An iterative solver can start from this map.
 
-        **Returns:** The functional map C (k_out, k_in), and a status code, which is a member of `RESULTS`.
+        **Returns:** The functional map C (k_out, k_in), without unit, and a status code, which is a member of
+        `RESULTS`.
         """

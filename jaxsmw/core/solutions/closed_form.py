@@ -28,8 +28,8 @@ class PreparedFiltering(NamedTuple):
 
     **Attributes:**
 
-    - `kernel`: the `multiscale_kernel` of the filter bank on both shapes, (k_out, k_in).
-    - `dual_out`: the `dual_eigenvectors` of the shape that C maps to, (n_out, k_out).
+    - `kernel`: the `multiscale_kernel` of the filter bank on both shapes, (k_out, k_in), without unit.
+    - `dual_out`: the `dual_eigenvectors` of the shape that C maps to, (n_out, k_out), in units of length.
     """
 
     kernel: Float[Array, "k_out k_in"]
@@ -48,6 +48,15 @@ class Filtering(Solution[PreparedFiltering]):
     If the bank is a Parseval frame, C minimises the wavelet-preservation energy in the area norm. In the
     default pullback convention, C is the exact minimiser only if T preserves area; otherwise C is only close
     to the minimiser. If the bank is not a Parseval frame, C does not minimise this energy.
+
+    `solve(problem, prepared, pointwise_map, previous)` returns C (k_out, k_in) and `RESULTS.successful`. C
+    and C_0 have the same shape and no unit. `problem` is the `WaveletProblem` of both shapes, and `prepared`
+    is the result of `prepare`. `pointwise_map` is the map T: X -> Y. T is an integer array (m,) with one
+    0-based vertex of Y per vertex of X, or a `SoftMap` or `SparseSoftMap`. `previous` is ignored.
+
+    In the pullback convention (the default), C maps functions on Y ("in") to functions on X ("out"), so C has
+    shape (k_X, k_Y). In the pushforward convention, C maps functions on X ("in") to functions on Y ("out"),
+    so C has shape (k_Y, k_X).
 
     **Arguments:**
 
@@ -79,7 +88,7 @@ class Filtering(Solution[PreparedFiltering]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Return the filtered map C (k_out, k_in), and `RESULTS.successful`."""
+        """Return the filtered map C (k_out, k_in), and `RESULTS.successful`; see `Filtering`."""
         unfiltered = problem.encode(pointwise_map, prepared.dual_out)
         return unfiltered * prepared.kernel, RESULTS.successful  # type: ignore[return-value]
 
@@ -87,12 +96,14 @@ class Filtering(Solution[PreparedFiltering]):
 class NearestOrthogonal(Solution[PreparedT]):
     """A solution that replaces the functional map of another solution by the nearest orthogonal matrix.
 
-    The new map (k_out, k_in) has orthonormal columns, or orthonormal rows if k_out is below k_in. With
-    `solution=Filtering()` and the bank `Identity()`, this solution is the update of spectral ICP (Ovsjanikov
-    et al. 2012). Pass a `NearestOrthogonal` object to `WaveletPreservation` as the argument `solution`.
+    The new map (k_out, k_in) has no unit. It has orthonormal columns, or orthonormal rows if k_out is below
+    k_in. With `solution=Filtering()` and the bank `Identity()`, this solution is the update of spectral ICP
+    (Ovsjanikov et al. 2012). Pass a `NearestOrthogonal` object to `WaveletPreservation` as the argument
+    `solution`.
 
-    The status code is that of the other solution. If the other solution's map contains NaN, all entries of
-    the new map are NaN.
+    `solve(problem, prepared, pointwise_map, previous)` has the arguments and the shapes that `Solution.solve`
+    describes. The status code is that of the other solution. If the other solution's map contains NaN, all
+    entries of the new map are NaN.
 
     **Arguments:**
 
@@ -125,7 +136,16 @@ class LeastSquares(Solution[None]):
     (k_in, k_in) gives the minimiser C (k_out, k_in). Pass a `LeastSquares` object to `WaveletPreservation` as
     the argument `solution`.
 
-    `solve` returns C and the status code `RESULTS.successful`, `RESULTS.undetermined_functional_map` or
+    `solve(problem, prepared, pointwise_map, previous)` returns C (k_out, k_in), without unit, and a status
+    code. `problem` is the `WaveletProblem` of both shapes. `pointwise_map` is the map T: X -> Y. T is an
+    integer array (m,) with one 0-based vertex of Y per vertex of X, or a `SoftMap` or `SparseSoftMap`.
+    `prepared` and `previous` are ignored.
+
+    In the pullback convention (the default), C maps functions on Y ("in") to functions on X ("out"), so C has
+    shape (k_X, k_Y). In the pushforward convention, C maps functions on X ("in") to functions on Y ("out"),
+    so C has shape (k_Y, k_X).
+
+    The status code is `RESULTS.successful`, `RESULTS.undetermined_functional_map` or
     `RESULTS.singular_system`. The functional map is undetermined if all filters are zero at an eigenvalue of
     the shape that C maps from. The system is singular if the gram matrix is singular to working precision.
 
@@ -149,7 +169,7 @@ class LeastSquares(Solution[None]):
         pointwise_map: PointwiseMap,
         previous: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Return the minimiser C (k_out, k_in) of the energy, and a status code (`RESULTS`)."""
+        """Return the minimiser C (k_out, k_in) of the energy, and a status code; see `LeastSquares`."""
         energy = problem.energy(pointwise_map, norm=self.norm)
         _, responses_in = problem.responses
         frame = frame_function(responses_in)

@@ -60,9 +60,10 @@ class DescriptorPair(eqx.Module):
 
     - `x`, `y`: d functions on X and the corresponding d functions on Y, expressed in the eigenbases. The
       shapes are (k_x, d) for `x.coefficients` and (k_y, d) for `y.coefficients`. Column j contains the
-      coefficients of function j. The shapes are (d, k_x, k_x) for `x.operators` and (d, k_y, k_y) for
-      `y.operators`. Matrix j multiplies other functions by function j, in the eigenbasis. The attribute
-      `operators` is None if no operators were computed.
+      coefficients of function j, in the unit of the function times length. The shapes are (d, k_x, k_x) for
+      `x.operators` and (d, k_y, k_y) for `y.operators`. Matrix j multiplies other functions by function j, in
+      the eigenbasis, and has the unit of the function. The attribute `operators` is None if no operators were
+      computed.
 
     The term for descriptor commutativity needs the operators of both shapes. `RegularizedLeastSquares` raises
     `ValueError` if this term has a weight but the operators of a shape are None. `DescriptorPair.project`
@@ -100,7 +101,8 @@ class DescriptorPair(eqx.Module):
 
         - `descriptors_x`, `descriptors_y`: the values of d functions on X (m, d) and of the corresponding
           functions on Y (n, d), in any unit.
-        - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices).
+        - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices), in
+          the same unit of length.
         - `operators`: whether to compute the multiplication operators of both shapes as well. Each shape has
           d operators, which are matrices of size k x k. Descriptor commutativity needs these operators. The
           default is False.

@@ -67,7 +67,14 @@ class RegularizedLeastSquares(Solution[None]):
     from an estimate. C is differentiable: its derivatives are computed by implicit differentiation at the
     minimum.
 
-    The status code of `solve` is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
+    `solve(problem, prepared, pointwise_map, previous)` returns C (k_out, k_in), without unit, and a status
+    code. `problem` is the `WaveletProblem` of both shapes, and `prepared` is ignored. `pointwise_map` is the
+    map T: X -> Y. T is an integer array (m,) with one 0-based vertex of Y per vertex of X, or a `SoftMap` or
+    `SparseSoftMap`. `previous` is the functional map of the previous iteration, or None. In the pullback
+    convention (the default), "in" is Y and "out" is X. In the pushforward convention, "in" is X and "out" is
+    Y.
+
+    The status code is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
     `RESULTS.singular_system`, `RESULTS.nonfinite_functional_map` and `RESULTS.solver_not_converged`.
 
     **Arguments:**
@@ -174,12 +181,13 @@ class RegularizedLeastSquares(Solution[None]):
         - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`. The
           energy must be None if this weight is None. Otherwise the energy is required.
         - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to (k_out,), and of
-          the shape that C maps from (k_in,). `descriptors.x` must belong to the shape that C maps to, as in
-          the pullback convention.
+          the shape that C maps from (k_in,), in the same unit. `descriptors.x` must belong to the shape that
+          C maps to, as in the pullback convention.
         - `initial`: the functional map (k_out, k_in) from which the solver starts. By default, the solver
           starts from an estimate.
 
-        **Returns:** The minimiser C (k_out, k_in), and a status code, which is a member of `RESULTS`.
+        **Returns:** The minimiser C (k_out, k_in), without unit, and a status code, which is a member of
+        `RESULTS`.
 
         **Raises:** `ValueError` if only one of `energy` and the weight `wavelet_preservation` is None, or if
         the descriptors and C have different numbers of eigenvectors.

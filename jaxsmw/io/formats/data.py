@@ -25,8 +25,8 @@ class Texture(NamedTuple):
 
     **Attributes:**
 
-    - `coordinates`: the coordinates (u, v) of the texture vertices (t, 2), float64. The origin of the picture
-      is its lower left corner.
+    - `coordinates`: the coordinates (u, v) of the texture vertices (t, 2), float64, in units of the picture's
+      width and height. The origin of the picture is its lower left corner.
     - `corners`: the 0-based texture vertex of each corner of each triangle (f, 3), int64. The number -1 marks
       a corner without a texture vertex.
     """
@@ -42,8 +42,8 @@ class Skin(NamedTuple):
 
     - `joints`: the names of the joints, a tuple of distinct strings.
     - `weights`: the weight of each joint at each vertex (n, joints), float64. The weights are finite numbers
-      as in the file. They are usually from 0 to 1 with sum 1 at each vertex, but neither range nor sum is
-      checked.
+      without unit, as in the file. They are usually from 0 to 1 with sum 1 at each vertex, but neither range
+      nor sum is checked.
     """
 
     joints: tuple[str, ...]
@@ -80,16 +80,20 @@ class MeshData:
 
     **Attributes:**
 
-    - `mesh`: the `Mesh` that matching uses, with n vertices.
+    - `mesh`: the `Mesh` that matching uses, with n vertices. The positions are in the unit of the file.
     - `faces`: all triangles of the file, in the order of the file, before cleaning and welding. The array
       (f, 3), int64, contains 0-based vertices of `mesh`. Polygons are split into fans of triangles.
-    - `vertex_data`: a dictionary from names to arrays (n,) or (n, c) with numbers for each vertex. Colours
-      are called `colors`; they are uint8, or floats from 0 to 1. Normals are called `normals`.
-    - `face_data`: a dictionary from names to arrays (f,) or (f, c) with numbers for each triangle.
-    - `texture`: a `Texture`, or None.
+    - `vertex_data`: a dictionary from names to arrays (n,) or (n, c) with numbers for each vertex. The arrays
+      contain integers, floats or Booleans; Booleans are stored as uint8. Colours are called `colors`; they
+      are uint8, or floats from 0 to 1. Normals are called `normals`.
+    - `face_data`: a dictionary from names to arrays (f,) or (f, c) with numbers for each triangle, of the
+      same types.
+    - `texture`: a `Texture`, or None. A `Texture` is a pair of arrays: texture coordinates (t, 2), and the
+      0-based texture vertex of each corner (f, 3).
     - `blend_shapes`: a dictionary from the names of blend shapes (morph targets) to displacements (n, 3) of
-      the vertices, in the unit of the vertices.
-    - `skin`: a `Skin`, or None.
+      the vertices, float64, in the unit of the vertices.
+    - `skin`: a `Skin`, or None. A `Skin` is a pair: the names of the joints, and the weight of each joint at
+      each vertex (n, joints), without unit.
     - `label_names`: a dictionary for arrays of labels 0, 1, … in `vertex_data` or `face_data`. Its keys are
       the names of these arrays, and its values are tuples of the names of the labels. For example,
       `face_data["group"]` of an OBJ file contains the number of each triangle's group, and
