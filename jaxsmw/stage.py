@@ -125,9 +125,13 @@ class Stage:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The refiner, the iterations and the Boolean attributes, as keyword arguments of `jaxsmw.refine`."""
+        """The refiner, the iterations and the Boolean attributes, as keyword arguments of `jaxsmw.refine`.
+
+        The levels of the refiner are an array, so stages with equally many levels share a compiled program.
+        """
+        refiner = self.refiner
         return {
-            "refiner": self.refiner,
+            "refiner": refiner.with_traced_levels() if isinstance(refiner, CoarseToFine) else refiner,
             "iterations": self.iterations,
             "starts_on_samples": self.starts_on_samples,
             "ends_on_samples": self.ends_on_samples,

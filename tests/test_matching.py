@@ -184,6 +184,17 @@ def test_no_program_of_a_stage_is_compiled_twice(pair, preset, compilations):
 
 
 @pytest.mark.slow
+def test_coarse_passes_share_one_program(pair, compilations):
+    """The levels are an argument of the program, so only their number and the largest level matter."""
+    accurate = PRESETS["accurate"]
+    always = replace(accurate, repair=replace(accurate.repair, non_isometric=0.0, coarse_from=0.0))
+    jax.clear_caches()
+    found = match(*pair[:2], preset=always, init="shot", mirror="no")
+    assert len(accurate.repair.coarse_levels) == 2
+    assert compilations.count("jit(refine)") == len(found.preset.stages) + 1
+
+
+@pytest.mark.slow
 def test_the_reverse_map_of_registration_compares_all_columns():
     """The search in patches, which large meshes use, also compares columns that are not eigenvectors."""
     creature = creature_pair(vertices=3100)

@@ -202,8 +202,9 @@ class RepairSettings:
       value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
       effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
       run (entry R24).
-    - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass. If
-      the refiner of the last stage has no levels, each coarse pass is the same as a usual pass.
+    - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass.
+      Tuples with the same length and the same maximum share a compiled program. If the refiner of the last
+      stage has no levels, each coarse pass is the same as a usual pass.
     - `rivals` (Table R36): the largest number of rivals. Rivals are the outcomes of the repair with the next
       best scores after the best outcome. If the best outcome still looks wrong, the passes also refine the
       rivals. The best outcome after the passes is chosen.
@@ -233,7 +234,7 @@ class RepairSettings:
     non_isometric: float = 0.14
     passes: int = 2
     coarse_from: float = 0.3
-    coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60))
+    coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
     rivals: int = 2
     aligned_preference: float = 0.9
     alternatives: AlternativeSettings = AlternativeSettings()

@@ -59,7 +59,7 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     `search` is unknown.
     """
 
-    levels: tuple[int, ...] = eqx.field(static=True, default=(), converter=_whole_numbers)
+    levels: tuple[int, ...] = eqx.field(default=(), converter=_whole_numbers)
     search: Search = eqx.field(static=True, default="auto")
 
     def __check_init__(self) -> None:
@@ -71,6 +71,13 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     def matches_samples_with_all(self) -> bool:
         """Always True, because `recover` matches samples of X with all vertices of Y."""
         return True
+
+    def with_traced_levels(self) -> CoarseToFine[PreparedT, StateT]:
+        """Return the refiner with an array of levels, which `jaxsmw.runtime.compilation.compiled` traces.
+
+        Refiners with the same number of levels then share a compiled program.
+        """
+        return eqx.tree_at(lambda refiner: refiner.levels, self, np.array(self.levels, np.int32))
 
     def active_eigenvectors(
         self, prepared: PreparedT, iteration: Int32[Array, ""]
@@ -85,10 +92,11 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
         sizes = prepared.spectrum_x.eigenvalues.shape[0], prepared.spectrum_y.eigenvalues.shape[0]
         largest = max(sizes)
 
+        levels = jnp.append(jnp.asarray(self.levels, jnp.int32), largest)
+        level = jnp.minimum(levels[jnp.minimum(iteration, len(self.levels))], largest)
+
         def active(size: int) -> Bool[Array, " k"]:
-            counts = [-(-min(level, largest) * size // largest) for level in (*self.levels, largest)]
-            level = jnp.asarray(np.array(counts, np.int32))[jnp.minimum(iteration, len(self.levels))]
-            return jnp.arange(size, dtype=jnp.int32) < level
+            return jnp.arange(size, dtype=jnp.int32) < -(-level * size // largest)
 
         return active(sizes[0]), active(sizes[1])
 
