@@ -353,7 +353,7 @@ class Correspondence:
         return self.preset.stages[-1].refiner, problem, self.refinement.state
 
     def _precision(self) -> AbstractContextManager[None]:
-        """Return a context manager in which JAX uses the float type with which the map was computed."""
+        """Return a context manager in which JAX uses the float type of the functional map."""
         return jax.enable_x64(self.functional_map.dtype == np.float64)
 
 

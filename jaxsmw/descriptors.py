@@ -22,9 +22,9 @@ from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
 from jaxsmw.pair import Pair
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
-# A mesh with more than `_COMPARED_FROM` vertices is reduced to about `_COMPARED` samples. Descriptors cannot
-# distinguish two vertices that are a few hundredths of the square root of the area apart. Therefore 10 000
-# samples are dense enough.
+# A mesh with more than `_COMPARED_FROM` vertices is reduced to about `_COMPARED` samples. Descriptors
+# cannot distinguish two vertices whose distance is below a few hundredths of the square root of the area.
+# Therefore 10 000 samples are dense enough.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
 # On meshes with at least `_FINE` vertices, a neighbourhood of the smaller radius contains at least about ten
 # vertices.
@@ -316,7 +316,7 @@ class PrincipalAxes(NamedTuple):
         **Arguments:**
 
         - `blocks`: pairs (rows, weights), which are arrays of shapes (n, c) and (n,). The weights of all
-          blocks together sum to 1. The iterable is read twice.
+          blocks together sum to 1. The function reads `blocks` twice.
         - `number`: the number d of axes.
         """
         mean = sum(weight @ values for values, weight in blocks)

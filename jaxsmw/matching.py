@@ -303,9 +303,8 @@ def _add_seconds(prepared: PreparedPair, seconds: dict[str, float]) -> None:
 def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
     """Compile the programs of all stages in the background.
 
-    Nothing is compiled for partial pairs, because their numbers of eigenvectors are not known yet. Nothing is
-    compiled either if a mesh has too few vertices for the eigenvectors of the preset, because
-    `paired_spectra` then raises an error.
+    Nothing is compiled for partial pairs, because their numbers of eigenvectors are not known yet. If a mesh
+    has too few vertices for the preset, nothing is compiled, because `paired_spectra` then raises an error.
     """
     if pair.partial or preset.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
         return []

@@ -21,10 +21,10 @@ logger = logging.getLogger("jaxsmw")
 # A preset uses at most one eigenvector per two vertices. With fewer vertices, a preset would use fewer than
 # two eigenvectors.
 _FEWEST_VERTICES = 4
-# The smallest allowed ratio of the smaller area to the larger area of a partial pair. A part with less than a
+# In a partial pair, the smaller area must be at least this share of the larger area. A part with less than a
 # thousandth of a body's area shows too little of the body's shape.
 _SMALLEST_PART = 1e-3
-# The smallest allowed ratio of the area of a closed full shape to the area of its part. The area of a body
+# The area of a closed full shape must be at least this share of the area of the part. The area of a body
 # changes by a few per cent between poses.
 _SMALLEST_FULL_SHAPE = 0.8
 
@@ -98,11 +98,11 @@ class Pair:
 
     @property
     def units_of_length(self) -> tuple[float, float]:
-        """The unit of length for X, in the coordinates of X, and the unit for Y, in the coordinates of Y.
+        """The units of length of X and of Y, two floats.
 
-        Each unit is a float. For two full shapes, the units are the square roots of the areas of X and of Y,
-        which compensates for a difference in size. For a partial pair, both units are the square root of the
-        larger area.
+        Each unit is in the coordinates of the mesh. For two full shapes, the units are the square roots of
+        the areas of X and of Y, which compensates for a difference in size. For a partial pair, both units
+        are the square root of the larger area.
         """
         root_x, root_y = self.mesh_x.area**0.5, self.mesh_y.area**0.5
         if not self.partial:

@@ -31,10 +31,10 @@ class Preset:
       None (the default) to run `stages` on meshes of any size.
 
     **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage has the
-    position `repair.stage`. `InputError` is also raised if one of three rules is broken. The last stage must
+    position `repair.stage`. `InputError` is also raised if one of these rules is broken. The last stage must
     not end on samples. If a stage ends on samples, the next stage must start on samples, and must not have
-    more samples. The stage that repair repeats must have levels, and must not have fewer samples than the
-    largest of `repair.fallback_levels`.
+    more samples. The stage that repair repeats must have levels. If this stage uses samples, the number of
+    samples must be at least the largest of `repair.fallback_levels`.
     """
 
     stages: tuple[Stage, ...]

@@ -187,9 +187,7 @@ class Stage:
         """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
 
         The two spectra of a partial pair end at a common limit. If the stage leaves out eigenvectors of a
-        partial pair, the limit is chosen again. The new limit is the largest remaining eigenvalue of X or of
-        Y, whichever is smaller. Eigenpairs with eigenvalues above this limit are removed
-        (`jaxsmw.pair.common_range`).
+        partial pair, `jaxsmw.pair.common_range` cuts both spectra at a new common limit.
 
         **Arguments:**
 

@@ -130,7 +130,10 @@ def medians(
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
-    """Return a table with each candidate's time in seconds, and its ratio to the time of candidate `of`."""
+    """Return a table with the time of each candidate in seconds.
+
+    The last column contains the time divided by the time of the candidate named `of`.
+    """
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 

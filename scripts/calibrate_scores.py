@@ -51,7 +51,7 @@ from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
-# A map is wrong if at least the share WRONG_SHARE of its errors exceeds WRONG_ERROR.
+# A map is wrong if its share of errors above WRONG_ERROR is at least WRONG_SHARE.
 WRONG_SHARE, WRONG_ERROR = 0.02, 0.25
 # The third table groups the maps by predicted probability. These numbers are the limits of the groups.
 PROBABILITIES = (0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 1)

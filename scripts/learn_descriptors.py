@@ -157,7 +157,7 @@ class DescriptorNetwork(eqx.Module):
     The spectrum of the shape must contain SHOT descriptors (`Spectrum.descriptors`). `described` computes
     such a spectrum.
 
-    **Raises:** `ValueError` if the spectrum has no descriptors, or descriptors of another dimension.
+    **Raises:** `ValueError` if the spectrum does not have `sizes.inputs` descriptors per vertex.
     """
 
     enter: eqx.nn.Linear

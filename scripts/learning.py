@@ -100,8 +100,8 @@ def root_mean_square(
 ) -> Float[Array, ""]:
     """Return the mean distance between the soft match of each point and its target position.
 
-    A soft match is a set of points with weights, which are the shares of the soft map. The distance of a soft
-    match is the weighted root mean square of the distances of these points.
+    A soft match is a set of points with weights, which are the shares of the soft map. The distance from
+    a soft match is the weighted root mean square of the distances from the points.
 
     **Arguments:**
 
@@ -347,7 +347,8 @@ def measure(
 def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
     """Return a Markdown table of the mean errors of the maps `names`.
 
-    Each map except the first also has its mean difference from the first map, with a confidence interval.
+    For every map except the first, the table also contains the mean difference from the error of the first
+    map, with a confidence interval.
     """
     rows = [["", "pairs", *names]]
     for data_set, pairs in measured.items():

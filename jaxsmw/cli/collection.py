@@ -394,10 +394,10 @@ def _provenance(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
 
 def _names(data: Mapping[str, MeshData]) -> list[str]:
-    """Return a unique name for each mesh. The name is the file name without suffix if possible.
+    """Return a unique name for each mesh: the file name without suffix, such as `cat` for `cat.ply`.
 
-    If two of these names are equal, dots in the file names are replaced by underscores instead. If two of the
-    resulting names are also equal, the complete file names are used.
+    If two names are equal, underscores replace the dots of all file names, as in `cat_ply`. If two of the new
+    names are also equal, the complete file names are used.
     """
     stems = [Path(name).stem for name in data]
     for names in (stems, [name.replace(".", "_") for name in data]):

@@ -84,8 +84,8 @@ def _wait_for_signal(reading: int) -> None:
         pass  # ignore other signals
     time.sleep(_PATIENCE)
     _end()
-    # If `_end` returns, the main thread is already ending the process. If the main thread is stuck, for
-    # example because nobody reads its message from a pipe, this thread ends the process.
+    # `_end` returns only if the main thread already runs `_end`. The main thread may be stuck, for example
+    # because nobody reads the message from a pipe. Therefore this thread ends the process after one second.
     time.sleep(1)
     _die()
 

@@ -81,7 +81,7 @@ def cycle_error(
     **Arguments:**
 
     - `first`, `second`, `third`: the maps i -> j, j -> k and k -> i, as 0-based vertices.
-    - `positions`: the positions of the vertices of shape i (i, 3), in units of the square root of the area.
+    - `positions`: the positions of the vertices of shape i, in units of the square root of the area.
     - `samples`: the samples (s,), vertices of shape i.
 
     **Returns:** The mean Euclidean distance, in the unit of `positions`. Distances above 0.5 count as 0.5.
@@ -98,8 +98,8 @@ def edge_errors(
 ) -> Float[Array, " e"]:
     """Estimate the error of each edge's map from the errors of cycles.
 
-    A cycle of three maps is consistent if all three maps are right. If two maps of a cycle are right, the
-    error of the cycle is therefore the error of the third map. Each iteration averages the errors of all
+    If all three maps of a cycle are right, the error of the cycle is small. If only two of the maps are
+    right, the error of the cycle is the error of the third map. Each iteration averages the errors of all
     cycles through an edge. The weight of a cycle decreases exponentially with the estimated errors of its two
     other edges (cycle-edge message passing; Lerman, Shi, "Robust group synchronization via cycle-edge message
     passing", Foundations of Computational Mathematics 2022). The function is traced JAX code.
@@ -114,7 +114,8 @@ def edge_errors(
     **Returns:** The estimated errors (e,), in the unit of `errors`. An edge without cycles keeps its prior.
     """
     number = prior.shape[0]
-    # Each cycle sends its error to each of its three edges. The two other edges determine the weight.
+    # Each edge receives the errors of its cycles. The weight of a cycle depends on the two other edges of the
+    # cycle.
     receiver = cycles.T.reshape(-1)
     others = jnp.concatenate([cycles[:, [1, 2]], cycles[:, [0, 2]], cycles[:, [0, 1]]])
     message = jnp.tile(errors, 3)

@@ -27,7 +27,7 @@ class ConsistentMaps:
     - `maps`: the map of each edge. An edge whose match failed has no map.
     - `settings`: the settings of the collection.
     - `network`: the shapes, the maps and their estimated errors.
-    - `template`: the number of the template.
+    - `template`: the index of the template in `shapes`.
     - `points`: for each shape, one `SurfacePoints` with an entry for each vertex of the template.
     - `cycle_errors`: the error of each triangle of edges (c,), in units of the square root of the area.
     """
@@ -55,7 +55,7 @@ class ConsistentMaps:
         - `shapes`: the N shapes.
         - `maps`: the map of each edge. The edges must connect all shapes.
         - `settings`: the settings of the collection.
-        - `template`: the number of the template. The default is the medoid.
+        - `template`: the index of the template in `shapes`. The default is `Network.medoid`.
         """
         meshes, units = [shape.mesh for shape in shapes], [shape.mesh.area**0.5 for shape in shapes]
         points = _both_directions(maps)
@@ -105,7 +105,7 @@ class ConsistentMaps:
         """Return each new map that agrees better with the consistent maps than the edge's old map.
 
         A new map is left out if its distortion exceeds the old distortion by more than the factor
-        `distortion_tolerance`. Such a map probably follows a wrong consistent map.
+        `distortion_tolerance`. Such a map probably started from a wrong consistent map.
 
         **Arguments:**
 

@@ -77,7 +77,7 @@ class EdgeTask:
 
     **Attributes:**
 
-    - `x`, `y`: the source X (m vertices) and the target Y, which have the same hand.
+    - `x`, `y`: the source X (m vertices) and the target Y.
     - `init`: the initial map X -> Y (m,), as 0-based vertices of Y; None for `"shot"`.
     - `aligned`: whether an edge without an initial map is also matched from `"aligned"`. The better map is
       kept; see `jaxsmw.match`.

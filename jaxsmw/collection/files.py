@@ -85,7 +85,7 @@ def write_registered(collection: Collection, template: MeshData, directory: Path
 
 
 def _write_mesh(path: Path, data: MeshData, *, told: bool) -> None:
-    """Write a mesh. Unless `told` is True, log what the file format cannot contain."""
+    """Write a mesh, and log the data that the file format cannot contain. If `told`, log nothing."""
     warnings = write_mesh_data(path, data)
     for warning in () if told else warnings:
         logger.warning("%s", warning)

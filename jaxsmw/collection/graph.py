@@ -111,8 +111,8 @@ def choose_edges(
     new = number - len(known)
     most = min(len(wanted), round(edges_per_shape * new)) if known else round(edges_per_shape * number)
     added: set[Edge] = set()
-    # The tree prefers edges that are already matched. Distances of zero would be missing edges in a sparse
-    # graph.
+    # The tree prefers edges that are already matched. All lengths are positive, because SciPy ignores edges
+    # of length zero.
     lengths = distances + 1e-6 * (1 + distances.max(initial=0))
     for edge in chosen:
         lengths[edge] *= 1e-6

@@ -48,9 +48,9 @@ def match_collection(
     """Match all shapes of a collection, such that the maps of all pairs agree.
 
     Only some pairs are matched, a few for each shape. These pairs are the edges of a graph, whose nodes are
-    the shapes. Cycles of the graph show which maps are wrong. The maps from a template to all shapes are the
-    robust means of the maps along all edges. If the map of an edge contradicts these means, the edge is
-    matched again from the map through the template.
+    the shapes. Cycles of the graph show which maps are wrong. One shape is the template. Each map
+    from the template to another shape is a robust mean of estimates from several edges. If the map of an edge
+    contradicts these means, the edge is matched again from the map through the template.
 
     **Arguments:**
 

@@ -37,13 +37,12 @@ class MatchedEdge:
       without unit. The distortion is 1 for isometries, larger for worse maps, and infinite if the match
       failed.
     - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The
-      penalty of a map grows with the distortion of the map (`CollectionSettings.distortion_weight`). The
-      prior is the expected error plus the penalty. The cycle error is the error that the cycles of the graph
-      show (`edge_errors`). The estimate is the penalty plus the larger of the cycle error and half of the
-      prior. The estimate is infinite if the match failed.
-    - `residual`: the mean distance between the map and the map through the template, at most 0.5; infinite if
-      the match failed. The mean is computed on the target and, for the reverse map, on the source; the larger
-      value is used.
+      estimate is `penalty + max(cycle_error, (expected_error + penalty) / 2)`. The penalty grows with the
+      distortion of the map (`CollectionSettings.distortion_weight`). The cycle error is estimated from the
+      cycles of the graph (`edge_errors`). The estimate is infinite if the match failed.
+    - `residual`: the mean distance between this map and the consistent map, which goes through the template.
+      The mean is at most 0.5. The mean is also computed for the reverse map, and the residual is the larger
+      mean. If the match failed, the residual is infinite.
     - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. `"replaced"` means that the first map
       contradicted the other maps. A second match, started from the consistent map, replaced the first map.
       `"contradicted"` means that the map contradicts the other maps and has little weight, or that the match

@@ -235,8 +235,8 @@ class ShapeModel:
     def _common_factor(self, mean: Float64[np.ndarray, "n 3"]) -> float:
         """Return the factor that `align` applies to shapes after their least-squares fit to the mean.
 
-        Every aligned shape A satisfies |A|² = factor * <A, mean>. The mean of all aligned shapes is `mean`.
-        Therefore the average of the equation over all shapes determines the factor.
+        Every aligned shape A satisfies |A|² = factor * <A, mean>. Averaged over all shapes, the left
+        side is |mean|² plus the variance, and the right side is factor * |mean|².
         """
         squared_mean = float(self.weights @ (mean**2).sum(axis=1))
         count = len(self.scores)
@@ -293,9 +293,9 @@ class ShapeModel:
         """Measure how much random shapes of the model resemble shapes of the collection.
 
         The scores of a random shape have a normal distribution with the variances of the modes (Davies 2002;
-        Styner et al. 2003). The distance of a random shape is the mean distance over the surface to the
-        nearest shape of the collection. The nearest shape has the smallest root-mean-square distance to the
-        random shape.
+        Styner et al. 2003). Each random shape is compared with one shape of the collection: the shape at the
+        smallest root-mean-square distance. The distance of the random shape is the mean distance over the
+        surface between both shapes.
 
         **Arguments:**
 

@@ -30,8 +30,9 @@ class SynchronizationSettings:
     - `iterations` (Table R26): the number of iterations. Each iteration averages the points on every shape.
     - `robust_scale` (Table R26): a distance from the mean. A point at this distance has half of the weight of
       a point at the mean. Points of wrong maps are much farther away.
-    - `discontinuity_distance`: if the matches of a triangle's corners are farther apart than this distance, a
-      point inside the triangle follows the match of the nearest corner instead of an average.
+    - `discontinuity_distance`: the largest distance at which the matches of a triangle's corners are
+      averaged. If the matches are farther apart, a point of the triangle follows the match of the nearest
+      corner.
 
     **Raises:** `InputError` if a setting is not valid.
     """
@@ -161,7 +162,9 @@ class Network:
         return int(np.argmin(dijkstra(self.lengths(), directed=False).sum(axis=1)))
 
     def along_best_paths(self, template: int) -> list[SurfacePoints]:
-        """Map the vertices of the template to all shapes, each along the path with the smallest error.
+        """Map the vertices of the template to all shapes along the best paths.
+
+        The best path to a shape has the smallest sum of errors.
 
         **Returns:** For each shape, one `SurfacePoints` with n entries, one for each vertex of the template.
 
@@ -232,10 +235,10 @@ class Network:
 def synchronize(network: Network, template: int) -> list[SurfacePoints]:
     """Compute the maps from the template to all shapes, such that they agree with the maps of all edges.
 
-    The first map to each shape follows the path from the template with the smallest sum of errors. In each
-    iteration, the points on the neighbours of a shape are carried to this shape, along the edges of the
-    graph. The points on this shape then move to the robust mean of the carried points. This is the
-    synchronisation of pointwise maps (Huang, Guibas 2013) by iterated averages on the surfaces.
+    The first maps follow the best paths from the template. The best path to a shape has the smallest sum of
+    errors. In each iteration, the points on the neighbours of a shape are carried to this shape, along the
+    edges of the graph. The points on this shape then move to the robust mean of the carried points. This is
+    the synchronisation of pointwise maps (Huang, Guibas 2013) by iterated averages on the surfaces.
 
     **Arguments:**
 

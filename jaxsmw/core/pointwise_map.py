@@ -147,8 +147,8 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
 
     **Returns:** A pair of `Patches`: the patches of X (the queries) and the patches of Y (the database). Each
     `Patches` contains three arrays for p patches of s vertices. `rows` (p, s) contains 0-based vertices, and
-    `mask` (p, s) is False for padding. `variations` (p, r, s) contains the coefficients of the main
-    directions of each patch, which speed up the search.
+    `mask` (p, s) is False for padding. `variations` (p, r, s) describes the directions along which
+    the points of each patch differ most.
     """
     n = spectrum_y.mask.shape[0]
     size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** 0.5)

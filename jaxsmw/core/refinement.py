@@ -122,15 +122,14 @@ def refine(
     If samples are given, only the first and the last step use all vertices. The first step computes a
     functional map from the initial map of all vertices. The last step recovers the refined map of all
     vertices. All steps in between use only the samples. The fast variant of the MWP authors' program also
-    iterates on samples. With `starts_on_samples` or `ends_on_samples`, the first or the last step also uses
-    only the samples. If one call ends on samples and the next call starts on the same samples, the two calls
-    save one search of all vertices.
+    iterates on samples. `starts_on_samples` restricts the first step to the samples, and `ends_on_samples`
+    restricts the last step to the samples. If one call ends on samples and the next call starts on the same
+    samples, the two calls save one search of all vertices.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices). Unless
-      `partial` is True, each shape should have area 1, as from `compute_spectrum`. Not all refiners scale the
-      shapes.
+      `partial` is True, each shape should have area 1, as from `compute_spectrum`.
     - `pointwise_map`: the initial map T, an integer array (m,). Entry i is the match of vertex i of X, as the
       index of a vertex of Y, from 0 to n - 1.
     - `refiner`: the method, a `Refiner`. The default is `WaveletPreservation()`, the method of the MWP paper.
@@ -155,9 +154,9 @@ def refine(
 
     **Raises:** `ValueError` if `iterations` is below 1, the initial map does not have shape (m,), `samples`
     is not a pair, or the two spectra have different float types. `ValueError` is also raised if
-    `starts_on_samples` or `ends_on_samples` is True without `samples`, or with a refiner that matches samples
-    of X only with samples of Y. `TypeError` if `iterations` or the entries of the initial map are not
-    integers, or if another argument has the wrong type.
+    `starts_on_samples` or `ends_on_samples` is True, but `samples` is None or
+    `refiner.matches_samples_with_all` is False. `TypeError` if `iterations` or the entries of the initial map
+    are not integers, or if another argument has the wrong type.
     """
     _check_arguments(spectrum_x, spectrum_y, pointwise_map, refiner, samples)
     check_samples_use(refiner, samples is not None, starts_on_samples, ends_on_samples)
@@ -305,7 +304,7 @@ class _Loop:
     ) -> tuple[Int32[Array, " s"], Float[Array, ""], Float[Array, ""]]:
         """Recover the pointwise map from a state.
 
-        Return the map, the share of matches that differ from the map `before`, and the objective.
+        Return the map, the share of changed matches, and the objective. `before` is the previous map.
         """
         after = self.refiner.recover(prepared, state)
         mask = prepared.spectrum_x.mask
@@ -374,8 +373,8 @@ def _check_arguments(
 def check_samples_use(refiner: Refiner, sampled: bool, starts: bool, ends: bool) -> None:
     """Check the arguments `starts_on_samples` and `ends_on_samples` of `refine`.
 
-    **Raises:** `ValueError` if one of them is True without samples, or with a refiner that matches samples of
-    X only with samples of Y.
+    **Raises:** `ValueError` if one of the two arguments is True, but there are no samples, or
+    `refiner.matches_samples_with_all` is False.
     """
     if not (starts or ends):
         return

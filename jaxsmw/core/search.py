@@ -269,11 +269,11 @@ def nearest_neighbor_in_patches(
     Each patch of the database has a bounding box with r axes through the centre of the patch. The box also
     has a radius: the largest distance from a point of the patch to the space that the axes span. The box
     gives a lower bound on the distances from a query to the points of the patch. Computing this bound takes
-    only r + 1 scalar products. For each query, the patch with the nearest box gives a first candidate. The
-    queries are divided into patches, too. For each patch of queries, the search skips the database patches
-    that cannot contain a nearer point for any of these queries. The bounds allow for rounding errors, so no
-    nearest point is skipped. If the points are spread evenly in all dimensions, the search skips no patch,
-    and `nearest_neighbor` is faster.
+    only r + 1 scalar products. For each query, the patch with the nearest box gives a first candidate. A
+    patch is too far away if the lower bound exceeds the distance to the first candidate. The queries are
+    divided into patches, too. For each patch of queries, the search skips the database patches that are too
+    far away from every query. The bounds allow for rounding errors, so no nearest point is skipped. If the
+    points are spread evenly in all dimensions, the search skips no patch, and `nearest_neighbor` is faster.
 
     **Arguments:**
 
@@ -417,7 +417,7 @@ def _bounds(
     norms = tables.center_norms[:, None] + jnp.sum(block**2, axis=1)[None, :]
     squared = norms - 2 * products[rank * patches :]
     along = []
-    for i in range(rank):  # XLA would not vectorise a sum over the axes.
+    for i in range(rank):  # A loop, because XLA does not vectorise a sum over the axes.
         along.append(products[i * patches : (i + 1) * patches] - tables.offsets[i, :, None])
         outside = along[i] - jnp.clip(along[i], tables.low[i], tables.high[i])
         squared = squared + (outside**2 - along[i] ** 2)

@@ -114,8 +114,8 @@ def run_benchmark(
     `Results.failures` contains the error message. No error is raised until `Results.check` is called.
 
     **Raises:** `InputError` if `output` contains damaged results, or results that were measured with other
-    data, settings or software versions; if another process is adding results to `output`; if a method
-    cannot match a pair; or if the file of an initial map or a published map is missing.
+    data, settings or software versions. `InputError` is also raised if another process is adding results to
+    `output`, if a method cannot match a pair, or if a file with a map is missing.
     """
     for method in methods.values():
         method.check(pairs)

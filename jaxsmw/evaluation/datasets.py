@@ -470,7 +470,7 @@ def _topology(directory: Path) -> _Pairs | None:
 
 
 def _identical(names: str) -> Callable[[Path], _Pairs | None]:
-    """Return a function for `_LAYOUTS` that opens data sets whose mesh names match the pattern `names`.
+    """Return a function that opens a data set if its mesh names match the pattern `names`.
 
     These data sets have no ground-truth files, because vertex i of one shape corresponds to vertex i of every
     other shape of its class.

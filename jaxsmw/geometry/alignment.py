@@ -16,8 +16,8 @@ _FIRST, _FURTHER = 10, 30
 _BEST = 5
 # The number of iterations with distances to tangent planes.
 _TO_PLANES = 10
-# The iterations with tangent planes must reduce the mean distance to less than this fraction. Otherwise the
-# result of these iterations is not used. (Entry R24)
+# The mean distance after the iterations with tangent planes, divided by the mean distance before, must be
+# below this number. Otherwise the result of these iterations is not used. (Entry R24)
 _MUCH_SMALLER = 0.5
 # The first iterations move at most this number of points of x.
 _MOVED_FIRST = 500

@@ -312,7 +312,7 @@ def _lanczos(
     than ARPACK's restarts.
 
     Blocks of b vectors find at most b copies of a multiple eigenvalue. If the result lacks some eigenvalues,
-    the method is repeated with larger blocks. Residuals are computed for the inverse. An eigenpair has
+    the method is repeated with larger blocks. An eigenpair of (W - shift A)^-1 A has
     converged when its relative residual is at most `tolerance`.
 
     **Raises:** `RuntimeError` if the method does not converge.
@@ -348,8 +348,8 @@ def _converged(
     vectors = np.empty((2 * k + 100 + size, n))
     # The first eigenvector is constant.
     vectors[0] = 1 / np.sqrt(mass.sum())
-    # The initial block is smoothed, because rounding errors in linear combinations of rough vectors would
-    # make the eigenvectors rough.
+    # The random initial block is smoothed. Otherwise, rounding errors would carry the roughness of
+    # the block into the eigenvectors.
     block = np.random.default_rng(0).standard_normal((size, n))
     for _ in range(2):
         block = images(block)
@@ -376,7 +376,8 @@ def _converged(
         # NumPy's `eigh` is used, because SciPy's `eigh` would hold Python's global lock.
         inverted, combinations = np.linalg.eigh(projected[1:end, 1:end])
         eigenvalues = shift + 1 / inverted
-        # Rounding errors can make very large eigenvalues negative, so negative eigenvalues are sorted last.
+        # Rounding errors can change the sign of a number near zero in `inverted`. A very large eigenvalue
+        # then becomes negative. Negative eigenvalues are therefore sorted last.
         wanted = np.argsort(np.where(eigenvalues > 0, eigenvalues, np.inf))[: k - 1]
         residuals = np.linalg.norm(left.T @ combinations[-size:, wanted], axis=0)
         if (residuals <= tolerance * np.abs(inverted[wanted])).all():
@@ -430,8 +431,8 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     accurate.
 
     **Raises:** `RuntimeError` if the subspace is too small, or if one more smoothing step would lower an
-    eigenvalue by more than 1.5 %. Missing eigenvalues are not detected, because counting eigenvalues requires
-    the factors of W - shift A.
+    eigenvalue by more than 1.5 %. Missing eigenvalues are not detected. Only the
+    expensive LU factors of W - shift A would reveal missing eigenvalues.
     """
     taken = k + max(10, k // 10)
     coarse = coarsen(stiffness, mass, _DIMENSIONS_OF_SUBSPACE * taken)
@@ -493,5 +494,5 @@ def _check(
         squares = np.sum(residuals**2 / areas[:, None], axis=0)
         # Unlike `max`, `np.maximum` returns NaN if one of the numbers is NaN.
         deviation, highest = np.maximum(deviation, np.abs(gram).max()), np.maximum(highest, squares.max())
-    # The divisor is at least 1, because all eigenvalues may be zero, for example if k = 1.
+    # The maximum with 1 avoids a division by zero, for example if k = 1.
     return float(np.sqrt(highest) / max(eigenvalues.max(), 1.0)), float(deviation)

@@ -52,9 +52,9 @@ class SurfacePoints:
     """Points on the faces of a mesh, given by barycentric weights.
 
     `len(points)` is the number p of points. `points[rows]` selects points by an array `rows` of 0-based
-    indices. The method `positions(mesh)` returns the positions (p, 3) of the points, and
-    `interpolate(values, mesh)` returns the values (p, x) of functions at the points, for values (n, x) at the
-    vertices. The method `nearest_corners(mesh)` returns for each point the nearest corner of its face, as
+    indices. The method `positions(mesh)` returns the positions (p, 3) of the points. The method
+    `interpolate(values, mesh)` receives values (n, x) at the vertices, and returns values (p, x) at the
+    points. The method `nearest_corners(mesh)` returns for each point the nearest corner of its face, as
     0-based vertex indices (p,). The constructor checks nothing. Functions that receive `SurfacePoints` check
     them.
 
@@ -118,7 +118,7 @@ def _sides(mesh: Mesh) -> _Sides:
     along = mesh.vertices[head] - mesh.vertices[tail]
     to_apex = mesh.vertices[apex] - mesh.vertices[tail]
     length = np.linalg.norm(along, axis=1)
-    # For sides of length zero, direction and shape are set to zero, because no line crosses such sides.
+    # For a side of length zero, `direction` and `shape` are zero. No line crosses such a side.
     direction = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0)
     x, y = np.sum(direction * to_apex, axis=1), np.linalg.norm(np.cross(direction, to_apex), axis=1)
     shape = np.divide(x + 1j * y, length, out=np.zeros(6 * f, complex), where=length > 0)
@@ -143,9 +143,9 @@ def _ranges(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
 class _Beams(NamedTuple):
     """Beams: cones of straight lines from a point through a strip of unfolded triangles.
 
-    The triangles are unfolded into the complex plane, and each beam starts at 0. `right` and `left` are the
-    ends of the side by which the beam enters or leaves a triangle. The lines of the beam have directions
-    between `rightmost` and `leftmost`.
+    The triangles are unfolded into the complex plane, and each beam starts at 0. The beam crosses the side
+    `side`, whose ends are `right` and `left`. The lines of the beam have directions between `rightmost` and
+    `leftmost`.
     """
 
     origin: Int64[np.ndarray, " b"]
@@ -186,8 +186,8 @@ def _unfold(
     - `depth`: the number of sides to cross.
 
     **Returns:** An iterator with `depth` pairs (beams, corners). The beams of pair i have crossed i + 1
-    sides. Each beam is then inside one triangle. For each beam, `corners` contains the position of the corner
-    of this triangle that is opposite the last crossed side.
+    sides. Each beam is then in a triangle. `corners` contains the position of one corner of the triangle: the
+    corner opposite the last crossed side.
     """
     right, left = -position * sides.length[side], (1 - position) * sides.length[side]
     beams = _Beams(origin, side, right, left, right, left)
@@ -547,7 +547,7 @@ def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> Surfac
 def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray, " p"]:
     """Check that values are indices (p,) from 0 to `count` - 1. Return them as int64.
 
-    `name` is the name of an index in error messages, in the singular, such as "vertex".
+    `name` is the text before the word "indices" in error messages, such as "vertex".
 
     **Raises:** `InputError` if the values are not a list of integers in this range, or if some values are
     masked.

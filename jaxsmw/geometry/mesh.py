@@ -57,8 +57,8 @@ class Mesh:
     - `name`: the name of the mesh in messages. The name of a mesh from a file is the file's path.
     - `notes`: a tuple of sentences about changes made by cleaning, and about unusual elements such as
       unreferenced vertices.
-    - `dropped_faces`: the faces of the file that cleaning dropped, as ascending 0-based indices (d,). Face
-      numbers in other files, such as ground-truth files, still count the dropped faces.
+    - `dropped_faces`: the faces of the file that cleaning dropped, as ascending 0-based indices (d,).
+      In ground-truth files, face numbers refer to all faces of the mesh file, including dropped faces.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -394,10 +394,11 @@ def make_mesh(
     Scans may contain vertices without a usable position, and small components such as dust. A vertex is lost
     if its position is not finite or is very far away. If at most one vertex in 1000 is lost, the faces of
     lost vertices are dropped. Each lost vertex is moved to the mean of its usable neighbours. A lost vertex
-    without usable neighbours is moved to the mean of all usable vertices. If more vertices are lost, they
-    stay, and the checks under "Raises" apply to them. If one component has at least half of the area, the
-    faces of components with less than 1 % of the area are dropped. Vertices that lose all their faces become
-    unreferenced, and receive the match of the nearest referenced vertex.
+    without usable neighbours is moved to the mean of all usable vertices. If more than one
+    vertex in 1000 is lost, no vertex is moved, and the checks under "Raises" apply to the lost vertices. If
+    one component has at least half of the area, the faces of components with less than 1 % of the area are
+    dropped. Vertices that lose all their faces become unreferenced, and receive the match of the nearest
+    referenced vertex.
 
     **Arguments:**
 
@@ -632,7 +633,7 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
 
 def first_equal_rows(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
     """For each row of an array (n, 3), return the index of the first equal row, as an array (n,)."""
-    order = np.lexsort(rows.T)  # a stable sort puts the first of equal rows first
+    order = np.lexsort(rows.T)  # a stable sort: equal rows keep their order
     sorted_rows = rows[order]
     starts = np.ones(len(rows), dtype=bool)
     starts[1:] = (sorted_rows[1:] != sorted_rows[:-1]).any(axis=1)

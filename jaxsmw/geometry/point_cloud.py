@@ -256,7 +256,7 @@ def _inside(
     of every outer tetrahedron is fixed at 1.
     """
     count = int((~tetrahedra.outer).sum())
-    unknown = np.full(len(tetrahedra.outer), count)  # outer tetrahedra share the label of index `count`
+    unknown = np.full(len(tetrahedra.outer), count)  # all outer tetrahedra have the index `count`
     unknown[~tetrahedra.outer] = np.arange(count)
     i, j = np.repeat(np.arange(len(unknown)), 4), tetrahedra.neighbors.ravel()
     i, j = i[once := i < j], j[once]

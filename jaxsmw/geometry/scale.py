@@ -53,7 +53,7 @@ class ScaleEstimate(NamedTuple):
 
     - `scale`: the factor by which lengths on X are multiplied to become lengths in the unit of Y, a float.
     - `support`: the mean number of other matches that confirm a match, a float without unit. Two matches
-      confirm each other if their ratio of distances agrees with the most frequent ratio.
+      confirm each other if the distance on X, times `scale`, is nearly the distance on Y.
     - `uncertain`: whether `support` is below `ScaleSettings.uncertain_below`, so that the scale can be wrong.
     """
 
@@ -72,9 +72,9 @@ def estimate_scale(
     The shape with the longer boundary, relative to the square root of its area, is taken as the partial
     shape. The function tests several ratios of the partial shape's area to the full shape's area (shares).
     Each share implies a common unit of length, in which SHOT has the same radius on both shapes. Samples with
-    mutually nearest descriptors are matched. The distance between two nearby samples, compared with the
-    distance between their matches, gives a ratio. The ratios of correct matches agree, and the ratios of
-    wrong matches are scattered. The most frequent ratio therefore shows how to correct the share. The
+    mutually nearest descriptors are matched. For two nearby samples, the distance between the matches is
+    divided by the distance between the samples. The ratios of correct matches agree, and the ratios of wrong
+    matches are scattered. The corrected share is the share times the square of the most frequent ratio. The
     function chooses the share with the largest support (see `ScaleEstimate`). The corrected share and the
     areas of both meshes give the scale. Pairs of samples are compared only if their normals agree (point pair
     features; Drost, Ulrich, Navab, Ilic, "Model globally, match locally", 2010).
@@ -109,7 +109,8 @@ def estimate_scale(
 
     with one_blas_thread():
         best = max(map(vote, settings.shares), key=lambda found: found.support)
-        # At the estimated share, both shapes have the same SHOT radius, so more descriptors match.
+        # The corrected share is tested too. SHOT then has the same radius on both shapes, so more
+        # descriptors match.
         best = max(best, vote(best.share), key=lambda found: found.support)
     if best.support == 0:
         raise InputError(
@@ -144,11 +145,11 @@ def relative_boundary(mesh: Mesh) -> float:
 
 
 def _describe(mesh: Mesh, share: float, settings: ScaleSettings) -> _Described:
-    """Describe a shape that covers the given share of the full shape's area."""
+    """Return samples with descriptors. `share` is the shape's area divided by the full shape's area."""
     unit = (mesh.area / share) ** 0.5
     samples = poisson_disk_samples(mesh, max(1, round(settings.samples * share)))
     with warnings.catch_warnings():
-        # SHOT warns if samples are sparse, but sparse samples only lower the support.
+        # SHOT's warning about sparse samples is ignored, because sparse samples only lower the support.
         warnings.simplefilter("ignore")
         shot = side_by_side(
             lambda radius: shot_descriptors(mesh, radius=radius * SHOT_RADIUS / share**0.5, samples=samples),
@@ -159,7 +160,7 @@ def _describe(mesh: Mesh, share: float, settings: ScaleSettings) -> _Described:
 
 
 def _vote(part: _Described, full: _Described, share: float, settings: ScaleSettings) -> _Vote:
-    """Correct a tested share by the most frequent ratio of distances, and compute its support."""
+    """Return the corrected share and the support for a tested share (see `estimate_scale`)."""
     rows, matches = _mutually_nearest(part.descriptors, full.descriptors)
     before, angles_before = _pair_features(part, rows)
     after, angles_after = _pair_features(full, matches)
@@ -169,8 +170,8 @@ def _vote(part: _Described, full: _Described, share: float, settings: ScaleSetti
     ratios = np.sort(np.log(after[compared] / before[compared]))
     if len(ratios) < _FEWEST:
         return _Vote(share, 0.0)
-    # Two ratios agree if their logarithms differ by at most the tolerance. The most frequent ratio is the
-    # ratio that agrees with the most other ratios. Ratios far from 1 belong to other shares and do not count.
+    # Two ratios agree if their logarithms differ by at most the tolerance. `counts` contains the number of
+    # ratios that agree with each ratio. The ratio with the largest count is called the most frequent ratio.
     tolerance = settings.tolerance
     counts = np.searchsorted(ratios, ratios + tolerance) - np.searchsorted(ratios, ratios - tolerance)
     counts = np.where(np.abs(ratios) < _FARTHEST, counts, 0)
@@ -194,15 +195,16 @@ def _pair_features(
 def _mutually_nearest(
     x: Float[np.ndarray, "s d"], y: Float[np.ndarray, "t d"]
 ) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, " p"]]:
-    """Return the rows of both arrays that are the nearest rows of each other."""
-    # Descriptors of one radius have the same length, so the nearest descriptor has the largest inner product.
+    """Return the rows of x and of y that are mutually nearest neighbours."""
+    # All SHOT descriptors have the same norm, so the nearest descriptor has the largest inner product.
     products = x @ y.T
     forward, backward = products.argmax(axis=1), products.argmax(axis=0)
     rows = np.flatnonzero(backward[forward] == np.arange(len(x)))
     return rows, forward[rows]
 
 
-# Ratios with a larger absolute logarithm are not counted, because the SHOT radii then differ too much.
+# The largest absolute logarithm of the most frequent ratio. At larger values, the tested share is so wrong
+# that the SHOT radii on the two shapes differ too much.
 _FARTHEST = 0.3
 # If fewer pairs than this number are compared, their ratios can agree by chance.
 _FEWEST = 30

@@ -13,8 +13,8 @@ _MOST_LOST = 1e-3
 # distances. It is also lost if its position is not finite. Some scans have coordinates of about 1e30, because
 # a program wrote uninitialised memory.
 _FAR = 100.0
-# A component is small if its share of the mesh's area is below _SMALL, and if the share of the largest
-# component is at least _LARGEST. In scans, small components are dust and enclosed bubbles.
+# A component is small if its share of the mesh's area is below _SMALL. If the share of the largest component
+# is below _LARGEST, no component is small. In scans, small components are dust and enclosed bubbles.
 _SMALL, _LARGEST = 0.01, 0.5
 
 

@@ -14,7 +14,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.runtime.cache import cached
 
-_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` requires 2 bins of elevation and distance
+_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` assumes `_ELEVATION == _RADIAL == 2`
 SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
@@ -58,8 +58,8 @@ def shot_descriptors(
       samples are given, descriptors are computed only at the samples, and only samples are used as
       neighbours. The normal of a sample is the mean normal of the vertices nearest to the sample. Without
       samples, the time grows with the square of the number of vertices.
-    - `required`: if True, messages about coarse meshes advise only a finer mesh. If False (the default), they
-      also advise how to match without SHOT.
+    - `required`: whether the caller needs SHOT. If False (the default), messages about coarse meshes also
+      explain how to match without SHOT.
 
     **Returns:** Dimensionless descriptors as float32: one row per vertex (n, 352), or one row per sample (s,
     352) if samples are given. The row is zero for unreferenced vertices and for vertices with fewer than 3
@@ -166,8 +166,9 @@ def _describe(
     bin_of_cosine = (1 + np.clip(cosine, -1, 1)) * ((_COSINE - 1) / 2)
 
     # A pair contributes to two bins each of azimuth, elevation, distance and cosine. Elevation and distance
-    # have only two bins, so every pair has weights for all four combinations. The bins of azimuth and cosine
-    # determine the row of `histogram`. The four combinations of elevation and distance are its columns.
+    # have only two bins, so every pair has weights for all four combinations. Each row of `histogram`
+    # is one bin of azimuth and cosine at one vertex. The columns of `histogram` are the four combinations of
+    # elevation and distance.
     upper, outer = np.clip(elevation, 0, 1), np.clip(shell, 0, 1)
     shares = np.empty((len(center), _ELEVATION * _RADIAL))
     for low, of_elevation in enumerate((1 - upper, upper)):

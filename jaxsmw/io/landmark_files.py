@@ -45,7 +45,7 @@ _LARGEST, _LARGEST_JSON = 2**27, 2**25
 
 
 def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
-    """Read the landmarks of one mesh: named points, as a program for placing landmarks saves them.
+    """Read the landmarks of one mesh from a file.
 
     The file is text in UTF-8. If a landmark has no name, its 1-based number in the file becomes its name.
 
@@ -127,8 +127,7 @@ def check_readable_suffix(path: str | os.PathLike[str]) -> str:
 def check_known_system(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
     """Check that landmarks have a coordinate system if they are to be written to a file of 3D Slicer.
 
-    **Raises:** `InputError` if files with the suffix state a coordinate system, but `landmarks.coordinates`
-    is None.
+    **Raises:** `InputError` if the suffix is `.mrk.json` or `.fcsv`, and `landmarks.coordinates` is None.
     """
     suffix = check_landmark_suffix(path)
     if landmarks.coordinates is None and suffix in _WITH_SYSTEM:

@@ -1,7 +1,6 @@
 """Parsers and writers of landmarks in tables: `.csv` and `.txt` files, and the `.fcsv` files of 3D Slicer.
 
-The module `csv` splits the lines into cells, because its error messages are specific and it does not guess
-the types of cells.
+Python's module `csv` splits the lines into cells, and leaves every cell as text.
 """
 
 from __future__ import annotations

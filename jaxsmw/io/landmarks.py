@@ -209,8 +209,7 @@ class FrameDistances(NamedTuple):
     **Attributes:**
 
     - `as_read`: the mean distance from the landmarks to the surface, a float.
-    - `flipped`: the mean distance after a change between LPS and RAS, which reverses the signs of x and y, a
-      float.
+    - `flipped`: the mean distance from the flipped landmarks (`Landmarks.flipped`) to the surface, a float.
     """
 
     as_read: float
@@ -218,7 +217,7 @@ class FrameDistances(NamedTuple):
 
 
 def find_frame(landmarks: Landmarks, mesh: Mesh) -> FrameDistances:
-    """Measure how far landmarks are from a surface, as they are and with reversed signs of x and y.
+    """Measure how far landmarks are from a surface, with and without reversed signs of x and y.
 
     A change between the coordinate systems LPS and RAS reverses these signs.
 

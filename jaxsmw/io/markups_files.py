@@ -80,7 +80,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _single_list(document: Any) -> dict[str, Any]:
-    """Return the only element of `markups`, which must be a list of points."""
+    """Check that a file contains one markup, and that the markup is a point list. Return the markup."""
     markups = document.get("markups") if isinstance(document, dict) else None
     if not isinstance(markups, list) or not all(isinstance(markup, dict) for markup in markups):
         raise InputError("is not a Markups file of 3D Slicer: export a point list as .mrk.json.")

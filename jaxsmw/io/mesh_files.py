@@ -31,8 +31,8 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
         - `.ply`: a text file, or a binary file in either byte order.
         - `.stl`: a text file or a binary file.
         - `.mat`: a file with a struct, such as `surface` in the TOSCA data set. The struct has the
-          coordinates X, Y and Z (or a matrix VERT) and the 1-based faces TRIV. It may be a field of another
-          struct, as in the files of `write_spectrum`.
+          coordinates X, Y and Z (or a matrix VERT) and the 1-based faces TRIV. The struct may be nested in
+          another struct, as in the files of `write_spectrum`.
         - `.vtk`, `.vtp`: a VTK file of polygons, text or binary.
         - `.gltf`, `.glb`: a glTF 2.0 file. Such a file duplicates vertices along texture seams, so vertices
           at exactly the same position are always welded.
@@ -63,9 +63,9 @@ def write_mesh(
 ) -> tuple[str, ...]:
     """Write a mesh to a file in one of the formats of `write_mesh_data`.
 
-    OFF files are text, and PLY files are binary and little endian. `read_mesh` reads the same faces and
-    exactly the same vertex positions from the file. glTF and STL files are exceptions, because their
-    positions are float32. The write is atomic: an incomplete file never appears at `path`.
+    OFF files are text, and PLY files are binary and little endian. `read_mesh` restores the faces and
+    the exact vertex positions. glTF and STL files are exceptions, because their positions are float32. The
+    write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 

@@ -29,8 +29,9 @@ def expected_error(
     """Estimate the geodesic error of every match without ground truth.
 
     The estimate is a weighted sum of two quantities, averaged over the neighbourhood of each vertex of X. The
-    first quantity is the detour: the distance from a vertex to its image under the map and then the reverse
-    map. The second quantity is the mean change in length of a vertex's edges under the map.
+    first quantity is the detour: the distance from a vertex to its image after a round trip via Y. The round
+    trip consists of the map and the reverse map. The second quantity is the mean change in length of a
+    vertex's edges under the map.
 
     Maps between non-isometric shapes can be smooth and wrong everywhere. For two full shapes, the weighted
     sum is therefore multiplied by a factor that grows with the `area_shape_difference` of the map.

@@ -94,9 +94,9 @@ def deformation(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"], radius: floa
     that remains, divided by the size of the patch. The size is the variance of the patch's positions plus the
     variance of its matches. The deformation is the mean residual of all patches.
 
-    A map that bends a body at its joints deforms most patches little. Upside-down maps and mirrored maps
-    deform most patches, because rotations contain no reflection. Such energies are called
-    "as-rigid-as-possible" (Sorkine, Alexa 2007).
+    A map that bends a body at its joints deforms most patches little. A mirrored map deforms most patches,
+    because no rotation undoes a reflection. Upside-down maps also deform most patches. The deformation is an
+    "as-rigid-as-possible" energy (Sorkine, Alexa 2007).
 
     **Arguments:**
 

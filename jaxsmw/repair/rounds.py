@@ -42,16 +42,17 @@ def refine_in_stages(
        these maps, at most `finalists`, are then refined by the repeated stage and all later stages. The
        outcome with the best score is kept, which can also be the outcome of the original initial map. If the
        kept outcome looks right, repair ends.
-    2. Rounds: each round runs the repeated stage and all later stages again. The first functional map of the
-       repeated stage is computed without the vertices that have a fault in the previous map. If a map has
-       both orientation reversal and discontinuities, each round leaves out the vertices of only one of these
-       faults, and successive rounds alternate. The outcome of step 1 with the second-best score is also
-       repaired by rounds and by the fallback if it has faults. It is used if all its faults disappear and its
-       score is the best.
+    2. Rounds: each round runs the repeated stage and all later stages again. Each round repairs one kind of
+       fault of the previous map, orientation reversal or discontinuities. The first functional map of the
+       repeated stage is computed without the vertices that have this fault. If a map has both kinds of fault,
+       the rounds alternate between the two kinds.
     3. Fallback: the repeated stage and all later stages run once more, from the best outcome of the rounds.
        The repeated stage then uses the numbers of eigenvectors in `fallback_levels`. The map of the fallback
        is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
        worse by less than `score_tolerance`. In all other cases, the best map of the rounds is kept.
+
+    If the second-best outcome of step 1 has faults, steps 2 and 3 also repair this outcome. The repaired
+    outcome is used if it has no faults and the best score.
 
     Maps between non-isometric shapes need further passes; see `refine_further`.
 
@@ -117,9 +118,8 @@ def refine_further(
     - `outcome`: an outcome of `refine_in_stages`.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
-    **Returns:** The `Outcome` with the best score. It is suspicious if and only if the given outcome is
-    suspicious. The given outcome is returned if `repair` is None, if no passes are needed, or if the given
-    outcome or all passes failed.
+    **Returns:** The `Outcome` with the best score. The attribute `suspicious` is copied from the given
+    outcome. If no pass runs or all passes fail, the given outcome is returned.
     """
     if repair is None or not outcome.successful:
         return outcome

@@ -127,11 +127,11 @@ class AlternativeSettings:
       is refined again without the faulty vertices.
     - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
     - `patch_radius` (Table R28): the radius of the patches on which the deformation is measured.
-    - `different_areas` (Table R27): a tuple of shares of X's area, each above 0. The second alternative map
-      must differ from the first map on at least the first share. Each further map must differ from all maps
-      before it on at least the next share. The last share also applies to all remaining maps.
-    - `margin` (Table R28): the largest difference of scores between the best map and a returned map. If a
-      wrong map has the best score, the score of the right map is worse by less than this margin.
+    - `different_areas` (Table R27): a tuple of shares of X's area, each above 0. An alternative map must
+      differ from all earlier alternative maps on a minimum share. The entries of the tuple are the minimum
+      shares for the second map, the third map, and so on. The last entry also applies to all further maps.
+    - `margin` (Table R28): the largest difference of scores between the best map and a returned map. Several
+      maps are returned, because a wrong map can have the best score.
     """
 
     samples: int = 1000

@@ -101,7 +101,7 @@ def encode_shape(mesh: Mesh, standing: Mesh) -> dict[str, Any]:
     **Arguments:**
 
     - `mesh`: the mesh in the coordinates of its file.
-    - `standing`: the same mesh as the page shows it; a result of `jaxsmw.report.standing.stand_pair`.
+    - `standing`: the mesh in the coordinates of the page; a result of `jaxsmw.report.standing.stand_pair`.
     """
     matrix, offset = placement(mesh, standing)
     return encode_mesh(standing) | {

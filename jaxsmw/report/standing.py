@@ -36,8 +36,8 @@ _SLENDER = 0.45
 # bodies that sit or leap, a wrong axis scores up to 0.09 higher than the correct axis.
 _HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
 _STABILITY_WEIGHT = 0.25
-# Stability is clipped to this range, in units of the square root of the area. Differences outside of the
-# range do not indicate which axis is correct.
+# Stability is clipped to this range, in units of the square root of the area. Outside of the range, stability
+# does not show which axis is correct.
 _STABILITY_RANGE = (-0.2, 0.1)
 # A point is treated as touching the ground if its height above the lowest point is at most this share of the
 # body's height.
@@ -130,8 +130,7 @@ def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], F
     """
     used = mesh.referenced_vertices
     scale = np.sqrt(mesh.area / standing.area)
-    # `stand` turns every mesh by one of these rotations. Only the rotation that `stand` applied gives the
-    # same offset at all vertices.
+    # `stand` applied one of these rotations. For this rotation, the offset is the same at all vertices.
     matrices = [scale * np.array(rows, dtype=float) for rows in _STAND.values()]
     offsets = [mesh.vertices[used] - standing.vertices[used] @ matrix for matrix in matrices]
     best = min(range(len(matrices)), key=lambda i: float(np.ptp(offsets[i], axis=0).max()))

@@ -26,8 +26,7 @@ def largest_contents(size_of_file: int) -> int:
     A limit is necessary because a malicious file can unpack to a thousand times its size. Contents of up to 1
     GiB are always accepted, because a mesh of ten million vertices has this size. Only files of eigenvectors
     are expected to unpack to more than 1 GiB. A compressed file of eigenvectors is hardly smaller than its
-    contents. Contents above 1 GiB are therefore accepted only up to four times the size of the compressed
-    file.
+    contents. Contents of more than 1 GiB may therefore be at most four times as large as the compressed file.
 
     `size_of_file` is the size of the compressed file, in bytes.
     """

@@ -116,7 +116,7 @@ class Journal:
         self._remember({name: str(value) for name, value in row.items()} for row in rows)
 
     def sort(self, keys: Iterable[Sequence[Any]]) -> None:
-        """Rewrite the file with the rows of `keys` only, in the order of `keys`.
+        """Sort the rows of the file in the order of `keys`, and remove all other rows.
 
         Before this call the order of rows is arbitrary, because workers finish tasks in an arbitrary order.
 

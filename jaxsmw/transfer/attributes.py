@@ -1,4 +1,4 @@
-"""Transfer of the data on the source to the target, and to the registered mesh."""
+"""Transfer of data from the source to the target or to the registered mesh."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from jaxsmw.transfer.registered_mesh import RegisteredMesh
 from jaxsmw.transfer.textures import transfer_texture
 from jaxsmw.wording import count_of
 
-# A vertex of the target is far from the registered mesh if its distance exceeds this number times the square
-# root of the target's area. The vertex then probably belongs to a part that the source lacks.
+# A vertex of the target is far from the registered mesh above this distance. The unit of the distance is the
+# square root of the target's area. A far vertex probably belongs to a part that the source lacks.
 _FAR = 0.03
 # The data of a target face are computed from the data at four points of the face. One point is the centroid
 # of the face. Each other point is the centroid of a triangle between a corner and the midpoints of the two
@@ -53,17 +53,17 @@ def transfer_attributes(
     - Floats and colours are interpolated. If the vertex with the largest weight has a value that is not
       finite, this value is the result. Otherwise, values that are not finite are left out. Components of
       vectors are interpolated without a rotation.
-    - Integers, such as labels, are never averaged. The value of a vertex is decided by a vote: each corner of
-      the nearest face votes with its barycentric weight. The value of a face is decided by a vote of its four
-      points. A row of several integers is one label. Labels are not smoothed, so a region that is thinner
+    - Integers, such as labels, are never averaged. The value with the most votes is chosen. For a vertex,
+      each corner of the nearest face votes with its barycentric weight. For a face, each of the four points
+      votes. A row of several integers is one label. Labels are not smoothed, so a region that is thinner
       than a face of Y may break up into single faces.
     - Texture coordinates jump at the seams of X. All corners of a face of Y therefore receive coordinates
       from the same side of a seam: the side on which the face's centroid lies. Along seams, vertices of Y
       have several texture vertices. If the nearest face of X has no texture, the face of Y has no texture
       either.
-    - Skin weights are interpolated. A vertex of Y has at most as many joints as the vertex of X with the most
-      joints. The smallest weights are left out. The weights of a vertex sum to 1, unless all weights of the
-      nearest face are 0.
+    - Skin weights are interpolated. Let k be the largest number of joints at a vertex of X. Each vertex of Y
+      keeps only the k largest weights. The weights of a vertex sum to 1, unless all weights of the nearest
+      face are 0.
     - Blend shapes are displacements of the vertices of X. Each displacement is first rotated and scaled in
       the same way as the neighbourhood of its vertex (`RegisteredMesh.similarities`). The results are then
       interpolated.
@@ -76,13 +76,13 @@ def transfer_attributes(
 
     - `data`: the `MeshData` of X. Its `mesh` is `registered.mesh_x`.
     - `registered`: the `RegisteredMesh` of X on Y.
-    - `target`: a `MeshData` with the mesh `registered.mesh_y`, or this mesh itself. None (the default) stands
-      for this mesh.
+    - `target`: the mesh `registered.mesh_y`, or a `MeshData` that contains `registered.mesh_y`. None (the
+      default) has the same effect as `registered.mesh_y`.
 
     **Returns:** The `MeshData` of Y with the vertices and faces of `target`, in the unit of Y. The notes in
     `mesh.notes` name the data of Y that were replaced. The notes also count the vertices of Y whose distance
-    to the registered mesh is above 3 % of the square root of Y's area. These vertices receive the values at
-    the nearest point, too.
+    to the registered mesh is above 3 % of the square root of Y's area. These vertices receive values in the
+    same way as all other vertices.
 
     **Raises:** `InputError` if `data` or `target` do not belong to the registered meshes.
     """

@@ -23,7 +23,8 @@ class Attraction(NamedTuple):
 
     **Attributes:**
 
-    - `interpolation`: the barycentric weights of the points at the vertices of the source, a matrix (c, m).
+    - `interpolation`: a matrix (c, m) of barycentric weights. Multiplied by the vertex positions of the
+      source, the matrix gives the positions of the points.
     - `weights`: the weights of the vertices of the target (c,).
     - `positions`: the positions of the vertices of the target (c, 3).
     """
@@ -67,8 +68,8 @@ class UncoveredVertices:
     ) -> Attraction | None:
         """Return the uncovered vertices of Y, each with the point of the deformed X that it attracts.
 
-        The first call finds the vertices of Y that are already close to X, within half of the distance
-        `_UNCOVERED`. No call returns these vertices.
+        The first call excludes all vertices of Y whose distance from X is at most half of `_UNCOVERED`. Later
+        calls exclude the same vertices.
 
         **Arguments:**
 

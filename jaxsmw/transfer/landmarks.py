@@ -54,11 +54,11 @@ def transfer_landmarks(
       see `Correspondence.expected_error`. If given, the result contains the expected error of each landmark
       (`expected_errors`). The positions do not depend on this argument.
 
-    **Returns:** `TransferredLandmarks`. Its attribute `landmarks` contains the positions (l, 3) on Y, and
-    keeps the coordinate system and the unit that the given landmarks state. Both meshes should therefore have
-    this coordinate system and this unit. The attribute `source_distances` (l,) contains the distances of the
-    landmarks to X, in the unit of X. The attribute `expected_errors` (l,) is in the unit of Y; it is None if
-    `expected_error` is None.
+    **Returns:** `TransferredLandmarks`. Its attribute `landmarks` contains the positions (l, 3) on Y. The
+    names of the coordinate system and of the unit are copied from the given landmarks. The copied names are
+    correct only if X and Y have the same coordinate system and the same unit. The attribute
+    `source_distances` (l,) contains the distances of the landmarks to X, in the unit of X. The attribute
+    `expected_errors` (l,) is in the unit of Y; it is None if `expected_error` is None.
 
     **Raises:** `InputError` if `expected_error` does not contain one number for each vertex of X.
     `InputError` is also raised if `jaxsmw.io.check_frame` finds that the landmarks are too far from the

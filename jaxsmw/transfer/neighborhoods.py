@@ -14,8 +14,8 @@ from scipy.sparse import csr_array, diags_array
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.rotations import nearest_rotations
 
-# `similarities` averages its moments over neighbouring vertices _AVERAGINGS times. More averagings enlarge
-# the neighbourhood of each vertex. With fewer averagings, the similarity transformations follow the noise of
+# Values at vertices are averaged over neighbouring vertices _AVERAGINGS times. More averagings enlarge the
+# neighbourhood of each vertex. With fewer averagings, the similarity transformations follow the noise of
 # the map. (Entry R22 of docs/research_log.md)
 _AVERAGINGS = 8
 # Cotangent weights of very obtuse triangles are negative, and those of slivers are huge. Weights are limited
@@ -100,7 +100,7 @@ class Neighborhoods:
 
     @cached_property
     def squared_lengths(self) -> Float64[np.ndarray, " n"]:
-        """The weighted sum of the squared edge lengths at each vertex, averaged over its neighbourhood."""
+        """The weighted sums of squared edge lengths at the vertices, averaged over neighbourhoods."""
         of_edges = self.weights * (self.vectors**2).sum(axis=1)
         return self._averaged(self._matrix(of_edges, of_edges).sum(axis=1))
 

@@ -38,9 +38,9 @@ class _Round(NamedTuple):
     - `factor`: the factor by which weights at flipped faces and at their neighbours are multiplied.
     - `neighbors`: the largest distance to these neighbours, in edges.
     - `pull`: if positive, vertices with reduced weights are pulled to the target. The function `_halfway`
-      computes the goals of these vertices. The weight of a goal is `pull` times the usual weight of the map.
+      computes the goals of these vertices. At first, the weight of a goal is `pull` times the vertex area.
     - `cover`: if positive, the round draws the source to vertices of the target that the source does not
-      reach. The weight of such a vertex is `cover` times the usual weight of the map.
+      reach. At first, the weight of such a vertex is `cover` times the vertex area.
     """
 
     deformations: int
@@ -51,7 +51,8 @@ class _Round(NamedTuple):
 
 
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
-# target. The last round covers the target, and removes folds that come back. (Entries R22 and R37)
+# target. The last round draws the source to uncovered vertices of the target, and removes new folds.
+# (Entries R22 and R37)
 _ROUNDS = (
     _Round(5, 0.2, 1),
     _Round(5, 0.4, 2),
@@ -64,7 +65,7 @@ _MANY_FLIPPED, _MANY_DEGREES = 0.003, 16.0
 # The linear solver stops when the norm of the residual is at most this fraction of the norm of the right-hand
 # side.
 _TOLERANCE = 1e-5
-# A deformation keeps positions whose errors are at most this fraction of the stiffness. (Entry R22)
+# Vertices are not moved if their errors are below this fraction of the stiffness. (Entry R22)
 _KEPT = 0.03
 
 
@@ -391,10 +392,9 @@ def _follow(
     if attraction is not None:
         system, right = system + attraction.matrix(), right + attraction.right_side()
     residual = right - system @ positions
-    # Without an attraction, the row sums of the system are `weights`, and all entries off the diagonal are
-    # negative. If the residual of each vertex is divided by its weight, the largest quotient bounds the
-    # errors of all positions. This criterion stays correct where small weights make the system
-    # ill-conditioned.
+    # Let r be the largest ratio of a vertex's residual to the vertex's weight. Without an attraction, the
+    # system is an M-matrix with the row sums `weights`, so no position has an error above r. The bound is
+    # also valid if small weights make the system ill-conditioned.
     moving = (np.abs(residual).max(axis=1) > _KEPT * stiffness * weights).astype(float)
     rows = np.flatnonzero(around.averaging @ moving)
     if not len(rows):
@@ -421,7 +421,7 @@ def _follow(
 def _halfway(
     nearest: SurfacePoints, mapped: Float64[np.ndarray, "p 3"], mesh_y: Mesh
 ) -> Float64[np.ndarray, "p 3"]:
-    """Move each point of Y halfway to a given position, in the plane of the point's triangle.
+    """Move each point of Y halfway towards a given position. The point stays in the plane of its triangle.
 
     Vertices that are pulled to the nearest points of Y can slide along the surface, away from the points of
     the map. The halfway points hold the vertices back.

@@ -28,8 +28,8 @@ def transfer_texture(
     """Transfer texture coordinates from X to Y.
 
     The registered mesh is cut along the seams of the texture. The centroid of each face of Y lies on one side
-    of a seam. Each corner of the face receives the texture coordinates at its nearest point on the same side
-    as the centroid. Seams inside one chart, such as the seam of a cylinder, are also respected.
+    of a seam. Each corner of the face receives the texture coordinates of the nearest point on this side.
+    Seams inside one chart, such as the seam of a cylinder, are also respected.
 
     **Arguments:**
 
@@ -85,7 +85,7 @@ def _best_of_sides(
 ) -> Int64[np.ndarray, " c"]:
     """Group the corners by vertex and by side of the seams, and choose one corner of each group.
 
-    The chosen corner is the corner whose walk ended nearest to the vertex. The result (c,) contains the
+    In each group, the corner with the smallest value in `lengths` is chosen. The result (c,) contains the
     chosen corner for each of the c = 3 f corners.
     """
     tail, head = np.arange(3 * len(faces)), np.roll(np.arange(3 * len(faces)).reshape(-1, 3), -1, 1).ravel()
@@ -97,7 +97,7 @@ def _best_of_sides(
     same = (vertex[tail[1:]] == vertex[tail[:-1]]) & (vertex[head[1:]] == vertex[head[:-1]])
     same &= near[tail[1:] // 3] | near[tail[:-1] // 3]
     sides = np.flatnonzero(same)
-    # Two faces with a common edge are on the same side if a walk from one arrives at the other.
+    # Two faces with a common edge are on the same side if no seam stops a walk between the two faces.
     centroids, before, after = positions.mean(axis=1), tail[sides] // 3, tail[sides + 1] // 3
     _, _, reached = surface.walk(centroids[after], start[before])
     _, nearest = nearest_points_of_triangles(centroids[after], surface.triangles[start[after]])
@@ -138,9 +138,9 @@ class _CutSurface:
     ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
         """Walk from triangles towards goals without crossing a seam.
 
-        Each step leads to the neighbour nearest to the goal. Return the last triangle (p,), the barycentric
-        weights of this triangle's point nearest to the goal (p, 3), and the distance of this point from the
-        goal (p,).
+        Each step leads to the neighbour nearest to the goal. Return the last triangle (p,). Also return
+        the point of this triangle that is nearest to the goal, as barycentric weights (p, 3), and the
+        distance from this point to the goal (p,).
         """
         found, weights, distances = start.copy(), np.empty((len(goals), 3)), np.empty(len(goals))
         for first in range(0, len(goals), _BLOCK):
@@ -161,8 +161,8 @@ class _CutSurface:
     ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
         """Return, for each goal and its triangle, the neighbouring triangle that is nearest to the goal.
 
-        Also return the barycentric weights of the neighbour's point nearest to the goal, and the distance of
-        this point from the goal.
+        Also return the point of this neighbour that is nearest to the goal, as barycentric weights, and the
+        distance from this point to the goal.
         """
         indptr = self.neighbors.indptr.astype(np.int64)
         first, counts = indptr[triangles], indptr[triangles + 1] - indptr[triangles]
@@ -179,7 +179,10 @@ def _near_seams(
     cut: Int64[np.ndarray, "g 3"],
     faces: Int64[np.ndarray, "f 3"],
 ) -> Bool[np.ndarray, " f"]:
-    """Return True for faces of Y that a seam, or the edge of the textured part of X, may cross."""
+    """Return True for faces of Y that a seam may cross.
+
+    The edge of the textured part of X counts as a seam.
+    """
     mesh, vertices = registered.mesh, registered.mesh_y.vertices
     pairs = np.unique(np.column_stack([mesh.faces.ravel(), cut.ravel()]), axis=0)
     several = np.bincount(pairs[:, 0], minlength=len(mesh.vertices)) > 1

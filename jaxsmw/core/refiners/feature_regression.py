@@ -254,9 +254,7 @@ class Regression(CoarseToFineState):
     def uncertainty(self) -> Float[Array, ""]:
         """The mean logarithm of the standard deviation of the residuals; lower is better.
 
-        The mean is taken over the principal components of the residuals of both predictions. The uncertainty
-        is half the sum of the log-determinants of both residual covariances, divided by the number of
-        features of X plus the number of features of Y.
+        The mean is taken over the principal components of the residuals of both predictions.
         """
         features = self.forward.queries.shape[-1] + self.backward.queries.shape[-1]
         return (self.forward.uncertainty + self.backward.uncertainty) / features

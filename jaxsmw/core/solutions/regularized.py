@@ -47,7 +47,8 @@ class RegularizedLeastSquares(Solution[None]):
     - Wavelet preservation is the energy of equation (5) of the MWP paper.
     - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrix Lambda_out contains
       the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains the eigenvalues of
-      the shape that C maps from. Both matrices are divided by the largest eigenvalue of both shapes.
+      the shape that C maps from. Both matrices are divided by the same number, the largest eigenvalue in the
+      two matrices.
     - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This is the
       only term that is not quadratic in C.
     - Descriptor preservation is `||C F_in - F_out||²`, where F_in and F_out contain the coefficients of the

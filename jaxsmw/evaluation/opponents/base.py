@@ -45,9 +45,8 @@ class MethodInput:
       attribute `both_directions` is True need this map.
     - `meshes`: the meshes of X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
-    - `partial`: whether X and Y are a partial pair, that is, one shape is a part of the other shape. Each
-      spectrum has a largest eigenvalue, and the spectra of a partial pair are comparable only up to the
-      smaller of these two eigenvalues.
+    - `partial`: whether X and Y are a partial pair, that is, one shape is a part of the other shape. The
+      spectra of a partial pair are comparable only in their common range of eigenvalues.
     - `prepared`: the `PreparedPair` from which this input was created, for methods that run a preset.
     """
 

@@ -248,8 +248,9 @@ def _bijective_step(
         Phi_X(x) = Phi_Y(y) C^T    for C = C_XY and for C = C_XX^T C_XY,
         Phi_X(x) C^T = Phi_Y(y)    for C = C_YX and for C = C_YY^T C_YX.
 
-    The functional map of a cycle should be the identity. The factor C_XX^T corrects C_XY accordingly: if
-    `C_XX = C_XY C_YX`, then `C_XX^T C_XY C_YX = I`. The factor C_YY^T corrects C_YX in the same way.
+    The functional map of a cycle should be the identity. If `C_XX = C_XY C_YX`, then
+    `C_XX^T C_XY C_YX = I`. The second condition therefore uses `C_XX^T C_XY` in place of C_XY. In the same
+    way, the fourth condition uses `C_YY^T C_YX` in place of C_YX.
 
     Each condition compares an embedding of X with an embedding of Y. The four embeddings of each shape are
     concatenated with equal weights. One search for nearest neighbours between the concatenated embeddings
@@ -290,8 +291,9 @@ def _smooth(x: _Surface, y: _Surface, t_xy: Int64[np.ndarray, " m"], rounds: int
     """Smooth the map X -> Y by averaging the images of adjacent vertices.
 
     In each round, the image of each vertex moves to the mean of this image and the images of all adjacent
-    vertices. Images are moved to the nearest vertices of Y only after the last round, because displacements
-    shorter than an edge would otherwise be lost. The uniform weights are our choice.
+    vertices. All images have the same weight in the mean (our choice). Images are moved to the nearest
+    vertices of Y only after the last round, because displacements shorter than an edge would otherwise be
+    lost.
     """
     if rounds == 0:
         return t_xy

@@ -232,8 +232,7 @@ def partial_functional_map(
     state, _ = lax.scan(iterate, (initial, energies.covered(initial)), None, length=iterations)
     functional_map, membership = state
     region = jnp.where(spectrum_y.mask, eta(membership), 0)
-    # If an energy overflows, the minimisations leave C and v unchanged. The fidelity term shows the
-    # overflow.
+    # If an energy overflows, C and v stay unchanged and finite, so the fidelity term is checked as well.
     left = fidelity(functional_map, energies.coefficients_x, energies.inside(membership))
     finite = all_finite((functional_map, region, left))
     result = where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)

@@ -26,8 +26,8 @@ class PublishedMaps(Method):
     **Attributes:**
 
     - `directory`: the directory that contains the files `X_Y.map`.
-    - `number_of_eigenvectors`: 1, because a benchmark computes at least one eigenvector. The method itself
-      uses no eigenvectors.
+    - `number_of_eigenvectors`: 1, the smallest number that a benchmark can compute. The method itself uses
+      no eigenvectors.
     """
 
     directory: Path

@@ -248,12 +248,12 @@ class Written(NamedTuple):
 
 
 def always(name: str, values: Any) -> bool:
-    """Return True, because the format can hold every element of an attribute; see `omissions`."""
+    """The check for an attribute that a format can hold; see `omissions`."""
     return True
 
 
 def never(name: str, values: Any) -> bool:
-    """Return False, because the format can hold no element of an attribute; see `omissions`."""
+    """The check for an attribute that a format cannot hold; see `omissions`."""
     return False
 
 
@@ -263,9 +263,9 @@ def omissions(data: MeshData, form: str, **holds: Callable[[str, Any], bool]) ->
     **Arguments:**
 
     - `form`: the name of the format.
-    - `holds`: functions, named after attributes of `MeshData`. Each function receives the name and the value
-      of an element of its attribute, and returns whether the format can hold this element. Attributes without
-      a function use `never`.
+    - `holds`: one check for each attribute of `MeshData` that the format can hold, under the name of the
+      attribute. A check receives the name and the value of an entry, such as an array in `vertex_data`. The
+      check returns whether the format can hold the entry.
     """
     skin = dict.fromkeys(data.skin[0]) if data.skin is not None else {}
     kinds: dict[str, tuple[str, Mapping[str, Any]]] = {
@@ -310,8 +310,8 @@ def texture_of_corners(
     """Return texture vertices, and the texture vertex of each corner, given the coordinates of all corners.
 
     Two corners share a texture vertex if they belong to the same vertex and have equal texture coordinates.
-    The texture vertices are numbered in the order of their vertices. A corner has no texture vertex if its
-    texture coordinates are NaN.
+    The texture vertices of vertex 0 come first, then the texture vertices of vertex 1, and so on. A corner
+    has no texture vertex if its texture coordinates are NaN.
     """
     known = np.isfinite(at_corners).all(axis=1)
     rows = np.column_stack([corners, at_corners])[known]

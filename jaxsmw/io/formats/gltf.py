@@ -130,7 +130,7 @@ class _Scene:
         nodes_of_joints = None
         if "skin" in node:
             nodes_of_joints = document.list_of(document.item("skins", node["skin"]), "joints")
-            matrix = np.eye(4)  # the joints alone move a skinned mesh
+            matrix = np.eye(4)  # the node's transform does not move a skinned mesh
         parts: dict[str, _Part] = {}
         for primitive in document.list_of(mesh, "primitives"):
             if not isinstance(primitive, dict):

@@ -82,7 +82,7 @@ class _File:
         attributes = {"POSITION": self.accessor(positions, _VERTICES, limits=True)}
         if data.texture is not None:
             coordinates = np.vstack([data.texture[0], [[0, 1]]])[texture]
-            coordinates[:, 1] = 1 - coordinates[:, 1]  # glTF counts v from the top of the picture
+            coordinates[:, 1] = 1 - coordinates[:, 1]  # in glTF, v = 0 at the top of the picture
             attributes["TEXCOORD_0"] = self.accessor(_single(coordinates), _VERTICES)
         for name, values in data.vertex_data.items():
             if (stored := _storable(name, values)) is not None:

@@ -70,7 +70,7 @@ def _struct(value: Any) -> Mapping[str, Any]:
 
 
 def _rows(values: Any, count: int) -> np.ndarray:
-    """Restore the `count` rows of an array, because `parse_variables` drops axes of length 1."""
+    """Reshape an array to `count` rows if `parse_variables` dropped one of its axes."""
     array = np.asarray(values)
     return array.reshape(count, -1) if array.ndim < 2 and array.size and array.size % count == 0 else array
 

@@ -63,7 +63,7 @@ def _counted_backward(
     face_at: Callable[[], list[int]],
     content: str,
 ) -> np.ndarray:
-    """Replace negative indices, which count backward: -1 is the last element before the face."""
+    """Convert negative indices to positive indices. Index -1 is the last element above the face."""
     if not (corners < 0).any():
         return corners
     element_at = [match.start() for match in pattern.finditer(content)]
@@ -173,7 +173,7 @@ def _fits_vertices(name: str, values: np.ndarray) -> bool:
 
 
 def _fits_faces(data: MeshData, name: str) -> bool:
-    """Return whether the face data `name` are labels that can be written to an OBJ file."""
+    """Return whether an OBJ file can store the face data with this name."""
     names = data.label_names.get(name, ())
     return (
         name in _LABELS

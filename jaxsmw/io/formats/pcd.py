@@ -14,8 +14,7 @@ from jaxsmw.wording import count_of
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _NORMAL_FIELDS = ("normal_x", "normal_y", "normal_z")
-# Compressed points may unpack to this number of bytes. In a large file, the points may unpack to four times
-# the size of the compressed data.
+# Unpacked points are refused if they exceed both this number of bytes and four times their packed size.
 _LARGEST = 2**28
 # The name of padding fields, which contain no data.
 _PADDING = "_"
@@ -159,7 +158,7 @@ def lzf_decompressed(packed: bytes, size: int) -> bytes:
     set, the next byte is added to the length. The lower five bits and the following byte are the distance
     minus 1.
 
-    **Raises:** `InputError` if the data is damaged, or has another size.
+    **Raises:** `InputError` if the data is damaged, or does not unpack to `size` bytes.
     """
     out, at = bytearray(), 0
     try:
@@ -178,7 +177,7 @@ def lzf_decompressed(packed: bytes, size: int) -> bytes:
             at += 1
             if start < 0 or len(out) > size:
                 raise IndexError
-            # If a copy is longer than the output after `start`, the bytes after `start` are repeated.
+            # If the output ends before the copy is complete, the copied bytes are repeated.
             repeated = out[start : start + length + 2]
             out += (repeated * (length + 2))[: length + 2] if len(repeated) < length + 2 else repeated
     except IndexError:

@@ -38,7 +38,7 @@ _TYPES = {
     **{"Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8"},
 }
 _NAMES = {kind: name for name, kind in _TYPES.items()}
-# The kinds of cells, in the order of the rows of cell data.
+# The kinds of cells. The rows of CellData begin with the vertices and end with the strips.
 _KINDS = {"Verts": VERTEX, "Lines": LINE, "Polys": POLYGON, "Strips": STRIP}
 _COMPRESSORS = {"vtkZLibDataCompressor", "vtkLZMADataCompressor", "vtkLZ4DataCompressor"}
 
