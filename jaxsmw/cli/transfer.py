@@ -254,7 +254,7 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
 def _register(
     options: argparse.Namespace, source: MeshData, target: MeshData, stopwatch: Stopwatch
 ) -> tuple[Correspondence | None, RegisteredMesh, Float[np.ndarray, " m"] | None]:
-    """Return the match, the registered mesh and the expected error of each match (m,).
+    """Return the `Match`, the registered mesh and the expected errors (m,), one for each vertex of X.
 
     If a map is given, the match and the expected error are None. The expected error is also None if neither
     landmarks nor a report need it.

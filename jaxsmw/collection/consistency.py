@@ -19,8 +19,9 @@ Edge = tuple[int, int]
 # of one limb lies on another limb, and the exact distance gives no further information.
 _LARGEST = 0.5
 # The sharpness of the weights in each iteration, in units of 1 / error. The values follow the doubling
-# sequence that Lerman and Shi recommend. Each edge averages the errors of its cycles. With the last value,
-# the weight of a cycle is e^-4 if the errors of the cycle's two other edges sum to 0.1.
+# sequence that Lerman and Shi recommend. Each edge averages the errors of its cycles. A cycle has a
+# small weight if its two other edges have large errors. With a sharpness of 40, the weight is e^-4 if these
+# two errors sum to 0.1.
 _SHARPNESS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 
 

@@ -18,8 +18,7 @@ from jaxsmw.runtime.progress import Progress, no_progress
 
 # The number of pairs whose hands are compared, divided by the number of shapes.
 _COMPARED_PER_SHAPE = 1.5
-# The number of pairs whose hands are compared first. If none of these pairs is asymmetric, no further
-# pairs are compared.
+# This number of pairs is compared first. If none of these pairs is asymmetric, no further pairs are compared.
 _COMPARED_FIRST = 5
 
 

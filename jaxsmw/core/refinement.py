@@ -223,7 +223,7 @@ class _Record(NamedTuple):
     pointwise_map: Int32[Array, "*iterations m"] | None
 
     def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
-        """Append the final search of all vertices to the record of a refinement on samples.
+        """Append a last entry, for the search that matches all vertices after the iterations on samples.
 
         The last map cannot be compared with an earlier map of the same vertices, so its entry in `changed` is
         NaN.

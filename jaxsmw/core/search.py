@@ -434,8 +434,8 @@ def _distance_to_promising_patch(
 ) -> Float[Array, " block"]:
     """Return the distance from each query to one point of the patch with the nearest box.
 
-    Of all points of this patch, the function chooses the one that is nearest to the query after projection
-    onto the axes of the box.
+    The query and the points of the patch are projected onto the axes of the box. The chosen point has the
+    nearest projection.
     """
     patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
     # A minimum, followed by a search for its position, takes a third of the time of argmin.

@@ -224,7 +224,7 @@ class _Lines(NamedTuple):
 
 
 def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.ndarray, depth: int) -> _Lines:
-    """Return the straight lines that lead from the given points to vertices across 1 to `depth` sides."""
+    """Return straight lines from the given points to vertices. Each line crosses at most `depth` sides."""
     found = []
     for beams, corner in _unfold(sides, origin, side, position, depth):
         seen = _visible(beams, corner)

@@ -26,9 +26,9 @@ _BYTES_OF_NUMBER = {3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 17: 2, 18:
 # The array classes cell, struct and object.
 _CONTAINERS = 1, 2, 3
 
-# The memory of every array, even of an empty array, is increased by this number of bytes. The increase
-# limits the number of arrays, because SciPy takes at least 10 microseconds per array. In 10 microseconds,
-# SciPy could read a few KiB of numbers.
+# Each array adds this number of bytes to the counted memory, even if it is empty. The limit on the memory also
+# limits the number of arrays. SciPy takes at least 10 microseconds per array, and reads a few KiB of numbers
+# in this time.
 _LEAST_BYTES_OF_ARRAY = 4096
 # The largest accepted size of all field names of a struct, in bytes. The limit allows 1000 fields with names
 # of 64 bytes. The structs of shapes have about ten fields.

@@ -130,7 +130,7 @@ class _TwoBands(_Transitions):
 
     @abc.abstractmethod
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Return `theta / (pi / 2)` of the transition as a function of `lambda / edge - 1`."""
+        """Return `theta / (pi / 2)` for each value of `excess`, which is `lambda / edge - 1`."""
 
     def transitions(
         self, points: Float[Array, " p"], lambda_max: Float[Array, ""]

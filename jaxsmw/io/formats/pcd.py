@@ -177,7 +177,7 @@ def lzf_decompressed(packed: bytes, size: int) -> bytes:
             at += 1
             if start < 0 or len(out) > size:
                 raise IndexError
-            # If the output ends before the copy is complete, the copied bytes are repeated.
+            # The copy can be longer than the available output. The available bytes are then repeated.
             repeated = out[start : start + length + 2]
             out += (repeated * (length + 2))[: length + 2] if len(repeated) < length + 2 else repeated
     except IndexError:
