@@ -26,10 +26,10 @@ _BYTES_OF_NUMBER = {3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 17: 2, 18:
 # The array classes cell, struct and object.
 _CONTAINERS = 1, 2, 3
 
-# Each array adds this number of bytes to the counted memory, even if it is empty. The limit on the memory also
-# limits the number of arrays. SciPy takes at least 10 microseconds per array, and reads a few KiB of numbers
-# in this time.
-_LEAST_BYTES_OF_ARRAY = 4096
+# Each array adds this number of bytes to the counted memory, even if it is empty. The limit on the memory
+# therefore also limits the number of arrays. SciPy takes at least 10 microseconds per array, and reads a few
+# KiB of numbers in this time.
+_BYTES_PER_ARRAY = 4096
 # The largest accepted size of all field names of a struct, in bytes. The limit allows 1000 fields with names
 # of 64 bytes. The structs of shapes have about ten fields.
 _LONGEST_NAMES = 64 * 1000
@@ -100,7 +100,7 @@ def _memory(variable: bytes, order: str, limit: int) -> int:
             if end > stop:
                 raise ValueError("an array ends early")
             if kind == _MATRIX:
-                memory += _LEAST_BYTES_OF_ARRAY
+                memory += _BYTES_PER_ARRAY
                 if size:
                     pending.append((start, end, _is_container(variable, start, size, order)))
             elif in_container and size > _LONGEST_NAMES:
