@@ -56,6 +56,20 @@ def test_components_stay_if_none_has_half_of_the_area():
     assert len(mesh.faces) == len(faces) and not mesh.notes
 
 
+@pytest.mark.parametrize(
+    ("size", "open_", "kept"), [(0.15, False, False), (0.3, False, True), (0.15, True, True)]
+)
+def test_closed_bubbles_take_no_part(size, open_, kept):
+    """A bubble has 2 % or 8 % of the area. An open surface of 2 % can be a severed limb."""
+    outside = bumpy_mesh(3)
+    bubble = outside.faces[1:] if open_ else outside.faces
+    n = len(outside.vertices)
+    vertices = np.vstack([outside.vertices, size * outside.vertices])
+    mesh = jaxsmw.make_mesh(vertices, np.vstack([outside.faces, bubble + n]))
+    assert mesh.referenced_vertices[n:].all() == kept and mesh.referenced_vertices[:n].all()
+    assert any("small component" in note for note in mesh.notes) != kept
+
+
 @pytest.mark.slow
 def test_specks_are_matched_like_the_nearest_vertex():
     vertices, faces = scan()

@@ -338,6 +338,19 @@ def with_loose_vertices() -> tuple[MeshData, Mesh]:
     return data, moved(mesh, 3 * TURN)
 
 
+def test_islands_of_the_map_move_with_their_surroundings():
+    """A dozen neighbours are mapped to the other side of the body."""
+    mesh_x = bumpy_mesh(4)
+    mesh_y = moved(mesh_x, 3 * TURN)
+    island = KDTree(mesh_x.vertices).query(mesh_x.vertices[700], 12)[1]
+    matches = np.arange(len(mesh_x.vertices))
+    matches[island] = KDTree(mesh_x.vertices).query(-mesh_x.vertices[island])[1]
+    registered = register_mesh(mesh_x, mesh_y, at_vertices(mesh_y, matches))
+    offsets = in_percent(registered.vertices - mesh_y.vertices, mesh_y)
+    assert offsets[island].max() < 1 and np.delete(offsets, island).max() < 0.5
+    assert registered.flipped_faces.sum() == 0
+
+
 class TestLandmarks:
     mesh_x = bumpy_mesh(4)
     mesh_y = moved(mesh_x, 10 * TURN)

@@ -394,11 +394,11 @@ def make_mesh(
     Scans may contain vertices without a usable position, and small components such as dust. A vertex is lost
     if its position is not finite or is very far away. If at most one vertex in 1000 is lost, the faces of
     lost vertices are dropped. Each lost vertex is moved to the mean of its usable neighbours. A lost vertex
-    without usable neighbours is moved to the mean of all usable vertices. If more than one
-    vertex in 1000 is lost, no vertex is moved, and the checks under "Raises" apply to the lost vertices. If
-    one component has at least half of the area, the faces of components with less than 1 % of the area are
-    dropped. Vertices that lose all their faces become unreferenced, and receive the match of the nearest
-    referenced vertex.
+    without usable neighbours is moved to the mean of all usable vertices. If more than one vertex in 1000 is
+    lost, no vertex is moved, and the checks under "Raises" apply to the lost vertices. If one component has
+    at least half of the area, the faces of components with less than 1 % of the area are dropped. For closed
+    components, such as enclosed bubbles, the limit is 5 %. Vertices that lose all their faces become
+    unreferenced, and receive the match of the nearest referenced vertex.
 
     **Arguments:**
 
@@ -473,7 +473,8 @@ def make_mesh(
         )
     _check_resolution(mesh)
     component = connected_components(mesh.edges, len(position))[1][mesh.faces[:, 0]]
-    small, count = in_small_components(component, mesh.face_areas)
+    at_boundary = np.isin(mesh.faces, mesh.boundary_edges).any(axis=1)
+    small, count = in_small_components(component, mesh.face_areas, at_boundary)
     if count:
         notes.append(
             f"{count_of(count, 'small component')} with {mesh.face_areas[small].sum() / mesh.area:.1%} of "

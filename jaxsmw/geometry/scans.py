@@ -13,9 +13,11 @@ _MOST_LOST = 1e-3
 # distances. It is also lost if its position is not finite. Some scans have coordinates of about 1e30, because
 # a program wrote uninitialised memory.
 _FAR = 100.0
-# A component is small if its share of the mesh's area is below _SMALL. If the share of the largest component
-# is below _LARGEST, no component is small. In scans, small components are dust and enclosed bubbles.
-_SMALL, _LARGEST = 0.01, 0.5
+# A component is small if its share of the mesh's area is below _SMALL, or below _SMALL_CLOSED for a closed
+# component. If the share of the largest component is below _LARGEST, no component is small. In scans, small
+# components are dust and enclosed bubbles. A component with 5 % of the area has fewer than 10 of 200
+# eigenfunctions, so its vertices cannot be matched. An open component of this size can be a severed limb.
+_SMALL, _SMALL_CLOSED, _LARGEST = 0.01, 0.05, 0.5
 
 
 def usable_positions(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -50,15 +52,23 @@ def between_neighbors(
 
 
 def in_small_components(
-    component: Int32[np.ndarray, " f"], face_areas: Float64[np.ndarray, " f"]
+    component: Int32[np.ndarray, " f"],
+    face_areas: Float64[np.ndarray, " f"],
+    at_boundary: Bool[np.ndarray, " f"],
 ) -> tuple[Bool[np.ndarray, " f"], int]:
     """Return a mask of the triangles in small components, and the number of small components.
 
-    `component` contains the index of each triangle's component.
+    **Arguments:**
+
+    - `component`: the 0-based index of each triangle's component (f,).
+    - `face_areas`: the area of each triangle (f,).
+    - `at_boundary`: a mask of the triangles with a vertex on the boundary of the mesh (f,). A component
+      without such triangles is closed.
     """
     areas = np.bincount(component, weights=face_areas)
     has_faces = np.bincount(component) > 0
-    small = (areas < _SMALL * areas.sum()) & has_faces
+    is_open = np.bincount(component, weights=at_boundary) > 0
+    small = (areas < np.where(is_open, _SMALL, _SMALL_CLOSED) * areas.sum()) & has_faces
     if areas.max() < _LARGEST * areas.sum():
         small[:] = False
     return small[component], int(small.sum())

@@ -14,7 +14,7 @@ from scipy.sparse.linalg import cg
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
-from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced
+from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
 from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_facing_points, nearest_surface_points
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.transfer.coverage import Attraction, UncoveredVertices
@@ -62,6 +62,12 @@ _ROUNDS = (
 # A map is probably wrong if two conditions hold: the share of flipped triangles exceeds _MANY_FLIPPED, and
 # the mean change of angles exceeds _MANY_DEGREES. (Entry R35)
 _MANY_FLIPPED, _MANY_DEGREES = 0.003, 16.0
+# The map tears an edge of X if its length grows to more than _TORN_FACTOR times its length plus _TORN_LENGTH.
+# Torn edges can cut X into several components. A component is an island if its share of the area is below
+# _ISLAND. Lengths are in units of the square root of Y's area. (Entry R38)
+_TORN_FACTOR, _TORN_LENGTH, _ISLAND = 4.0, 0.03, 0.005
+# The number of deformations that move islands together with their surroundings.
+_FILLING = 3
 # The linear solver stops when the norm of the residual is at most this fraction of the norm of the right-hand
 # side.
 _TOLERANCE = 1e-5
@@ -297,6 +303,9 @@ def register_mesh(
     areas = around.size**2 * mesh_x.vertex_areas
     # A vertex of no or little area still follows the map.
     areas = np.maximum(areas, 0.1 * np.median(areas[areas > 0]))
+    islands = _islands(around, areas, mapped, root)
+    if islands.any():
+        mapped = _with_islands_moved(around, target, np.where(islands, 0, areas), mapped, stiffness * root)
     targets, positions, similarities = mapped.copy(), mapped, around.similarities(mapped)
     weights, number = areas.copy(), 0
     normals = _normals(mesh_x.vertices, mesh_x)
@@ -334,6 +343,34 @@ def register_mesh(
             weights = np.where(near > 0, of_round.factor * weights, weights)
     similarities = Similarities(similarities.rotations, around.size * similarities.scales)
     return RegisteredMesh(mesh_x, mesh_y, *_with_unreferenced(mesh_x, positions + middle, similarities))
+
+
+def _islands(
+    around: Neighborhoods, areas: Float64[np.ndarray, " m"], mapped: Float64[np.ndarray, "m 3"], root: float
+) -> Bool[np.ndarray, " m"]:
+    """Return a mask of the islands: small groups of vertices that torn edges separate from all others."""
+    lengths = np.linalg.norm(around.vectors, axis=1)
+    mapped_lengths = np.linalg.norm(around.differences(mapped), axis=1)
+    torn = mapped_lengths > _TORN_FACTOR * lengths + _TORN_LENGTH * root
+    number, component = connected_components(around.edges[~torn], len(areas))
+    share = np.bincount(component, areas, number) / areas.sum()
+    return (share < _ISLAND)[component] & around.mesh.referenced_vertices
+
+
+def _with_islands_moved(
+    around: Neighborhoods,
+    target: Mesh,
+    weights: Float64[np.ndarray, " m"],
+    mapped: Float64[np.ndarray, "m 3"],
+    stiffness: float,
+) -> Float64[np.ndarray, "m 3"]:
+    """Move islands with their surroundings, and then to the target. The weights of islands are zero."""
+    positions, similarities = mapped, around.similarities(mapped)
+    for _ in range(_FILLING):
+        positions = _follow(around, similarities, weights, mapped, stiffness, positions)
+        similarities = around.similarities(positions)
+    moved = RegisteredMesh(around.mesh, target, positions, similarities).surface_points.positions(target)
+    return np.where(weights[:, None] == 0, moved, mapped)
 
 
 def _with_unreferenced(
