@@ -363,6 +363,10 @@ def _doubt(pair: Pair, decision: Decision) -> str:
     )
 
 
+# If the map reverses the orientation of more than this share of the area, one shape may be a mirror image.
+_MOSTLY = 0.5
+
+
 def _warning(prepared: PreparedPair, repair: RepairSettings | None, outcome: Outcome) -> str:
     """Return the text of the warning that a map looks wrong."""
     pair, spectrum_x, init = prepared.pair, prepared.spectrum_x, prepared.init
@@ -374,6 +378,8 @@ def _warning(prepared: PreparedPair, repair: RepairSettings | None, outcome: Out
     cure = f"use {'more' if more else 'a few'} landmarks as the initial map"
     if repair is None:
         cure = f'use preset="accurate" (--preset accurate), which repairs such maps, or {cure}'
+    if mirrored > _MOSTLY:
+        cure += '; if one mesh is a mirror image of the other, set mirror="yes" (--mirror yes)'
     if pair.partial:
         cure += (
             ", and check that both meshes have the same unit of length, or estimate the scale with "

@@ -250,6 +250,7 @@ def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
         ({"names": ["a", "b"]}, "2 different names for 5 meshes"),
         ({"names": list("abcda")}, "4 different names"),
         ({"mirror": "yes"}, "is not a mirror setting of a collection: choose auto, no"),
+        ({"mirror": [True]}, "mirror has 1 entries for 5 meshes"),
         ({"template": 5}, "from 0 to 4"),
         ({"template": "a"}, "from 0 to 4"),
         ({"template": True}, "from 0 to 4"),
@@ -303,6 +304,17 @@ def test_workers_give_the_same_maps(meshes, found, tmp_path):
 def signed_volume(mesh: Mesh) -> float:
     corners = mesh.vertices[mesh.faces]
     return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
+
+
+def test_meshes_of_the_other_hand_can_be_named(meshes, found):
+    some = [mesh.mirrored() if number == 1 else mesh for number, mesh in enumerate(meshes)]
+    result = match_collection(
+        some, preset="paper", settings=SETTINGS, mirror=[False, True, False, False, False]
+    )
+    assert result.mirrored.tolist() == [False, True, False, False, False]
+    for target in (0, 4):
+        same = result.pointwise_map(1, target) == found.pointwise_map(1, target)
+        assert same.mean() > 0.99
 
 
 @pytest.mark.slow
@@ -433,6 +445,17 @@ def test_landmarks_appear_on_all_other_meshes(result_directory, shapes):
         assert np.linalg.norm(offsets, axis=1).max() < 0.2 * np.sqrt(mesh.area)
 
 
+def test_landmarks_in_another_unit_are_refused_before_the_computation(directory, meshes, run, tmp_path):
+    landmarks = tmp_path / "landmarks.csv"
+    write_landmark_file(landmarks, Landmarks(("a", "b"), 1000 * meshes[1].vertices[:2]))
+    outcome = run(
+        "collection", directory, "--output", tmp_path / "out", *OPTIONS, "--landmarks", landmarks,
+        "--landmarks-of", "shape1.off",
+    )  # fmt: skip
+    assert outcome.code == 2 and "multiply the positions by 0.001" in outcome.errors
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_killed_runs_lose_nothing(directory, tmp_path):
     """The command is killed three times, whenever it has finished another pair."""
@@ -459,10 +482,13 @@ def test_killed_runs_lose_nothing(directory, tmp_path):
 
 
 def test_the_same_command_continues(result_directory, directory, run, matched):
-    outcome = run("collection", directory, "--output", result_directory, *OPTIONS, "--quiet")
+    outcome = run("collection", directory, "--output", result_directory, *OPTIONS)
     assert outcome.code == 0, outcome.errors
     assert matched == []
-    assert "4 shapes" in outcome.output
+    assert "4 shapes" in outcome.output and "Registered meshes: the mean distance" in outcome.output
+    # The first run chose this template with `--template`.
+    assert "template of the earlier results is kept: shape2" in outcome.errors
+    assert json.loads((result_directory / "collection.json").read_text("utf-8"))["template"] == "shape2"
     assert "not read" not in outcome.errors  # the other files of the directory often accompany meshes
 
 
@@ -482,7 +508,7 @@ def test_files_that_are_not_read_are_named_in_one_line(result_directory, directo
 
 
 def test_other_settings_need_another_directory(result_directory, directory, run):
-    outcome = run("collection", directory, "--output", result_directory, *OPTIONS, "--seed", "3")
+    outcome = run("collection", directory, "--output", result_directory, *OPTIONS, "--seed", "3", "--quiet")
     # The first line names the broken mesh.
     assert_refused(outcome._replace(errors=outcome.errors.split("\n", 1)[1]), naming="seed = 0")
 
@@ -567,6 +593,8 @@ def test_a_failed_run_leaves_the_earlier_results_and_nothing_else(
         (("--suffix", ".docx"), ".docx"),
         (("--template", "elsewhere.ply"), "--template"),
         (("--exclude", "elsewhere.ply"), "--exclude"),
+        (("--mirrored", "elsewhere.ply"), "--mirrored: elsewhere.ply is not a mesh file"),
+        (("--mirrored", "shape0.ply", "--mirror", "no"), "--mirrored needs --mirror auto"),
         (("--landmarks-of", "shape0.ply"), "--landmarks"),
         (("--landmarks", "none.csv"), "none.csv: does not exist"),
         (("--attributes-of", "shape9.ply"), "--attributes-of"),

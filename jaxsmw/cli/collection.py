@@ -52,8 +52,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--template",
         metavar="FILE",
         type=path,
-        help="mesh of DIRECTORY whose triangulation all meshes receive (default: the mesh that is most "
-        "similar to all others)",
+        help="mesh of DIRECTORY whose triangulation all meshes receive (default: the template of earlier "
+        "results in DIR, otherwise the mesh that is most similar to all others)",
     )
     parser.add_argument(
         "--exclude",
@@ -75,6 +75,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_MIRROR,
         help="auto finds meshes of opposite hands, such as left and right teeth, and matches their mirror "
         "images; no matches all meshes as they are (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--mirrored",
+        metavar="FILE",
+        nargs="+",
+        type=path,
+        default=[],
+        help="meshes of DIRECTORY whose mirror images are matched, such as all left jaws among right jaws. "
+        "Use this option for thin meshes, which --mirror auto cannot tell apart",
     )
     parser.add_argument(
         "--edges",
@@ -147,6 +156,7 @@ def run(options: argparse.Namespace) -> None:
         files = _mesh_files(options)
         _check(options, files)
         from jaxsmw.collection.files import RESULT_DIRECTORIES, check_replaceable, replace_results
+        from jaxsmw.io.landmarks import check_frame
         from jaxsmw.runtime.files import make_directory, remove_leftovers
         from jaxsmw.runtime.journal import claimed_directory
     with stopwatch.step("reading"):
@@ -158,7 +168,10 @@ def run(options: argparse.Namespace) -> None:
             raise InputError(
                 f"--{option.replace('_', '-')}: {file} was left out (see above): choose another mesh."
             )
+    if landmarks is not None:
+        check_frame(landmarks, data[Path(options.landmarks_of).name].mesh)
     check_replaceable(Path(options.output), _names(data))
+    _keep_template(options, data)
     directory = make_directory(options.output)
     work = make_directory(directory / "work")
     announce_consequence(
@@ -272,6 +285,9 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
     if not options.suffix.startswith("."):
         options.suffix = f".{options.suffix}"
     check_mesh_suffix(f"mesh{options.suffix}")
+    if options.mirrored and options.mirror == "no":
+        raise InputError("--mirrored needs --mirror auto: leave --mirror out.")
+    options.mirrored = [_inside(options, "mirrored", file, files) for file in options.mirrored]
     if options.suffix.count(".") != 1 or "/" in options.suffix:
         raise InputError(f"--suffix: {options.suffix!r} is not a suffix: give for example .ply or .obj.")
     for option in ("template", "landmarks_of", "attributes_of"):
@@ -357,12 +373,30 @@ def _read(files: Mapping[str, Path], *, weld: bool) -> tuple[dict[str, MeshData]
     for name, file in files.items():
         try:
             data[name] = read_mesh_data(file, weld=weld)
+            if notes := data[name].mesh.notes:
+                report_progress(f"{name}: {' '.join(notes)}")
         except InputError as error:
             unreadable[name] = str(error)
             say(f"{name} is left out: {error}")
     if len(data) < 2:
         raise InputError(f"only {len(data)} of {len(files)} meshes can be read: a collection needs two.")
     return data, unreadable
+
+
+def _keep_template(options: argparse.Namespace, data: Mapping[str, MeshData]) -> None:
+    """Choose the template of the earlier results in the output directory, unless `--template` is given.
+
+    With another template, vertex numbers would have another meaning in all registered meshes.
+    """
+    from jaxsmw.collection.files import read_template
+
+    earlier = None if options.template else read_template(Path(options.output))
+    for file, name in zip(data, _names(data), strict=True):
+        if name == earlier:
+            options.template = str(Path(options.directory) / file)
+            report_progress(
+                f"The template of the earlier results is kept: {name}. Choose another with --template."
+            )
 
 
 def _read_landmarks(options: argparse.Namespace) -> Landmarks | None:
@@ -432,13 +466,19 @@ def _match(
         names=_names(data),
         preset=options.preset,
         template=None if options.template is None else list(data).index(Path(options.template).name),
-        mirror=options.mirror,
+        mirror=_mirror(options, data),
         settings=settings,
         seed=options.seed,
         directory=work,
         executor=executor,
         progress=progress,
     )
+
+
+def _mirror(options: argparse.Namespace, data: Mapping[str, MeshData]) -> MirrorCollection | list[bool]:
+    """Return the argument `mirror` of `match_collection`."""
+    mirrored = {Path(file).name for file in options.mirrored}
+    return [name in mirrored for name in data] if mirrored else options.mirror
 
 
 def _measures(model: ShapeModel) -> dict[str, Any]:
@@ -508,7 +548,17 @@ def _write(
     if options.attributes_of:
         files += write_attributes(collection, sources["attributes_of"], kept, directory, options.suffix)
     shared = _provenance(options)
-    changeable = ["edges", "exclude", "template", "scale", "modes", "suffix", "landmarks", "attributes_of"]
+    changeable = [
+        "edges",
+        "exclude",
+        "template",
+        "mirrored",
+        "scale",
+        "modes",
+        "suffix",
+        "landmarks",
+        "attributes_of",
+    ]
     changeable += ["workers", "scheduler"]  # these options hardly change the results, but change the times
     settings = shared["settings"] | {name: getattr(options, name) for name in changeable}
     provenance = {**shared, "settings": settings, "machine": machine()}

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -223,6 +223,8 @@ def write_summary(
                 "vertices": len(registered.mesh_y.vertices),
                 "mirrored": bool(mirrored),
                 "distance_of_registered_mesh": float(registered.distances.mean()),
+                "flipped_triangles": float(registered.flipped_faces.mean()),
+                "notes": list(registered.mesh_y.notes),
             }
             for name, registered, mirrored in zip(
                 names, collection.registered, collection.mirrored, strict=True
@@ -255,6 +257,11 @@ def write_summary(
         temporary.write_text(json.dumps(contents, indent=2, allow_nan=False) + "\n", "utf-8")
 
 
+def read_template(directory: Path) -> str | None:
+    """Return the name of the template of earlier results in a directory; None if there are no results."""
+    return _in_summary(directory / "collection.json", "template", str)
+
+
 def check_replaceable(directory: Path, names: Sequence[str]) -> None:
     """Check that the results of a collection can be written to a directory without loss of other files.
 
@@ -274,7 +281,7 @@ def check_replaceable(directory: Path, names: Sequence[str]) -> None:
                 "for the results."
             )
         return
-    shapes = _summary(directory / "collection.json").get("shapes", [])
+    shapes = _in_summary(directory / "collection.json", "shapes", list) or []
     before = [str(shape.get("name")) for shape in shapes if isinstance(shape, dict)]
     if before and not set(before) & set(names):
         raise InputError(
@@ -312,17 +319,23 @@ def replace_results(new: Path, directory: Path) -> None:
 
 def _listed_files(summary: Path) -> list[str]:
     """Return the files that a summary lists, if they lie within the directory of the summary."""
-    listed = _summary(summary).get("files", [])
+    listed = _in_summary(summary, "files", list) or []
     return [file for file in listed if isinstance(file, str) and _LISTED.fullmatch(file)]
 
 
-def _summary(path: Path) -> dict[str, list[Any]]:
-    """Return all lists in a `collection.json` by name, or `{}` if the file is missing or damaged."""
+Kind = TypeVar("Kind")
+
+
+def _in_summary(path: Path, name: str, kind: type[Kind]) -> Kind | None:
+    """Return a value in a `collection.json`.
+
+    The value is None if the file is missing or damaged, or if the value is not of the given kind.
+    """
     with suppress(OSError, ValueError, RecursionError):
         found = json.loads(path.read_text("utf-8"))
-        if isinstance(found, dict):
-            return {name: value for name, value in found.items() if isinstance(value, list)}
-    return {}
+        if isinstance(found, dict) and isinstance(found.get(name), kind):
+            return found[name]
+    return None
 
 
 # `replace_results` removes only files that match this pattern. All matching paths lie inside the directory of

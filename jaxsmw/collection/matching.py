@@ -36,7 +36,7 @@ def match_collection(
     names: Sequence[str] | None = None,
     preset: PresetName | Preset = DEFAULT_PRESET,
     template: int | None = None,
-    mirror: MirrorCollection = DEFAULT_MIRROR,
+    mirror: MirrorCollection | Sequence[bool] = DEFAULT_MIRROR,
     stiffness: float = DEFAULT_STIFFNESS,
     settings: CollectionSettings = CollectionSettings(),  # noqa: B008 (immutable)
     seed: int = 0,
@@ -62,7 +62,9 @@ def match_collection(
     - `template`: the 0-based position of the template in the argument `meshes`. The default is the shape with
       the smallest sum of errors along the best paths to all other shapes (the medoid).
     - `mirror`: `"auto"` (the default) recognises shapes of opposite hands, such as left and right teeth, and
-      matches their mirror images. `"no"` matches all meshes as they are.
+      matches their mirror images. `"no"` matches all meshes as they are. You can also give a sequence with
+      one Boolean per mesh: True for each mesh whose mirror image is matched. Thin shapes, such as left and
+      right jaws, need such a sequence.
     - `stiffness`: the stiffness of the registered meshes, a positive length in units of the square root of
       each shape's area; see `register_mesh`.
     - `settings`: the `CollectionSettings`.
@@ -89,7 +91,12 @@ def match_collection(
             f"there are {len(set(names))} different names for {len(meshes)} meshes: give each mesh a name of "
             "its own."
         )
-    check_choice(mirror, MirrorCollection, "a mirror setting of a collection")
+    if isinstance(mirror, str):
+        check_choice(mirror, MirrorCollection, "a mirror setting of a collection")
+    elif len(mirror) != len(meshes):
+        raise InputError(
+            f"mirror has {len(mirror)} entries for {len(meshes)} meshes: give one Boolean for each mesh."
+        )
     if template is not None:
         template = check_whole_number("template", template, 0, len(meshes) - 1)
     check_number("stiffness", stiffness, positive=True)
@@ -109,9 +116,13 @@ def match_collection(
     kept, shapes = [given[number] for number in usable], list(usable.values())
     with timed("hands", seconds):
         decisions = {}
-        if mirror == "auto":
+        if mirror == "no":
+            mirrored = np.zeros(len(shapes), bool)
+        elif mirror == "auto":
             decisions = compare_hands(shapes, chosen, seed=seed, store=store, progress=report)
-        mirrored = choose_hands(len(shapes), decisions)
+            mirrored = choose_hands(len(shapes), decisions)
+        else:
+            mirrored = np.array([bool(mirror[number]) for number in usable])
         shapes = [one.mirrored() if other else one for one, other in zip(shapes, mirrored, strict=True)]
     with timed("descriptors", seconds):
         shapes, axes = describe_shapes(shapes, chosen, store)

@@ -124,13 +124,13 @@ class Collection:
         return tuple(mesh.name for mesh in self.meshes)
 
     def sentences(self) -> tuple[str, ...]:
-        """Return sentences about the template, the edges, mirrored shapes, outliers and meshes left out."""
+        """Return all `decisions`, and sentences about outliers and about meshes that were left out."""
         warning = [self.warning] if self.warning else []
         left_out = [f"Left out: {name} ({reason})" for name, reason in self.left_out.items()]
         return (*self.decisions(), *warning, *left_out)
 
     def decisions(self) -> tuple[str, ...]:
-        """Return sentences about the template, the decisions on the edges, and mirrored shapes."""
+        """Return sentences about the template, the edges, the registered meshes and mirrored shapes."""
         decisions = Counter(edge.decision for edge in self.edges)
         found = [
             f"{count_of(len(self.meshes), 'shape')}, {count_of(len(self.edges), 'matched pair')}; the "
@@ -144,6 +144,13 @@ class Collection:
             )
         else:
             found.append("The graph has no cycles, so no map could be compared with other maps.")
+        distance = np.mean([one.distances.mean() / np.sqrt(one.mesh_y.area) for one in self.registered])
+        flipped = [float(one.flipped_faces.mean()) for one in self.registered]
+        found.append(
+            f"Registered meshes: the mean distance to the meshes is {distance:.2%} of the square root of the "
+            f"area. Flipped triangles: {np.mean(flipped):.2%} in the mean, at most {max(flipped):.2%} "
+            f"({self.names[int(np.argmax(flipped))]})."
+        )
         if self.mirrored.any():
             names = ", ".join(name for name, other in zip(self.names, self.mirrored, strict=True) if other)
             found.append(f"Of the other hand, so that their mirror images were matched: {names}.")

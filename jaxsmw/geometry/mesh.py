@@ -473,7 +473,9 @@ def make_mesh(
         )
     _check_resolution(mesh)
     component = connected_components(mesh.edges, len(position))[1][mesh.faces[:, 0]]
-    at_boundary = np.isin(mesh.faces, mesh.boundary_edges).any(axis=1)
+    on_boundary = np.zeros(len(position), bool)
+    on_boundary[mesh.boundary_edges] = True
+    at_boundary = np.asarray(on_boundary[mesh.faces].any(axis=1))
     small, count = in_small_components(component, mesh.face_areas, at_boundary)
     if count:
         notes.append(
