@@ -134,6 +134,21 @@ def test_stand_refuses_meshes_without_area_and_unknown_axes() -> None:
         stand(TALL, "w")  # type: ignore[arg-type]
 
 
+def test_nearly_rigid_copies_are_turned_alike() -> None:
+    numbers = np.arange(len(TALL.vertices))
+    noise = 0.01 * np.random.default_rng(0).normal(size=TALL.vertices.shape)
+    overturned = replace(TALL, vertices=(TALL.vertices + noise) @ np.diag([1.0, -1, -1]))
+    alone = stand(overturned, "y")
+    shown_x, shown_y = stand_pair(overturned, TALL, None, numbers)
+    assert np.abs(shown_x.vertices - shown_y.vertices).max() < 0.1
+    matrix, offset = placement(overturned, shown_x)
+    assert np.allclose(shown_x.vertices @ matrix + offset, overturned.vertices)
+    # An axis that the user gives holds for both meshes, and a map that scatters the vertices turns nothing.
+    scattered = np.random.default_rng(0).permutation(numbers)
+    assert np.array_equal(stand_pair(overturned, TALL, "y", numbers)[0].vertices, alone.vertices)
+    assert np.array_equal(stand_pair(overturned, TALL, None, scattered)[0].vertices, stand(overturned).vertices)
+
+
 def test_a_partial_shape_keeps_its_size_next_to_the_full_shape() -> None:
     part = replace(TALL, faces=TALL.faces[TALL.vertices[TALL.faces, 1].min(axis=1) > 0])
     assert part.area < 0.5 * TALL.area

@@ -81,7 +81,7 @@ def draw_correspondence(
     `up` is not an axis, or if matplotlib is missing.
     """
     indices = check_map(mesh_x, mesh_y, pointwise_map)
-    shown_x, shown_y = stand_pair(mesh_x, mesh_y, up)
+    shown_x, shown_y = stand_pair(mesh_x, mesh_y, up, indices)
     colors_y = position_colors(shown_y)
     panels = [_Panel("Source", shown_x, colors_y[indices]), _Panel("Target", shown_y, colors_y)]
     if not errors:

@@ -163,7 +163,8 @@ def write_page(
     check_error_limit(error_limit)
     encoded = [_encode_map(name, shown, mesh_x, mesh_y) for name, shown in maps.items()]
     error_names = list(dict.fromkeys(of for shown in maps.values() for of in shown.errors))
-    shown_x, shown_y = stand_pair(mesh_x, mesh_y, up)
+    first = check_map(mesh_x, mesh_y, next(iter(maps.values())).pointwise_map)
+    shown_x, shown_y = stand_pair(mesh_x, mesh_y, up, first)
     data = _encode_view(shown_x, shown_y) | {
         "x": encode_shape(mesh_x, shown_x),
         "y": encode_shape(mesh_y, shown_y),

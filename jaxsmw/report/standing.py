@@ -11,6 +11,7 @@ from jaxtyping import Float64, Int64
 from jaxsmw.choices import Axis
 from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.rotations import nearest_rotations
 
 # A dictionary from each axis to the rotation that makes this axis of a file point up. In files with y up,
 # bodies face +z. In files with z up, bodies face -y. In both cases, bodies face +z after the rotation.
@@ -50,6 +51,10 @@ _CELL, _SHORTEST_LIMB = 1 / 30, 0.05
 
 # A shape is treated as partial if its area is between these multiples of the area of the other shape.
 _SMALLEST_PART, _LARGEST_PART = 1 / 16, 0.6
+# Two shapes are nearly rigid copies of each other, such as two jaws, if their root mean square distance after
+# alignment is at most _RIGID, in units of the square root of the area. X is turned like Y if this divides the
+# distance by at least _MUCH_NEARER.
+_RIGID, _MUCH_NEARER = 0.15, 2.0
 
 
 def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
@@ -90,8 +95,15 @@ def _check_area(mesh: Mesh) -> None:
         )
 
 
-def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh, Mesh]:
+def stand_pair(
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    up: Axis | None = None,
+    pointwise_map: Int64[np.ndarray, " m"] | None = None,
+) -> tuple[Mesh, Mesh]:
     """Turn both meshes upright, and scale them for a common picture; see `stand`.
+
+    If a map shows that both shapes are nearly rigid copies, such as two jaws, X is turned like Y instead.
 
     Y is scaled to area 1. The scale of X depends on the ratio of the smaller area to the larger area. If the
     ratio is between 1/16 and 0.6, one of the shapes seems to be partial, and X keeps its size relative to Y.
@@ -103,6 +115,8 @@ def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh
     - `mesh_x`, `mesh_y`: surfaces of positive area.
     - `up`: the axis of both files that points up, such as `"y"` or `"-z"`. By default, `guess_up` guesses the
       axis of each mesh.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y. If it is None (the default), or if `up` is given,
+      X is not turned like Y.
 
     **Returns:** The upright meshes X and Y.
 
@@ -112,7 +126,25 @@ def stand_pair(mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None) -> tuple[Mesh
     ratio = mesh_x.area / mesh_y.area
     if _SMALLEST_PART < min(ratio, 1 / ratio) < _LARGEST_PART:
         standing_x = replace(standing_x, vertices=np.sqrt(ratio) * standing_x.vertices)
+    if up is None and pointwise_map is not None:
+        standing_x = _turned_like(standing_x, standing_y.vertices[pointwise_map])
     return standing_x, standing_y
+
+
+def _turned_like(mesh: Mesh, matches: Float64[np.ndarray, "m 3"]) -> Mesh:
+    """Turn a mesh by the rotation that aligns it with its matches, if the mesh is nearly a rigid copy."""
+    share = mesh.vertex_areas / mesh.area
+    vertices, targets = mesh.vertices - share @ mesh.vertices, matches - share @ matches
+    rotation = nearest_rotations(((share[:, None] * targets).T @ vertices)[None])[0][0]
+    turned = vertices @ rotation.T
+
+    def distance(positions: Float64[np.ndarray, "m 3"]) -> float:
+        return float(np.sqrt(share @ ((positions - targets) ** 2).sum(axis=1)))
+
+    if distance(turned) > min(_RIGID, distance(vertices) / _MUCH_NEARER):
+        return mesh
+    used = turned[mesh.referenced_vertices]
+    return replace(mesh, vertices=turned - (used.min(axis=0) + used.max(axis=0)) / 2)
 
 
 def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
@@ -129,12 +161,10 @@ def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], F
     the file.
     """
     used = mesh.referenced_vertices
-    scale = np.sqrt(mesh.area / standing.area)
-    # `stand` applied one of these rotations. For this rotation, the offset is the same at all vertices.
-    matrices = [scale * np.array(rows, dtype=float) for rows in _STAND.values()]
-    offsets = [mesh.vertices[used] - standing.vertices[used] @ matrix for matrix in matrices]
-    best = min(range(len(matrices)), key=lambda i: float(np.ptp(offsets[i], axis=0).max()))
-    return matrices[best], offsets[best].mean(axis=0)
+    ours, theirs = mesh.vertices[used], standing.vertices[used]
+    moment = (theirs - theirs.mean(axis=0)).T @ (ours - ours.mean(axis=0))
+    matrix = np.sqrt(mesh.area / standing.area) * nearest_rotations(moment[None])[0][0]
+    return matrix, (ours - theirs @ matrix).mean(axis=0)
 
 
 def guess_up(mesh: Mesh) -> Axis:
