@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int64
+from jaxtyping import Array, Bool, Float, Int64
 
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiner import Problem, Refiner, State, reverse_map
@@ -25,6 +25,7 @@ from jaxsmw.pair import Pair
 from jaxsmw.preparation import program_size
 from jaxsmw.presets import Preset
 from jaxsmw.repair.expected_error import expected_error
+from jaxsmw.repair.overlap import overlap
 from jaxsmw.repair.settings import WITHOUT_REPAIR, ExpectedErrorSettings
 from jaxsmw.repair.wrong_probability import wrong_probability
 from jaxsmw.runtime.compilation import compiled
@@ -287,6 +288,20 @@ class Correspondence:
         the square root of Y's area.
         """
         return self._expected_error.copy()
+
+    def overlap(self) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
+        """Predict which vertices have a counterpart on the other shape, for partial shapes.
+
+        `jaxsmw.repair.overlap` explains the prediction.
+
+        **Returns:** A mask of the vertices of X (m,) and a mask of the vertices of Y (n,), True for vertices
+        with a counterpart.
+        """
+        reverse = self.reverse_map()
+        return (
+            overlap(self.pair, self.pointwise_map, reverse),
+            overlap(self.pair.reversed(), reverse, self.pointwise_map),
+        )
 
     def wrong_probability(self, expected_error: Float[np.ndarray, " m"] | None = None) -> float | None:
         """Estimate the probability that the map is wrong on a part of the body, without ground truth.

@@ -111,8 +111,9 @@ def match(
     - `eigensolver`: `"exact"`, `"approximate"` or `"auto"` (the default). `"approximate"` takes less time on
       large meshes. `"auto"` chooses `"approximate"` if one mesh has at least 50 000 referenced vertices, else
       `"exact"`.
-    - `partial`: True if one mesh is a partial shape and the other mesh the full shape; see `paired_spectra`.
-      The default is False, for two full shapes.
+    - `partial`: True if one mesh or both meshes are partial shapes of the body; see `paired_spectra`. The
+      default is False, for two full shapes. `Correspondence.overlap` predicts which vertices have a
+      counterpart on the other mesh.
     - `scale`: for a partial pair, the factor by which lengths on X are multiplied to become lengths in the
       unit of Y. The default is 1, for meshes in the same unit. With `"unknown"`, the factor is estimated; see
       `jaxsmw.geometry.estimate_scale`. Full shapes are always scaled to the same area.

@@ -22,6 +22,7 @@ import pytest
 import scipy.io
 import trimesh
 from command_line import COMMANDS, SMALL, Outcome, assert_refused, runner, write_pair
+from scipy.spatial import KDTree
 from synthetic import grid_mesh
 
 import jaxsmw
@@ -366,6 +367,35 @@ def test_a_page_of_a_partial_shape_uses_a_common_range_of_eigenvalues(run, pair,
     outcome = run(*call[:2], tmp_path / "large.off", *call[3:], "--partial")
     assert outcome.code == 0 and "warning: the page has no wavelets" in outcome.errors
     assert shown_maps(tmp_path / "p.html")[0]["functional"] is None
+
+
+@pytest.mark.filterwarnings("default:.*limbs may be swapped")
+def test_the_overlap_of_partial_shapes_is_written(run, pair, tmp_path):
+    mesh = read_mesh(pair / "x.off")
+    high = mesh.vertices[:, 1] > np.quantile(mesh.vertices[:, 1], 0.4)
+    part = make_mesh(mesh.vertices, mesh.faces[high[mesh.faces].all(axis=1)])
+    write_mesh(tmp_path / "part.off", part)
+    call = [
+        "match",
+        pair / "x.off",
+        tmp_path / "part.off",
+        "--output",
+        tmp_path / "m.txt",
+        "--preset",
+        "fast",
+    ]
+    call += ["--overlap", tmp_path / "overlap.txt"]
+    assert_refused(run(*call), naming="--overlap")
+    assert_refused(run(*call[:-1], tmp_path / "o.npy", "--partial"), naming="the overlap is written as text")
+    truth = tmp_path / "truth.txt"
+    used = np.flatnonzero(part.referenced_vertices)
+    np.savetxt(truth, used[KDTree(mesh.vertices[used]).query(mesh.vertices)[1]], "%d")
+    outcome = run(*call, "--partial", "--init", f"map:{truth}")
+    assert outcome.code == 0, outcome.errors
+    found = np.loadtxt(tmp_path / "overlap.txt")
+    assert set(found) == {0, 1} and len(found) == len(mesh.vertices)
+    assert mesh.average(found == part.referenced_vertices) > 0.9
+    assert f"overlap:     {mesh.average(found):.0%} of the source's area and" in outcome.output
 
 
 def test_spectrum_writes_an_orthonormal_eigenbasis(run, pair, tmp_path):

@@ -146,7 +146,9 @@ def test_nearly_rigid_copies_are_turned_alike() -> None:
     # An axis that the user gives holds for both meshes, and a map that scatters the vertices turns nothing.
     scattered = np.random.default_rng(0).permutation(numbers)
     assert np.array_equal(stand_pair(overturned, TALL, "y", numbers)[0].vertices, alone.vertices)
-    assert np.array_equal(stand_pair(overturned, TALL, None, scattered)[0].vertices, stand(overturned).vertices)
+    assert np.array_equal(
+        stand_pair(overturned, TALL, None, scattered)[0].vertices, stand(overturned).vertices
+    )
 
 
 def test_a_partial_shape_keeps_its_size_next_to_the_full_shape() -> None:

@@ -123,7 +123,7 @@ def add_partial(
     parser.add_argument(
         "--partial",
         action="store_true",
-        help=f"declare that one mesh is a partial shape and the other mesh is the full shape{condition}",
+        help=f"declare that one mesh or both meshes are partial shapes of the body{condition}",
     )
 
 

@@ -16,7 +16,7 @@ from jaxsmw.cli.arguments import (
     refuse_without,
 )
 from jaxsmw.cli.conclusion import estimate_error, measure_match, show_match, write_match_report
-from jaxsmw.cli.console import Stopwatch, report_progress
+from jaxsmw.cli.console import Stopwatch, report_progress, show
 from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_mesh_file, read_truth
 from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
 from jaxsmw.cli.method import add_method, check_preset, match_meshes
@@ -54,6 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=path,
         help="write to this file the expected error of each match, one per line: an estimate of the geodesic "
         "error without ground truth, divided by the square root of the target's area",
+    )
+    parser.add_argument(
+        "--overlap",
+        metavar="FILE",
+        type=path,
+        help="with --partial: write to this file a line for each source vertex, 1 if the vertex has a "
+        "counterpart on the target and 0 if not",
     )
     parser.add_argument(
         "--one-to-one",
@@ -122,6 +129,8 @@ def run(options: argparse.Namespace) -> None:
         with stopwatch.step("writing"):
             _write_numbers(options.expected_error, expected)
         report_written(options.expected_error)
+    if options.overlap:
+        _write_overlap(options.overlap, correspondence, stopwatch)
     settings = evaluation_settings(options)
     errors = measure_match(correspondence, truth, settings, stopwatch, others)
     if expected is not None and options.report:
@@ -137,22 +146,21 @@ def _check(options: argparse.Namespace) -> None:
     check_preset(options)
     check_initial_map(options.init)
     check_evaluation(options)
-    refuse_without(options, "--partial", options.partial, "scale")
+    refuse_without(options, "--partial", options.partial, "scale", "overlap")
     refuse_without(options, "--report", bool(options.report), "up")
     reads_indices = bool(options.ground_truth or init_files)
     refuse_without(options, "--ground-truth or a file of --init", reads_indices, "index_base")
-    points, expected = options.surface_points, options.expected_error
+    points, expected, overlap = options.surface_points, options.expected_error, options.overlap
     if points and Path(points).suffix != ".baryc_gt":
         raise InputError(
             f"{points}: surface points are written as .baryc_gt: choose a name that ends in .baryc_gt."
         )
-    if expected and Path(expected).suffix.lower() in (".npy", ".mat"):
-        raise InputError(
-            f"{expected}: expected errors are written as text: choose another suffix, such as .txt."
-        )
+    for file, contents in ((expected, "expected errors are"), (overlap, "the overlap is")):
+        if file and Path(file).suffix.lower() in (".npy", ".mat"):
+            raise InputError(f"{file}: {contents} written as text: choose another suffix, such as .txt.")
     check_outputs(
         [options.source, options.target, *init_files, *(options.ground_truth or ())],
-        files=[options.output, points, options.one_to_one, expected],
+        files=[options.output, points, options.one_to_one, expected, overlap],
         directories=_directories(options),
     )
     from jaxsmw.io.map_files import check_map_name
@@ -223,11 +231,24 @@ def _write_points(options: argparse.Namespace, correspondence: Correspondence, p
         report_written(*(directory / name for name in TEXTURE_FILES))
 
 
-def _write_numbers(file: str, numbers: Any) -> None:
+def _write_overlap(file: str, correspondence: Correspondence, stopwatch: Stopwatch) -> None:
+    """Write which source vertices have a counterpart on the target, and print the shares of both areas."""
+    with stopwatch.step("overlap"):
+        mask_x, mask_y = correspondence.overlap()
+        _write_numbers(file, mask_x, "%d")
+    report_written(file)
+    share_x, share_y = correspondence.mesh_x.average(mask_x), correspondence.mesh_y.average(mask_y)
+    show(
+        f"overlap:     {share_x:.0%} of the source's area and {share_y:.0%} of the target's area have a "
+        "counterpart on the other mesh"
+    )
+
+
+def _write_numbers(file: str, numbers: Any, form: str = "%.6f") -> None:
     """Write one number per line."""
     import numpy as np
 
     from jaxsmw.runtime.files import atomic_write
 
     with atomic_write(file) as temporary:
-        np.savetxt(temporary, numbers, "%.6f")
+        np.savetxt(temporary, numbers, form)

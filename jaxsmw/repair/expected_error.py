@@ -8,6 +8,7 @@ from jaxtyping import Float, Int64
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import connected_components
 from jaxsmw.pair import Pair
+from jaxsmw.repair.overlap import detours
 from jaxsmw.repair.scores import (
     area_shape_difference,
     discontinuous_parts,
@@ -54,9 +55,8 @@ def expected_error(
     square root of Y's area.
     """
     mesh_x = pair.mesh_x
-    unit_x, unit_y = pair.units_of_length
-    returned = mesh_x.vertices[reverse_map[pointwise_map]]
-    detour = np.linalg.norm(mesh_x.vertices - returned, axis=1) / unit_x
+    _, unit_y = pair.units_of_length
+    detour = detours(pair, pointwise_map, reverse_map)
     change = np.abs(np.subtract(*edge_lengths(pair, mesh_x.edges, pointwise_map)))
     ends, m = mesh_x.edges.ravel(), len(mesh_x.vertices)
     length_change = np.bincount(ends, np.repeat(change, 2), m) / np.maximum(np.bincount(ends, minlength=m), 1)

@@ -115,8 +115,8 @@ def stand_pair(
     - `mesh_x`, `mesh_y`: surfaces of positive area.
     - `up`: the axis of both files that points up, such as `"y"` or `"-z"`. By default, `guess_up` guesses the
       axis of each mesh.
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y. If it is None (the default), or if `up` is given,
-      X is not turned like Y.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y. If it is None (the default), or if `up` is
+      given, X is not turned like Y.
 
     **Returns:** The upright meshes X and Y.
 
