@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int64
+from numpy.typing import ArrayLike
 
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiner import Problem, Refiner, State, reverse_map
@@ -19,7 +20,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_candidates
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
-from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.geodesics import SurfacePoints, check_indices
 from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import program_size
@@ -289,15 +290,32 @@ class Correspondence:
         """
         return self._expected_error.copy()
 
-    def overlap(self) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
+    def overlap(
+        self, reverse_map: ArrayLike | None = None
+    ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
         """Predict which vertices have a counterpart on the other shape, for partial shapes.
 
         `jaxsmw.repair.overlap` explains the prediction.
 
+        **Arguments:**
+
+        - `reverse_map`: a map Y -> X (n,), 0-based vertices of X. By default, the method uses `reverse_map()`.
+          The map of a second match, from Y to X, makes the prediction more accurate.
+
         **Returns:** A mask of the vertices of X (m,) and a mask of the vertices of Y (n,), True for vertices
         with a counterpart.
+
+        **Raises:** `InputError` if the reverse map does not fit the meshes.
         """
         reverse = self.reverse_map()
+        if reverse_map is not None:
+            name = f"map to {self.mesh_x.name}: vertex"
+            reverse = check_indices(reverse_map, len(self.mesh_x.vertices), name)
+            if len(reverse) != len(self.mesh_y.vertices):
+                raise InputError(
+                    f"{self.mesh_y.name}: the reverse map has {len(reverse)} entries for "
+                    f"{len(self.mesh_y.vertices)} vertices: give one vertex of X for each vertex."
+                )
         return (
             overlap(self.pair, self.pointwise_map, reverse),
             overlap(self.pair.reversed(), reverse, self.pointwise_map),

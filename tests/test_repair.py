@@ -11,11 +11,13 @@ from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching import match
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import PRESETS, Preset
 from jaxsmw.repair.outcome import Judge
+from jaxsmw.repair.overlap import detours, overlap
 from jaxsmw.repair.rounds import refine_further, refine_in_stages
 from jaxsmw.repair.scores import distortion
 from jaxsmw.repair.settings import RepairSettings
@@ -257,3 +259,22 @@ def test_sizes_follow_from_levels():
     assert small.refiner.levels == (20, 20, 30, 30) and small.number_of_eigenvectors == 30
     with pytest.raises(TypeError, match="positional"):
         Stage(FeatureRegression(LEVELS), 40)
+
+
+def test_the_overlap_of_two_partial_shapes(body):
+    """Two overlapping halves of a body, with the true maps in both directions."""
+    mesh, _ = body
+    height = mesh.vertices[:, 1]
+    keep_x, keep_y = height < np.quantile(height, 0.7), height > np.quantile(height, 0.3)
+    x, y = (make_mesh(mesh.vertices, mesh.faces[k[mesh.faces].all(axis=1)]) for k in (keep_x, keep_y))
+
+    def nearest(to: Mesh) -> np.ndarray:
+        used = np.flatnonzero(to.referenced_vertices)
+        return used[KDTree(mesh.vertices[used]).query(mesh.vertices)[1]]
+
+    pair = Pair.make(x, y, partial=True)
+    found = overlap(pair, nearest(y), nearest(x))
+    used = x.referenced_vertices
+    assert (found == keep_y)[used].mean() > 0.9
+    inside = used & y.referenced_vertices
+    assert detours(pair, nearest(y), nearest(x))[inside].max() == 0
