@@ -299,8 +299,8 @@ class Correspondence:
 
         **Arguments:**
 
-        - `reverse_map`: a map Y -> X (n,), 0-based vertices of X. By default, the method uses `reverse_map()`.
-          The map of a second match, from Y to X, makes the prediction more accurate.
+        - `reverse_map`: a map Y -> X (n,), 0-based vertices of X. By default, `Correspondence.reverse_map`
+          computes it. The map of a second match, from Y to X, makes the prediction more accurate.
 
         **Returns:** A mask of the vertices of X (m,) and a mask of the vertices of Y (n,), True for vertices
         with a counterpart.
