@@ -204,7 +204,8 @@ class Match(NamedTuple):
     def warn_if_suspicious(self) -> None:
         """Issue a `UserWarning` if the map looks wrong, or if the hand of X is doubtful."""
         if self.outcome.suspicious:
-            warning = _warning(self.prepared, self.correspondence.preset.repair, self.outcome)
+            repair = self.correspondence.preset.repair
+            warning = _warning(self.prepared, repair, self.outcome, mirrored=self.decision.mirrored)
             warnings.warn(warning, stacklevel=3)
         if self.decision.doubtful:
             warnings.warn(_doubt(self.prepared.pair, self.decision), stacklevel=3)
@@ -368,19 +369,28 @@ def _doubt(pair: Pair, decision: Decision) -> str:
 _MOSTLY = 0.5
 
 
-def _warning(prepared: PreparedPair, repair: RepairSettings | None, outcome: Outcome) -> str:
-    """Return the text of the warning that a map looks wrong."""
+def _warning(
+    prepared: PreparedPair, repair: RepairSettings | None, outcome: Outcome, *, mirrored: bool
+) -> str:
+    """Return the text of the warning that a map looks wrong.
+
+    `mirrored` is True if the mirror image of X was matched.
+    """
     pair, spectrum_x, init = prepared.pair, prepared.spectrum_x, prepared.init
     settings = repair or WITHOUT_REPAIR
     found = outcome.unpadded_map(pair)
-    mirrored = pair.mesh_x.average(orientation_reversal(pair, found, spectrum_x, settings.scores))
+    reversed_ = pair.mesh_x.average(orientation_reversal(pair, found, spectrum_x, settings.scores))
     cut_off = pair.mesh_x.average(discontinuous_parts(pair, found, settings.scores))
     more = not isinstance(init, str | SurfacePoints) and np.ndim(init) == 2
     cure = f"use {'more' if more else 'a few'} landmarks as the initial map"
     if repair is None:
         cure = f'use preset="accurate" (--preset accurate), which repairs such maps, or {cure}'
-    if mirrored > _MOSTLY:
-        cure += '; if one mesh is a mirror image of the other, set mirror="yes" (--mirror yes)'
+    if reversed_ > _MOSTLY:
+        cure += (
+            '; if both meshes are of the same hand, set mirror="no" (--mirror no)'
+            if mirrored
+            else '; if one mesh is a mirror image of the other, set mirror="yes" (--mirror yes)'
+        )
     if pair.partial:
         cure += (
             ", and check that both meshes have the same unit of length, or estimate the scale with "
@@ -390,7 +400,7 @@ def _warning(prepared: PreparedPair, repair: RepairSettings | None, outcome: Out
         cure += "; if one mesh is a partial shape, set partial=True (--partial)"
     return (
         f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down. The map has "
-        f"distortion {outcome.distortion:.3f}, reverses the orientation of {mirrored:.0%} of the source's "
+        f"distortion {outcome.distortion:.3f}, reverses the orientation of {reversed_:.0%} of the source's "
         f"area, and separates {cut_off:.0%} of the source's area by discontinuities. Correct maps between "
         f"poses of one body have distortions up to {settings.suspicious}. Correct maps can have larger "
         "distortions between non-isometric shapes, with topological noise, or if one shape is mirrored. "
