@@ -307,8 +307,9 @@ class Correspondence:
 
         **Raises:** `InputError` if the reverse map does not fit the meshes.
         """
-        reverse = self.reverse_map()
-        if reverse_map is not None:
+        if reverse_map is None:
+            reverse = self.reverse_map()
+        else:
             name = f"map to {self.mesh_x.name}: vertex"
             reverse = check_indices(reverse_map, len(self.mesh_x.vertices), name)
             if len(reverse) != len(self.mesh_y.vertices):

@@ -78,7 +78,7 @@ def align_rigidly(
         moving = x[::step]
         for _ in range(iterations):
             _, nearest = tree.query(motion.apply(moving))
-            motion = _rigid_fit(moving, y[nearest])
+            motion = rigid_fit(moving, y[nearest])
         return motion
 
     def distance(motion: Alignment) -> float:
@@ -129,8 +129,18 @@ def _principal_axes(points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "
     return axes * np.linalg.det(axes)
 
 
-def _rigid_fit(x: Float64[np.ndarray, "p 3"], targets: Float64[np.ndarray, "p 3"]) -> Alignment:
-    """Return the rigid motion of x that minimises the sum of squared distances to the targets."""
-    middle, middle_of_targets = x.mean(axis=0), targets.mean(axis=0)
-    (rotation,), _ = nearest_rotations(((targets - middle_of_targets).T @ (x - middle))[None])
+def rigid_fit(
+    x: Float64[np.ndarray, "p 3"],
+    targets: Float64[np.ndarray, "p 3"],
+    weights: Float64[np.ndarray, " p"] | None = None,
+) -> Alignment:
+    """Return the rigid motion of x that minimises the weighted sum of squared distances to the targets.
+
+    With `weights` None (the default), all points have the same weight.
+    """
+    middle, middle_of_targets = (np.average(points, axis=0, weights=weights) for points in (x, targets))
+    pulls = targets - middle_of_targets
+    if weights is not None:
+        pulls *= weights[:, None]
+    (rotation,), _ = nearest_rotations((pulls.T @ (x - middle))[None])
     return Alignment(rotation, middle_of_targets - rotation @ middle)

@@ -10,8 +10,8 @@ from jaxtyping import Float64, Int64
 
 from jaxsmw.choices import Axis
 from jaxsmw.errors import InputError, check_choice
+from jaxsmw.geometry.alignment import rigid_fit
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.rotations import nearest_rotations
 
 # A dictionary from each axis to the rotation that makes this axis of a file point up. In files with y up,
 # bodies face +z. In files with z up, bodies face -y. In both cases, bodies face +z after the rotation.
@@ -79,13 +79,8 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
     else:
         check_choice(up, Axis, "an axis")
     vertices = mesh.vertices @ np.array(_STAND[up], dtype=float).T / np.sqrt(mesh.area)
-    used = vertices[mesh.referenced_vertices]
     faces, _ = igl.bfs_orient(mesh.faces)
-    return replace(
-        mesh,
-        vertices=vertices - (used.min(axis=0) + used.max(axis=0)) / 2,
-        faces=faces.astype(np.int64),
-    )
+    return replace(mesh, vertices=_centered(vertices, mesh), faces=faces.astype(np.int64))
 
 
 def _check_area(mesh: Mesh) -> None:
@@ -134,17 +129,21 @@ def stand_pair(
 def _turned_like(mesh: Mesh, matches: Float64[np.ndarray, "m 3"]) -> Mesh:
     """Turn a mesh by the rotation that aligns it with its matches, if the mesh is nearly a rigid copy."""
     share = mesh.vertex_areas / mesh.area
-    vertices, targets = mesh.vertices - share @ mesh.vertices, matches - share @ matches
-    rotation = nearest_rotations(((share[:, None] * targets).T @ vertices)[None])[0][0]
-    turned = vertices @ rotation.T
+    turned = rigid_fit(mesh.vertices, matches, share).apply(mesh.vertices)
 
     def distance(positions: Float64[np.ndarray, "m 3"]) -> float:
-        return float(np.sqrt(share @ ((positions - targets) ** 2).sum(axis=1)))
+        offsets = positions - matches
+        return float(np.sqrt(share @ ((offsets - share @ offsets) ** 2).sum(axis=1)))
 
-    if distance(turned) > min(_RIGID, distance(vertices) / _MUCH_NEARER):
+    if distance(turned) > min(_RIGID, distance(mesh.vertices) / _MUCH_NEARER):
         return mesh
-    used = turned[mesh.referenced_vertices]
-    return replace(mesh, vertices=turned - (used.min(axis=0) + used.max(axis=0)) / 2)
+    return replace(mesh, vertices=_centered(turned, mesh))
+
+
+def _centered(positions: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
+    """Move new positions of a mesh such that the middle of the bounding box is the origin."""
+    used = positions[mesh.referenced_vertices]
+    return positions - (used.min(axis=0) + used.max(axis=0)) / 2
 
 
 def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
@@ -161,10 +160,9 @@ def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], F
     the file.
     """
     used = mesh.referenced_vertices
-    ours, theirs = mesh.vertices[used], standing.vertices[used]
-    moment = (theirs - theirs.mean(axis=0)).T @ (ours - ours.mean(axis=0))
-    matrix = np.sqrt(mesh.area / standing.area) * nearest_rotations(moment[None])[0][0]
-    return matrix, (ours - theirs @ matrix).mean(axis=0)
+    scale = np.sqrt(mesh.area / standing.area)
+    motion = rigid_fit(scale * standing.vertices[used], mesh.vertices[used])
+    return scale * motion.rotation.T, motion.offset
 
 
 def guess_up(mesh: Mesh) -> Axis:
