@@ -33,8 +33,7 @@ class Preset:
     **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage has the
     position `repair.stage`. `InputError` is also raised if one of these rules is broken. The last stage must
     not end on samples. If a stage ends on samples, the next stage must start on samples, and must not have
-    more samples. The stage that repair repeats must have levels. If this stage uses samples, the number of
-    samples must be at least the largest of `repair.fallback_levels`.
+    more samples.
     """
 
     stages: tuple[Stage, ...]
@@ -116,7 +115,6 @@ def _check_stages(name: str, stages: tuple[Stage, ...], repair: RepairSettings |
             f"repair repeats stage {repair.stage}, but the stages are 0 to {len(stages) - 1}: "
             "give RepairSettings(stage=...) with one of these numbers."
         )
-    stages[repair.stage].with_levels(repair.fallback_levels)
 
 
 _WAVELETS = Stage()

@@ -16,11 +16,12 @@ from jaxsmw.pair import Pair
 from jaxsmw.preparation import prepare
 from jaxsmw.presets import PRESETS
 from jaxsmw.repair.alternatives import Alternatives
-from jaxsmw.repair.proxies import Proxy, deformation, distance_error
+from jaxsmw.repair.proxies import Proxy, deformation, distance_error, map_difference
 
 REPAIR = PRESETS["accurate"].repair
 # Fewer samples and levels, which compile faster.
-REPAIR = replace(REPAIR, alternatives=replace(REPAIR.alternatives, samples=500, levels=(8, 11, 15, 20)))
+FEW = {"samples": 500, "levels": (8, 11, 15, 20), "fine_levels": (15, 20, 20, 20)}
+REPAIR = replace(REPAIR, alternatives=replace(REPAIR.alternatives, **FEW))
 
 
 @pytest.fixture(scope="module")
@@ -111,23 +112,24 @@ def test_wrong_maps_deform_more_than_the_true_map(pair):
 
 def test_the_best_alternative_is_right_and_does_not_depend_on_the_position_in_space(pair):
     mesh_x, mesh_y, truth = pair
-    first, *others = Alternatives(prepared(mesh_x, mesh_y), REPAIR).best()
+    nonsense = np.zeros_like(truth)
+    first, *others = Alternatives(prepared(mesh_x, mesh_y), REPAIR).best(nonsense)
     assert first.dtype == np.int64 and first.shape == truth.shape
     assert mean_error(mesh_y, first, truth) < 0.08
-    assert len(others) <= 3
+    assert len(others) < REPAIR.alternatives.promising
     turned = moved(mesh_x, Rotation.random(random_state=1)), moved(mesh_y, Rotation.random(random_state=2))
-    (again, *_) = Alternatives(prepared(*turned), REPAIR).best()
+    (again, *_) = Alternatives(prepared(*turned), REPAIR).best(nonsense)
     assert np.mean(again == first) > 0.99
 
 
 def test_alternatives_of_partial_pairs_come_from_descriptors_alone(pair):
-    mesh_x, mesh_y, _ = pair
+    mesh_x, mesh_y, truth = pair
     whole = Alternatives(prepared(mesh_x, mesh_y), REPAIR)
     part = Alternatives(prepared(mesh_x, mesh_y, partial=True), REPAIR)
     radii, pairings = REPAIR.alternatives.radii, REPAIR.alternatives.pairings
     assert len(list(part._initial_maps())) == len(radii)
     assert len(list(whole._initial_maps())) == len(radii) + pairings + 4
-    assert next(part.best()).shape == (len(mesh_x.vertices),)
+    assert next(part.best(truth)).shape == (len(mesh_x.vertices),)
 
 
 def test_known_maps_are_refined_as_well(pair):
@@ -138,11 +140,38 @@ def test_known_maps_are_refined_as_well(pair):
     assert mean_error(mesh_y, next(alone.best(truth)), truth) < 0.05
 
 
+def test_only_better_maps_that_differ_from_the_known_map_are_tried(pair):
+    mesh_x, mesh_y, truth = pair
+    found = Alternatives(prepared(mesh_x, mesh_y), REPAIR)
+    assert not list(found.best(truth, only_better=True))
+    upside_down = truth[np.argsort(np.argsort(-mesh_x.vertices[:, 1]))]
+    better = next(found.best(upside_down, only_better=True))
+    assert mean_error(mesh_y, better, truth) < 0.08
+
+
+def test_the_difference_of_two_maps_is_a_share_of_the_area(pair):
+    """Matches that are close in space but not along the surface are different."""
+    mesh, _, _ = pair
+    proxy = reduced(mesh)
+    identity = np.arange(len(proxy.areas))
+    assert map_difference(proxy, proxy, identity, identity, 0.2) == 0
+    apart = proxy.distances / np.linalg.norm(proxy.positions[:, None] - proxy.positions, axis=2).clip(1e-9)
+    moved = identity.copy()
+    moved[:50] = np.argmax(apart[:50], axis=1)
+    far = proxy.distances[identity, moved] > 0.2
+    assert far.any()
+    expected = pytest.approx(proxy.areas[far].sum())
+    assert map_difference(proxy, proxy, identity, moved, 0.2) == expected
+
+
 def test_further_alternatives_differ_from_all_maps_before_them(unchecked):
     """The maps 0, 1 and 2 are variants of one map, and so are 3 and 4. Map 5 differs from 0 by too little."""
     places = np.array([0.0, 0.05, 0.11, 0.5, 0.53, 0.02])
-    judge = SimpleNamespace(difference=lambda one, other: abs(places[one] - places[other]))
+    candidates = [SimpleNamespace(found=number) for number in range(6)]
     for areas, expected in (((0.03, 0.03, 0.2), [0, 1, 2, 3]), ((0.03, 0.2), [0, 1, 3]), ((0.4,), [0, 3])):
         settings = replace(REPAIR, alternatives=replace(REPAIR.alternatives, different_areas=areas))
-        alternatives = SimpleNamespace(settings=settings, judge=judge)
-        assert list(Alternatives._distinct(alternatives, range(6))) == expected
+        alternatives = SimpleNamespace(
+            settings=settings, _difference=lambda one, other: abs(places[one] - places[other])
+        )
+        chosen = Alternatives._distinct(alternatives, candidates)
+        assert [one.found for one in chosen] == expected

@@ -19,7 +19,6 @@ from jaxsmw.repair.scores import (
     dirichlet_energy_ratio,
     discontinuous_parts,
     distortion,
-    map_difference,
     orientation_reversal,
 )
 from jaxsmw.repair.settings import ExpectedErrorSettings, ScoreSettings
@@ -51,11 +50,9 @@ def test_the_area_shape_difference_is_zero_for_isometries_and_known_for_a_consta
     assert area_shape_difference(pair, identity, spectrum, spectrum) == pytest.approx(0, abs=1e-5)
     padded = spectrum.pad(n + 7)
     assert area_shape_difference(pair, identity, padded, padded) == pytest.approx(0, abs=1e-5)
-    # Pulled back by a constant map, all functions are constant: the operator has rank 1.
-    values = np.asarray(spectrum.eigenvectors)[5, :20]
-    expected = np.sqrt((19 + (values @ values - 1) ** 2) / 20)
+    # Pulled back by a constant map, all functions are constant: 19 of the 20 eigenvalues are 0.
     constant = np.full(n, 5)
-    assert area_shape_difference(pair, constant, spectrum, spectrum) == pytest.approx(expected, rel=1e-5)
+    assert area_shape_difference(pair, constant, spectrum, spectrum) == pytest.approx(1, rel=1e-5)
 
 
 def test_a_head_that_grows_has_a_larger_area_shape_difference_than_a_bent_body():
@@ -240,24 +237,6 @@ def test_the_distance_of_a_mesh_from_the_origin_does_not_matter():
     np.testing.assert_allclose(there.positions, here.positions, atol=1e-5)
     for x, y, spectrum in ((near, far, here), (far, near, there), (far, far, there)):
         assert dirichlet_energy_ratio(Pair(x, y), identity, spectrum) == pytest.approx(1, abs=1e-4)
-
-
-def test_the_difference_of_two_maps_is_a_share_of_the_area(mesh):
-    identity = np.arange(len(mesh.vertices))
-    _, mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])
-    assert map_difference(Pair(mesh, mesh), identity, identity) == 0
-    few = np.arange(len(mesh.vertices)) < 50
-    far = np.linalg.norm(mesh.vertices[mirrored] - mesh.vertices, axis=1) > 0.1 * mesh.area**0.5
-    some = np.where(few, mirrored, identity)
-    expected = mesh.vertex_areas[few & far].sum() / mesh.area
-    assert 0 < expected < 0.1
-    assert map_difference(Pair(mesh, mesh), identity, some) == pytest.approx(expected)
-    # Distances on the small piece of a partial pair are small, because their unit comes from the full shape.
-    piece, shift = make_mesh(mesh.vertices / 10, mesh.faces), np.argsort(mesh.vertices[:, 0])
-    moved = np.empty_like(identity)
-    moved[shift] = np.roll(shift, 40)
-    assert map_difference(Pair(mesh, piece), identity, moved) > 0.03
-    assert map_difference(Pair(mesh, piece, True), identity, moved) < 0.03
 
 
 def test_lengths_on_a_partial_shape_use_the_unit_of_the_full_shape(mesh):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import count, islice
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,7 +21,7 @@ from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.repair.extremities import extremities, plausible_pairings
 from jaxsmw.repair.outcome import Judge, Outcome
-from jaxsmw.repair.proxies import Proxy, deformation
+from jaxsmw.repair.proxies import Proxy, deformation, map_difference
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import side_by_side
@@ -30,6 +31,13 @@ from jaxsmw.stage import Stage
 SampleMap = Int64[np.ndarray, " s"]
 # The identity and the half turns about the three principal axes, as factors of the three coordinates.
 _HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
+
+
+class _Candidate(NamedTuple):
+    """A refined map of samples, and its score; see `jaxsmw.repair.outcome.score`."""
+
+    score: float
+    found: SampleMap
 
 
 class Alternatives:
@@ -67,13 +75,14 @@ class Alternatives:
         )
         self.x, self.y = side_by_side(self._proxy, *sides)
         chosen = settings.alternatives
-        self._stage = Stage(
+        stage = Stage(
             FeatureRegression(chosen.levels),
             number_of_descriptors=0 if prepared.spectrum_x.descriptors is None else chosen.descriptors,
-        ).fitted(min(len(self.x.areas), len(self.y.areas)))
-        spectra = self._stage.view(
-            self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial
         )
+        fewest = min(len(self.x.areas), len(self.y.areas))
+        self._coarse, self._fine = stage.fitted(fewest), stage.with_levels(chosen.fine_levels).fitted(fewest)
+        finer = max(self._coarse, self._fine, key=lambda stage: stage.number_of_eigenvectors)
+        spectra = finer.view(self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial)
         self._spectra = [spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in spectra]
         coarse_x, coarse_y = (
             side.truncate(chosen.eigenvectors) for side in (prepared.spectrum_x, prepared.spectrum_y)
@@ -91,50 +100,64 @@ class Alternatives:
         radius = self.settings.alternatives.patch_radius
         return deformation(self.x, self.y, self._reduced(pointwise_map), radius)
 
-    def best(self, *known: Int64[np.ndarray, " m"]) -> Iterator[Int64[np.ndarray, " m"]]:
+    def best(
+        self, known: Int64[np.ndarray, " m"], *, only_better: bool = False
+    ) -> Iterator[Int64[np.ndarray, " m"]]:
         """Yield alternative maps that differ from each other. Maps with better scores mostly come first.
 
-        The best refined maps are repaired. For each fault of such a map, a refinement without the faulty
-        vertices gives a further map.
+        All initial maps are refined. For each fault of the best refined maps, a refinement without the faulty
+        samples gives a further map. The most promising of all these maps are then refined with more
+        eigenvectors. Afterwards, right maps are easier to distinguish from wrong maps. (Table R40)
 
         **Arguments:**
 
-        - `known`: maps X -> Y (m,), which are refined as further initial maps.
+        - `known`: a map X -> Y (m,), which is refined as a further initial map.
+        - `only_better`: whether the iterator ends at the first map that does not differ from `known`.
 
         **Returns:** An iterator over maps T: X -> Y (m,), 0-based vertices of Y.
         """
-        outcomes = self._refined([*self._initial_maps(), *map(self._reduced, known)])
-        repaired = islice(self._distinct(outcomes), self.settings.alternatives.repaired)
-        outcomes = self._sorted(outcomes + self._without_faults(list(repaired)))
-        score, margin = self.judge.score, self.settings.alternatives.margin
-        close = [outcome for outcome in outcomes if score(outcome) <= score(outcomes[0]) + margin]
-        for outcome in self._distinct(close):
-            yield outcome.unpadded_map(self.pair)
+        chosen, usual = self.settings.alternatives, self._reduced(known)
+        coarse = self._refined(self._coarse, [*self._initial_maps(), usual])
+        repaired = self._without_faults(list(islice(self._distinct(coarse), chosen.repaired)))
+        coarse = sorted(coarse + repaired, key=lambda candidate: candidate.score)
+        promising = islice(self._distinct(_within(chosen.coarse_margin, coarse)), chosen.promising)
+        fine = self._refined(self._fine, [candidate.found for candidate in promising])
+        for candidate in self._distinct(_within(chosen.margin, fine)):
+            if only_better and self._difference(candidate.found, usual) < chosen.different_areas[0]:
+                return
+            yield self._extended(candidate.found)
 
-    def _distinct(self, outcomes: Sequence[Outcome]) -> Iterator[Outcome]:
-        """Choose outcomes that differ from each other, and yield them.
+    def _distinct(self, candidates: Sequence[_Candidate]) -> Iterator[_Candidate]:
+        """Choose candidates that differ from each other, and yield them.
 
-        The given outcomes must be sorted by their scores. Each yielded outcome differs from all earlier
-        outcomes on a minimum share of X's area; see `AlternativeSettings.different_areas`.
+        The given candidates must be sorted by their scores. Each yielded candidate differs from all earlier
+        ones on a minimum share of X's area; see `AlternativeSettings.different_areas`.
         """
         areas = self.settings.alternatives.different_areas
-        # Each entry contains an outcome and its smallest difference from the outcomes yielded so far.
-        differences = [(outcome, 1.0) for outcome in outcomes]
+        # Each entry contains a candidate and its smallest difference from the candidates yielded so far.
+        differences = [(candidate, 1.0) for candidate in candidates]
         for number in count():
             least = areas[min(max(number - 1, 0), len(areas) - 1)]
-            chosen = next((outcome for outcome, area in differences if area >= least), None)
+            chosen = next((candidate for candidate, area in differences if area >= least), None)
             if chosen is None:
                 return
             yield chosen
             differences = [
-                (other, min(area, self.judge.difference(other, chosen))) for other, area in differences
+                (other, min(area, self._difference(other.found, chosen.found))) for other, area in differences
             ]
 
-    def _without_faults(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
-        """For each fault of each outcome, refine the map without the faulty vertices."""
-        faulty = [(outcome, fault) for outcome in outcomes for fault in self.judge.faults(outcome)]
-        maps = [self._reduced(one.unpadded_map(self.pair)) for one, _ in faulty]
-        return self._refined(maps, [fault[self.x.samples.vertices] for _, fault in faulty])
+    def _difference(self, first: SampleMap, second: SampleMap) -> float:
+        return map_difference(self.x, self.y, first, second, self.settings.alternatives.different_distance)
+
+    def _without_faults(self, candidates: Sequence[_Candidate]) -> list[_Candidate]:
+        """For each fault of each candidate, refine the map of samples without the faulty ones."""
+        starts, faults = [], []
+        for candidate in candidates:
+            everywhere = Outcome([], jax.device_put(self._extended(candidate.found)))
+            for fault in self.judge.faults(everywhere):
+                starts.append(candidate.found)
+                faults.append(fault[self.x.samples.vertices])
+        return self._refined(self._coarse, starts, faults)
 
     def _initial_maps(self) -> Iterator[SampleMap]:
         """Yield the initial maps, each from the samples of X to the samples of Y."""
@@ -202,34 +225,31 @@ class Alternatives:
         return side_by_side(of_one, *zip((self.x, self.y), self.pair.units_of_length, strict=True))
 
     def _refined(
-        self, initial: Sequence[SampleMap], faults: Sequence[Bool[np.ndarray, " s"]] | None = None
-    ) -> list[Outcome]:
-        """Refine maps of samples.
+        self,
+        stage: Stage,
+        initial: Iterable[SampleMap],
+        faults: Sequence[Bool[np.ndarray, " s"]] | None = None,
+    ) -> list[_Candidate]:
+        """Refine maps of samples by a stage, and return the successful results, the best score first.
 
-        **Arguments:**
-
-        - `initial`: the maps.
-        - `faults`: for each map, a mask of the samples of X (s,) that are left out. The default is to use all
-          samples.
-
-        **Returns:** The successful outcomes, the best score first. Their maps are extended to all vertices.
+        With `faults`, map number i is refined without the samples of X in the mask `faults[i]`.
         """
         x, y = self._spectra
-        size, used = len(x.mask), len(self.x.areas)
-        outcomes = []
+        candidates = []
         for number, start in enumerate(initial):
-            weighted = x if faults is None else x.excluding(jnp.asarray(pad_rows(faults[number], size)))
-            padded = jax.device_put(pad_rows(start, size).astype(np.int32))
-            found = self._stage.run(weighted, y, padded, partial=self.pair.partial)
-            if found.result == RESULTS.successful:
-                of_samples = np.asarray(found.pointwise_map)[:used].astype(np.int64)
-                everywhere = jax.device_put(self._extended(of_samples))
-                found = eqx.tree_at(lambda tree: tree.pointwise_map, found, everywhere)
-                outcomes.append(self.judge.judged(Outcome([found], everywhere)))
-        return self._sorted(outcomes)
-
-    def _sorted(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
-        return sorted(outcomes, key=self.judge.score)
+            weighted = x
+            if faults is not None:
+                weighted = x.excluding(jnp.asarray(pad_rows(faults[number], len(x.mask))))
+            padded = jax.device_put(pad_rows(start, len(x.mask)).astype(np.int32))
+            refined = stage.run(weighted, y, padded, partial=self.pair.partial)
+            if refined.result == RESULTS.successful:
+                found = np.asarray(refined.pointwise_map)[: len(self.x.areas)].astype(np.int64)
+                # The score of a map is computed at all vertices.
+                everywhere = jax.device_put(self._extended(found))
+                refined = eqx.tree_at(lambda tree: tree.pointwise_map, refined, everywhere)
+                score = self.judge.score(self.judge.judged(Outcome([refined], everywhere)))
+                candidates.append(_Candidate(score, found))
+        return sorted(candidates, key=lambda candidate: candidate.score)
 
     def _reduced(self, pointwise_map: Int64[np.ndarray, " m"]) -> SampleMap:
         return self.y.samples.nearest[pointwise_map[self.x.samples.vertices]]
@@ -237,6 +257,11 @@ class Alternatives:
     def _extended(self, found: SampleMap) -> Int64[np.ndarray, " m"]:
         everywhere = self.y.samples.vertices[found][self.x.samples.nearest]
         return extend_to_unreferenced(self.pair.mesh_x, everywhere)
+
+
+def _within(margin: float, candidates: Sequence[_Candidate]) -> list[_Candidate]:
+    """Return the candidates whose scores exceed the best score by at most `margin`."""
+    return [one for one in candidates if one.score <= candidates[0].score + margin]
 
 
 def _squares(x: Float[np.ndarray, "s d"], y: Float[np.ndarray, "t d"]) -> Float[np.ndarray, "s t"]:

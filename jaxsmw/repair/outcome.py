@@ -17,7 +17,6 @@ from jaxsmw.repair.scores import (
     area_shape_difference,
     discontinuous_parts,
     distortion,
-    map_difference,
     orientation_reversal,
 )
 from jaxsmw.repair.settings import RepairSettings
@@ -34,8 +33,6 @@ class Outcome(NamedTuple):
     - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed yet.
     - `deformation`: `jaxsmw.repair.proxies.deformation` of the final map; 0 if it was not computed.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
-    - `rivals`: the outcomes with the next best scores, from best to worst. Rivals are kept only if the map
-      still looks wrong after repair.
     """
 
     refinements: list[Refinement]
@@ -43,7 +40,6 @@ class Outcome(NamedTuple):
     distortion: float | None = None
     deformation: float = 0.0
     suspicious: bool = False
-    rivals: tuple[Outcome, ...] = ()
 
     @property
     def successful(self) -> bool:
@@ -168,8 +164,3 @@ class Judge:
             self.spectrum_y,
             self.settings.scores,
         )
-
-    def difference(self, first: Outcome, second: Outcome) -> float:
-        """Return the share of X's area on which the maps of two outcomes differ; see `map_difference`."""
-        maps = first.unpadded_map(self.pair), second.unpadded_map(self.pair)
-        return map_difference(self.pair, *maps, self.settings.scores)

@@ -86,6 +86,22 @@ def distance_error(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"]) -> float:
     return float(x.areas @ np.abs(x.distances - y.distances[np.ix_(found, found)]) @ x.areas)
 
 
+def map_difference(
+    x: Proxy, y: Proxy, first: Int64[np.ndarray, " s"], second: Int64[np.ndarray, " s"], distance: float
+) -> float:
+    """Return the share of X's area, from 0 to 1, on which two maps differ.
+
+    Two maps differ at a sample if the distance between its two matches along the surface exceeds `distance`.
+
+    **Arguments:**
+
+    - `x`, `y`: the proxies of X (s samples) and Y (t samples).
+    - `first`, `second`: the two maps (s,), as 0-based indices of samples of Y.
+    - `distance`: the distance, in the unit of the distances on Y.
+    """
+    return float(x.areas @ (y.distances[first, second] > distance))
+
+
 def deformation(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"], radius: float) -> float:
     """Measure how far a map deviates from a rigid motion on each patch of X.
 

@@ -35,7 +35,7 @@ def refine_in_stages(
 
     If the initial map exchanges symmetric limbs, refinement does not correct this error, because both limbs
     have the same shape. With `repair`, the outcome is checked for orientation reversal and discontinuities
-    (`jaxsmw.repair.scores`). If the outcome looks wrong, repair takes the following three steps. The stage at
+    (`jaxsmw.repair.scores`). If the outcome looks wrong, repair takes the following two steps. The stage at
     position `repair.stage` is called the repeated stage.
 
     1. Alternatives: `jaxsmw.repair.alternatives` refines many initial maps on a thousand samples. The best of
@@ -45,14 +45,12 @@ def refine_in_stages(
     2. Rounds: each round runs the repeated stage and all later stages again. Each round repairs one kind of
        fault of the previous map, orientation reversal or discontinuities. The first functional map of the
        repeated stage is computed without the vertices that have this fault. If a map has both kinds of fault,
-       the rounds alternate between the two kinds.
-    3. Fallback: the repeated stage and all later stages run once more, from the best outcome of the rounds.
-       The repeated stage then uses the numbers of eigenvectors in `fallback_levels`. The map of the fallback
-       is kept if its score is better. The map of the fallback is also kept if it looks right and its score is
-       worse by less than `score_tolerance`. In all other cases, the best map of the rounds is kept.
+       the rounds alternate between the two kinds. If the second-best outcome of step 1 has faults, this
+       outcome is repaired as well. The repaired outcome is used if it has no faults and the best score.
 
-    If the second-best outcome of step 1 has faults, steps 2 and 3 also repair this outcome. The repaired
-    outcome is used if it has no faults and the best score.
+    Some wrong maps look right. If the distortion of an outcome is at least `compared`, step 1 therefore runs
+    as well. Only alternatives that differ from the map and have a better score are then refined at all
+    vertices.
 
     Maps between non-isometric shapes need further passes; see `refine_further`.
 
@@ -77,19 +75,23 @@ def refine_in_stages(
     best = judge.judged(refined or runner.run(0, Outcome([], first)))
     if repair is None or not best.successful:
         return best
-    if not best.suspicious:
+    assert best.distortion is not None
+    from_shot = isinstance(prepared.init, str) and prepared.init == "shot"
+    computes = alternatives is None and from_shot
+    if best.suspicious:
+        logger.info(
+            "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
+            "%.0f %% of the area)",
+            best.distortion,
+            repair.suspicious,
+            100 * repair.suspicious_area,
+        )
+    elif not computes or best.distortion < repair.compared:
         return best
-    logger.info(
-        "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
-        "%.0f %% of the area)",
-        best.distortion,
-        repair.suspicious,
-        100 * repair.suspicious_area,
-    )
-    if alternatives is None and isinstance(prepared.init, str) and prepared.init == "shot":
+    if computes:
         proxies = Alternatives(prepared, repair)
         judge = replace(judge, measure_deformation=proxies.deformation)
-        alternatives = proxies.best(best.unpadded_map(prepared.pair))
+        alternatives = proxies.best(best.unpadded_map(prepared.pair), only_better=not best.suspicious)
     repairer = _Repairer(runner, judge, repair)
     return repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives or ()))
 
@@ -104,9 +106,6 @@ def refine_further(
 ) -> Outcome:
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
-    If repair did not find a map that looks right, the `rivals` of the outcome are refined as well. The map
-    with the best score after the passes is returned.
-
     In each pass, the repeated stage and all later stages run again. `RepairSettings` explains how many passes
     run, and which passes are coarse.
 
@@ -118,8 +117,8 @@ def refine_further(
     - `outcome`: an outcome of `refine_in_stages`.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
-    **Returns:** The `Outcome` with the best score. The attribute `suspicious` is copied from the given
-    outcome. If no pass runs or all passes fail, the given outcome is returned.
+    **Returns:** The `Outcome` of the last pass. The attribute `suspicious` is copied from the given outcome.
+    If no pass runs or a pass fails, the given outcome is returned.
     """
     if repair is None or not outcome.successful:
         return outcome
@@ -133,17 +132,15 @@ def refine_further(
     runners = [runner] * repair.passes
     if change >= repair.coarse_from or aligned:
         runners = [*map(runner.coarse, repair.coarse_levels), runner]
-    refined = []
-    for further in (outcome, *outcome.rivals):
-        for one in runners:
-            if further.successful:
-                further = _Repairer(one, judge, repair).repeated(further)
+    further = outcome
+    for one in runners:
         if further.successful:
-            refined.append(judge.judged(further))
-    best = min(refined, key=judge.score, default=outcome)
+            further = _Repairer(one, judge, repair).repeated(further)
+    if not further.successful:
+        return outcome
     # Passes also lower the distortion of wrong maps. Therefore a low distortion after the passes does not
     # show that a map is right. (Table R36)
-    return best._replace(suspicious=outcome.suspicious)
+    return judge.judged(further)._replace(suspicious=outcome.suspicious)
 
 
 _View = tuple[Spectrum, Spectrum]
@@ -219,33 +216,16 @@ class _Repairer:
             outcomes.append(self._from_repeated(Outcome([], start)))
         best, *others = sorted(outcomes, key=self.judge.score)
         if not self.judge.looks_right(best):
-            # A right map with a fault can have a worse score than a wrong map without faults. The fallback
-            # lowers the scores of wrong maps as well. Therefore the second-best map is used only if it
-            # has no faults after the repair.
+            # A right map with a fault can have a worse score than a wrong map without faults. Therefore the
+            # second-best map is used only if it has no faults after the repair.
             faulty = (outcome for outcome in others[:1] if self.judge.faults(outcome))
-            mended = [other for other in map(self._by_rounds, faulty) if not self.judge.faults(other)]
-            best = min([self._by_rounds(best), *mended], key=self.judge.score)
+            mended = map(self._without_faults, faulty)
+            right = [other for other in mended if not self.judge.faults(other)]
+            best = min([self._without_faults(best), *right], key=self.judge.score)
         best = best._replace(suspicious=not self.judge.looks_right(best))
-        if best.suspicious:
-            best = best._replace(rivals=tuple(others[: self.settings.rivals]))
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)
         return best
-
-    def _by_rounds(self, outcome: Outcome) -> Outcome:
-        """Repair an outcome by rounds and by the fallback."""
-        outcome = self._without_faults(outcome)
-        _, stage = self.runner.steps[self.settings.stage]
-        fallback = _with_levels(stage, self.settings.fallback_levels)
-        last = self._from_repeated(outcome, fallback)
-        # The fallback depends less on the faults of previous maps than the rounds do. The outcome of the
-        # fallback is preferred if it looks right and its score is not much worse. Upside-down maps are not
-        # preferred, because their scores are worse by more than `score_tolerance`.
-        score = self.judge.score
-        preferred = (
-            self.judge.looks_right(last) and score(last) < score(outcome) + self.settings.score_tolerance
-        )
-        return last if preferred else min(outcome, last, key=score)
 
     def _without_faults(self, outcome: Outcome) -> Outcome:
         """Run rounds of repair and return the best outcome.
@@ -257,35 +237,30 @@ class _Repairer:
         for done in range(self.settings.rounds):
             if not (last.successful and best.suspicious and (faults := self.judge.faults(last))):
                 break
-            last = self._from_repeated(last, excluded=faults[done % len(faults)])
+            last = self._from_repeated(last, faults[done % len(faults)])
             best = min(best, last, key=self.judge.score)
         return best
 
-    def _from_repeated(
-        self, outcome: Outcome, stage: Stage | None = None, excluded: Bool[np.ndarray, " m"] | None = None
-    ) -> Outcome:
+    def _from_repeated(self, outcome: Outcome, excluded: Bool[np.ndarray, " m"] | None = None) -> Outcome:
         """Run the repeated stage and all later stages from the map of an outcome, and judge the result."""
-        return self.judge.judged(self.repeated(outcome, stage, excluded))
+        return self.judge.judged(self.repeated(outcome, excluded))
 
-    def repeated(
-        self, outcome: Outcome, stage: Stage | None = None, excluded: Bool[np.ndarray, " m"] | None = None
-    ) -> Outcome:
+    def repeated(self, outcome: Outcome, excluded: Bool[np.ndarray, " m"] | None = None) -> Outcome:
         """Run the repeated stage and all later stages from the map of an outcome.
 
         **Arguments:**
 
         - `outcome`: the outcome. If the outcome contains refinements of all stages, the refinements before
           the repeated stage are kept.
-        - `stage`: a stage that runs instead of the repeated stage.
         - `excluded`: a mask of the vertices of X (m,) that the repeated stage leaves out. If the stage uses
           samples, the vertices are left out only in its first functional map.
         """
         position = self.settings.stage
-        (spectrum_x, spectrum_y), usual = self.runner.steps[position]
+        (spectrum_x, spectrum_y), stage = self.runner.steps[position]
         if excluded is not None:
             spectrum_x = spectrum_x.excluding(jnp.asarray(pad_rows(excluded, len(spectrum_x.mask))))
         before = Outcome([], outcome.pointwise_map)
-        repeated = self.runner.run_one((spectrum_x, spectrum_y), stage or usual, before)
+        repeated = self.runner.run_one((spectrum_x, spectrum_y), stage, before)
         finished = self.runner.run(position + 1, repeated)
         kept = outcome.refinements[:position] if len(outcome.refinements) == len(self.runner.steps) else []
         return Outcome([*kept, *finished.refinements], outcome.initial_map)

@@ -29,7 +29,6 @@ class ScoreSettings:
     - `orientation_weight` (Table R6): the weight of orientation reversal in the distortion. This weight
       multiplies the share of X's area in which the orientation is reversed.
     - `area_eigenvectors`: the number of eigenvectors on which the area-based shape difference is computed.
-    - `different_distance`: two maps differ at a vertex if its two matches are more than this distance apart.
     """
 
     vertices_per_eigenvector: int = 10
@@ -39,7 +38,6 @@ class ScoreSettings:
     orientation_threshold: float = -0.2
     orientation_weight: float = 4.0
     area_eigenvectors: int = 20
-    different_distance: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ class AlternativeSettings:
     - `extremities`: the settings of the search for extremities, an `ExtremitySettings`.
     - `compared_pairings`: the largest number of pairings of extremities in the comparison of features. The
       most plausible pairings are compared; see `jaxsmw.repair.extremities.plausible_pairings`.
-    - `pairings` (Table R27): the number of initial maps from pairings of extremities.
+    - `pairings` (Tables R27 and R40): the number of initial maps from pairings of extremities.
     - `distance_weight`: the weight of the distances to extremities in the search for initial maps. SHOT has
       the weight 1.
     - `position_weight`: the weight of the positions along the principal axes in the same search.
@@ -125,27 +123,38 @@ class AlternativeSettings:
       the initial maps.
     - `repaired`: the number of refined maps whose faults are repaired. For each fault of such a map, the map
       is refined again without the faulty vertices.
+    - `fine_levels` (Table R40): the levels of a second refinement, which only promising maps receive. If
+      there are as many levels as in `levels`, and the largest level is the same, no further program is
+      compiled.
+    - `coarse_margin`, `promising`: a map is promising if its score exceeds the best score by at most
+      `coarse_margin`. At most `promising` maps are refined with `fine_levels`.
     - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
     - `patch_radius` (Table R28): the radius of the patches on which the deformation is measured.
+    - `different_distance`: two maps differ at a sample if the distance between its two matches along the
+      surface exceeds this value.
     - `different_areas` (Table R27): a tuple of shares of X's area, each above 0. An alternative map must
       differ from all earlier alternative maps on a minimum share. The entries of the tuple are the minimum
       shares for the second map, the third map, and so on. The last entry also applies to all further maps.
-    - `margin` (Table R28): the largest difference of scores between the best map and a returned map. Several
-      maps are returned, because a wrong map can have the best score.
+    - `margin` (Table R28): the largest difference of scores between the best map and a returned map, after
+      the second refinement. Several maps are returned, because a wrong map can have the best score.
     """
 
     samples: int = 1000
     radii: tuple[tuple[int, ...], ...] = ((1,), (1, 2, 4), (2, 4))
     extremities: ExtremitySettings = ExtremitySettings()
     compared_pairings: int = 64
-    pairings: int = 6
+    pairings: int = 12
     distance_weight: float = 2.25
     position_weight: float = 10.0
     levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20, 26, 35)
     descriptors: int = 30
     repaired: int = 3
+    fine_levels: tuple[int, ...] = (20, 20, 26, 26, 35, 35, 35, 35, 35, 35)
+    coarse_margin: float = 1.5
+    promising: int = 6
     eigenvectors: int = 50
     patch_radius: float = 0.2
+    different_distance: float = 0.2
     different_areas: tuple[float, ...] = (0.03, 0.03, 0.2)
     margin: float = 1.0
 
@@ -163,14 +172,13 @@ class RepairSettings:
 
     **Attributes:**
 
-    - `stage`: the stage that repair repeats, as a 0-based position in the stages of the preset. The refiner
-      of this stage must have levels.
-    - `fallback_levels` (entry R4): the numbers of eigenvectors in the iterations of the fallback. The
-      fallback repeats the stage once more after all rounds of repair. By default, the fallback begins with
-      fewer eigenvectors than the stage.
+    - `stage`: the stage that repair repeats, as a 0-based position in the stages of the preset.
     - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
       value is suspicious and is repaired. Correct maps between poses of one body have a distortion below this
       value.
+    - `compared` (Table R40): a positive number, usually above 1. A map with a distortion of at least this
+      value is compared with alternative maps, even if it is not suspicious. A value above `suspicious` has no
+      effect.
     - `suspicious_area` (Table R28): a share of X's area, from 0 to 1. A map is also suspicious if a fault
       covers at least this share.
     - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
@@ -189,9 +197,6 @@ class RepairSettings:
       than correct maps, and mirrored maps have a higher distortion.
     - `deformation_weight` (Table R28): the weight of the deformation in the score, at least 0. Upside-down
       maps and mirrored maps have larger deformations than right maps.
-    - `score_tolerance` (entry R4): a number of at least 0. The map of the fallback is preferred if it looks
-      right and its score is worse by less than this value. The scores of two correct maps mostly differ by
-      less than this value. The scores of a correct map and an upside-down map differ by more than this value.
     - `non_isometric` (Table R29): a number of at least 0. If the final map of two full shapes has an
       area-based shape difference of at least this value, the map is refined further, even if it looks right.
       The difference is smaller between poses of one body.
@@ -205,9 +210,6 @@ class RepairSettings:
     - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass.
       Tuples with the same length and the same maximum share a compiled program. If the refiner of the last
       stage has no levels, each coarse pass is the same as a usual pass.
-    - `rivals` (Table R36): the largest number of rivals. Rivals are the outcomes of the repair with the next
-      best scores after the best outcome. If the best outcome still looks wrong, the passes also refine the
-      rivals. The best outcome after the passes is chosen.
     - `aligned_preference` (entry R24): a number of at least 0. With `init="auto"`, asymmetric shapes are
       matched from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean
       expected error is below this multiple of the other map's mean expected error. Both expected errors are
@@ -215,46 +217,43 @@ class RepairSettings:
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 
-    **Raises:** `InputError` if a number is out of its range. `Preset` raises `InputError` if the stage at
-    position `stage` does not exist or has a refiner without levels.
+    **Raises:** `InputError` if a number is out of its range. `Preset` raises `InputError` if there is no
+    stage at position `stage`.
     """
 
     stage: int = 1
-    fallback_levels: tuple[int, ...] = (10, 10, 14, 14, 20, 20, 26, 35)
     suspicious: float = 1.12
+    compared: float = 1.05
     suspicious_area: float = 0.02
     doubtful: float = 1.15
     negligible_area: float = 0.002
     excessive_area: float = 0.5
-    rounds: int = 4
+    rounds: int = 1
     finalists: int = 4
     uncertainty_weight: float = 30.0
     deformation_weight: float = 5.0
-    score_tolerance: float = 0.25
-    non_isometric: float = 0.14
+    non_isometric: float = 0.09
     passes: int = 2
-    coarse_from: float = 0.3
+    coarse_from: float = 0.14
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
-    rivals: int = 2
     aligned_preference: float = 0.9
     alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
 
     def __post_init__(self) -> None:
-        for name in ("stage", "rounds", "finalists", "passes", "rivals"):
+        for name in ("stage", "rounds", "finalists", "passes"):
             check_whole_number(name, getattr(self, name), 0)
         for name in ("suspicious_area", "negligible_area", "excessive_area"):
             check_number(name, getattr(self, name), most=1.0)
         for name in (
             "uncertainty_weight",
             "deformation_weight",
-            "score_tolerance",
             "non_isometric",
             "coarse_from",
             "aligned_preference",
         ):
             check_number(name, getattr(self, name))
-        for name in ("suspicious", "doubtful"):
+        for name in ("suspicious", "compared", "doubtful"):
             check_number(name, getattr(self, name), positive=True)
 
 
