@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxsmw import creature_pair
+from jaxsmw import creature_pair, geodesic_error, match, read_mesh
+from jaxsmw.evaluation.datasets import open_data_set
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
@@ -17,6 +18,7 @@ from jaxsmw.preparation import prepare
 from jaxsmw.presets import PRESETS
 from jaxsmw.repair.alternatives import Alternatives
 from jaxsmw.repair.proxies import Proxy, deformation, distance_error, map_difference
+from jaxsmw.repair.rounds import refine_in_stages
 
 REPAIR = PRESETS["accurate"].repair
 # Fewer samples and levels, which compile faster.
@@ -175,3 +177,44 @@ def test_further_alternatives_differ_from_all_maps_before_them(unchecked):
         )
         chosen = Alternatives._distinct(alternatives, candidates)
         assert [one.found for one in chosen] == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("names", "looks_right"),
+    [
+        # All eigenvectors and descriptors agree better with an upside-down map at first.
+        (("hippo_walking", "dog2"), False),
+        # The usual map exchanges the hind legs, but it looks right.
+        (("muybridge_132_133_07", "muybridge_074_01"), True),
+    ],
+)
+def test_animals_are_matched_in_any_position(shared, names, looks_right):
+    """Alternative maps correct maps of real animals, and random rotations of both shapes change little."""
+    animals = open_data_set(shared / "data" / "smal_r")
+    pair = next(one for one in (*animals.pairs, *animals.others) if one.names == names)
+    meshes = [read_mesh(file) for file in pair.meshes]
+    truth = pair.ground_truth(*meshes)
+    preset = PRESETS["accurate"]
+    alone = replace(preset, repair=replace(preset.repair, finalists=0, rounds=0, non_isometric=10.0))
+    wrong = refine_in_stages(
+        prepare(
+            Pair.make(*meshes),
+            number_of_eigenvectors=preset.number_of_eigenvectors,
+            number_of_descriptors=preset.number_of_descriptors,
+            number_of_samples=preset.number_of_samples,
+        ),
+        alone.stages,
+        alone.repair,
+    )
+    assert wrong.suspicious != looks_right
+
+    def mean_error(found):
+        return geodesic_error(meshes[1], found, truth, number_of_samples=300).mean
+
+    assert mean_error(np.asarray(wrong.pointwise_map)[: len(meshes[0].vertices)].astype(np.int64)) > 0.1
+    turned = [moved(mesh, Rotation.random(random_state=seed)) for seed, mesh in enumerate(meshes)]
+    found, again = (match(*shapes).pointwise_map for shapes in (meshes, turned))
+    assert max(mean_error(found), mean_error(again)) < 0.035
+    distances = np.linalg.norm(meshes[1].vertices[found] - meshes[1].vertices[again], axis=1)
+    assert np.mean(distances > 0.05 * meshes[1].area ** 0.5) < 0.02

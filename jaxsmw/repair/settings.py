@@ -66,8 +66,8 @@ class ExpectedErrorSettings:
     distortion_weight: float = 2.0
     misplaced_weight: float = 0.5
     heat_time: float = 1e-3
-    area_weight: float = 0.7
-    isometric_difference: float = 0.09
+    area_weight: float = 0.8
+    isometric_difference: float = 0.06
 
 
 @dataclass(frozen=True)

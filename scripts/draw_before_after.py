@@ -1,0 +1,80 @@
+"""Draws the maps of several pairs before and after a change of the code, side by side.
+
+Each pair has three bodies: the source with the colours of the map before, the source with the colours of the
+map after, and the target. The two directories contain one map per pair. The map of the pair "a b" is the file
+`a__b.npy`, which `jaxsmw match a.off b.off --output a__b.npy` writes. Run
+
+    python scripts/draw_before_after.py DATA_DIRECTORY/smal_r PAIRS.txt BEFORE AFTER PICTURE.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+from pathlib import Path
+
+import numpy as np
+from draw_documentation import save_small
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+import jaxsmw
+from jaxsmw import geodesic_error, read_mesh
+from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
+from jaxsmw.io.map_files import read_pointwise_map
+from jaxsmw.report.colors import position_colors
+from jaxsmw.report.figures import draw_mesh
+
+BODY, CAPTION, GAP = 150, 34, 10  # in pixels
+PAIRS_PER_ROW = 2
+
+
+def body(mesh: jaxsmw.Mesh, colors: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the picture of a body, which fills a square."""
+    buffer = io.BytesIO()
+    draw_mesh(mesh, colors).savefig(buffer, format="png", dpi=200)
+    picture = Image.open(buffer).convert("RGB")
+    picture.thumbnail((BODY, BODY), Image.Resampling.LANCZOS)
+    square = Image.new("RGB", (BODY, BODY), "white")
+    square.paste(picture, ((BODY - picture.width) // 2, (BODY - picture.height) // 2))
+    return np.asarray(square)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data_set", metavar="DATA_SET_DIRECTORY", type=Path)
+    parser.add_argument("pairs", metavar="PAIRS.txt", help="a list of pairs, one pair per line")
+    parser.add_argument("before", metavar="BEFORE", type=Path, help="directory of maps")
+    parser.add_argument("after", metavar="AFTER", type=Path, help="directory of maps")
+    parser.add_argument("picture", metavar="PICTURE.png", type=Path)
+    options = parser.parse_args()
+    panels = []
+    for pair in choose_pairs(open_data_set(options.data_set), options.pairs, 0):
+        source, target = (read_mesh(file) for file in pair.meshes)
+        truth, colors = pair.ground_truth(source, target), position_colors(target)
+        pictures, errors = [], []
+        for directory in (options.before, options.after):
+            found = read_pointwise_map(directory / f"{'__'.join(pair.names)}.npy", source, target)
+            errors.append(1e3 * geodesic_error(target, found, truth, number_of_samples=400).mean)
+            pictures.append(body(source, colors[found]))
+        panel = Image.new("RGB", (3 * BODY + GAP, BODY + CAPTION), "white")
+        panel.paste(Image.fromarray(np.hstack([*pictures, body(target, colors)])), (0, CAPTION))
+        words = f"{pair.name}\nbefore: {errors[0]:.0f}, after: {errors[1]:.0f}, target"
+        ImageDraw.Draw(panel).text((4, 2), words, fill="black", font=ImageFont.load_default(12))
+        panels.append(panel)
+        print(words.replace("\n", ": "), flush=True)
+    width, height = panels[0].size
+    rows = -(-len(panels) // PAIRS_PER_ROW)
+    sheet = Image.new("RGB", (PAIRS_PER_ROW * width, rows * height), "white")
+    for number, panel in enumerate(panels):
+        sheet.paste(panel, (number % PAIRS_PER_ROW * width, number // PAIRS_PER_ROW * height))
+    buffer = options.picture.with_suffix(".full.png")
+    sheet.save(buffer)
+    save_small(options.picture, buffer)
+    buffer.unlink()
+
+
+if __name__ == "__main__":
+    main()
