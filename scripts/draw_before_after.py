@@ -1,7 +1,7 @@
-"""Draws the maps of several pairs before and after a change of the code, side by side.
+"""Draws the errors of several pairs before and after a change of the code, side by side.
 
-Each pair has three bodies: the source with the colours of the map before, the source with the colours of the
-map after, and the target. The two directories contain one map per pair. The map of the pair "a b" is the file
+Each pair has three bodies: the source with the errors of the map before, the source with the errors of the map
+after, and the target. The two directories contain one map per pair. The map of the pair "a b" is the file
 `a__b.npy`, which `jaxsmw match a.off b.off --output a__b.npy` writes. Run
 
     python scripts/draw_before_after.py DATA_DIRECTORY/smal_r PAIRS.txt BEFORE AFTER PICTURE.png
@@ -17,22 +17,27 @@ import numpy as np
 from draw_documentation import save_small
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
+from scipy.spatial import KDTree
 
 import jaxsmw
 from jaxsmw import geodesic_error, read_mesh
 from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
 from jaxsmw.io.map_files import read_pointwise_map
-from jaxsmw.report.colors import position_colors
+from jaxsmw.report.colors import ERROR_LIMIT, error_colors
 from jaxsmw.report.figures import draw_mesh
 
 BODY, CAPTION, GAP = 150, 34, 10  # in pixels
 PAIRS_PER_ROW = 2
+# Errors are measured at this number of vertices. All other vertices have the error of the nearest one.
+MEASURED = 1500
 
 
-def body(mesh: jaxsmw.Mesh, colors: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the picture of a body, which fills a square."""
+def body(
+    mesh: jaxsmw.Mesh, colors: Float[np.ndarray, "n 3"] | None, up: str | None
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the picture of a body, which fits into a square."""
     buffer = io.BytesIO()
-    draw_mesh(mesh, colors).savefig(buffer, format="png", dpi=200)
+    draw_mesh(mesh, colors, up=up).savefig(buffer, format="png", dpi=200)
     picture = Image.open(buffer).convert("RGB")
     picture.thumbnail((BODY, BODY), Image.Resampling.LANCZOS)
     square = Image.new("RGB", (BODY, BODY), "white")
@@ -49,18 +54,21 @@ def main() -> None:
     parser.add_argument("before", metavar="BEFORE", type=Path, help="directory of maps")
     parser.add_argument("after", metavar="AFTER", type=Path, help="directory of maps")
     parser.add_argument("picture", metavar="PICTURE.png", type=Path)
+    parser.add_argument("--up", help="the axis that points up, such as y (default: guessed for each mesh)")
     options = parser.parse_args()
     panels = []
     for pair in choose_pairs(open_data_set(options.data_set), options.pairs, 0):
         source, target = (read_mesh(file) for file in pair.meshes)
-        truth, colors = pair.ground_truth(source, target), position_colors(target)
+        truth = pair.ground_truth(source, target)
         pictures, errors = [], []
         for directory in (options.before, options.after):
             found = read_pointwise_map(directory / f"{'__'.join(pair.names)}.npy", source, target)
-            errors.append(1e3 * geodesic_error(target, found, truth, number_of_samples=400).mean)
-            pictures.append(body(source, colors[found]))
+            error = geodesic_error(target, found, truth, number_of_samples=MEASURED)
+            errors.append(1e3 * error.mean)
+            _, nearest = KDTree(source.vertices[error.source_vertices]).query(source.vertices)
+            pictures.append(body(source, error_colors(error.errors[nearest], ERROR_LIMIT), options.up))
         panel = Image.new("RGB", (3 * BODY + GAP, BODY + CAPTION), "white")
-        panel.paste(Image.fromarray(np.hstack([*pictures, body(target, colors)])), (0, CAPTION))
+        panel.paste(Image.fromarray(np.hstack([*pictures, body(target, None, options.up)])), (0, CAPTION))
         words = f"{pair.name}\nbefore: {errors[0]:.0f}, after: {errors[1]:.0f}, target"
         ImageDraw.Draw(panel).text((4, 2), words, fill="black", font=ImageFont.load_default(12))
         panels.append(panel)

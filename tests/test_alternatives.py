@@ -185,7 +185,7 @@ def test_further_alternatives_differ_from_all_maps_before_them(unchecked):
     [
         # All eigenvectors and descriptors agree better with an upside-down map at first.
         (("hippo_walking", "dog2"), False),
-        # The usual map exchanges the hind legs, but it looks right.
+        # The usual map exchanges the front legs, but it looks right.
         (("muybridge_132_133_07", "muybridge_074_01"), True),
     ],
 )

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
@@ -235,17 +236,18 @@ class Alternatives:
         With `faults`, map number i is refined without the samples of X in the mask `faults[i]`.
         """
         x, y = self._spectra
-        candidates = []
-        for number, start in enumerate(initial):
-            weighted = x
-            if faults is not None:
-                weighted = x.excluding(jnp.asarray(pad_rows(faults[number], len(x.mask))))
-            padded = jax.device_put(pad_rows(start, len(x.mask)).astype(np.int32))
-            refined = stage.run(weighted, y, padded, partial=self.pair.partial)
+        size, candidates = len(x.mask), []
+
+        def run(number: int, start: SampleMap) -> Refinement:
+            weighted = x if faults is None else x.excluding(jnp.asarray(pad_rows(faults[number], size)))
+            padded = jax.device_put(pad_rows(start, size).astype(np.int32))
+            return stage.run(weighted, y, padded, partial=self.pair.partial)
+
+        # All refinements are started first. While they run, the host computes the scores of finished ones.
+        for refined in [run(*one) for one in enumerate(initial)]:
             if refined.result == RESULTS.successful:
                 found = np.asarray(refined.pointwise_map)[: len(self.x.areas)].astype(np.int64)
-                # The score of a map is computed at all vertices.
-                everywhere = jax.device_put(self._extended(found))
+                everywhere = jax.device_put(self._extended(found))  # scores are computed at all vertices
                 refined = eqx.tree_at(lambda tree: tree.pointwise_map, refined, everywhere)
                 score = self.judge.score(self.judge.judged(Outcome([refined], everywhere)))
                 candidates.append(_Candidate(score, found))

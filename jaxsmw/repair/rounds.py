@@ -45,8 +45,8 @@ def refine_in_stages(
     2. Rounds: each round runs the repeated stage and all later stages again. Each round repairs one kind of
        fault of the previous map, orientation reversal or discontinuities. The first functional map of the
        repeated stage is computed without the vertices that have this fault. If a map has both kinds of fault,
-       the rounds alternate between the two kinds. If the second-best outcome of step 1 has faults, this
-       outcome is repaired as well. The repaired outcome is used if it has no faults and the best score.
+       the rounds alternate between the two kinds. The second-best outcome of step 1 is repaired as well. The
+       outcome with the best score is used.
 
     Some wrong maps look right. If the distortion of an outcome is at least `compared`, step 1 therefore runs
     as well. Only alternatives that differ from the map and have a better score are then refined at all
@@ -118,7 +118,8 @@ def refine_further(
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Returns:** The `Outcome` of the last pass. The attribute `suspicious` is copied from the given outcome.
-    If no pass runs or a pass fails, the given outcome is returned.
+    The given outcome is returned if no pass runs, if a pass fails, or if the passes make the score worse by
+    more than `repair.pass_tolerance`.
     """
     if repair is None or not outcome.successful:
         return outcome
@@ -136,11 +137,13 @@ def refine_further(
     for one in runners:
         if further.successful:
             further = _Repairer(one, judge, repair).repeated(further)
-    if not further.successful:
+    before, after = judge.judged(outcome._replace(deformation=0.0)), judge.judged(further)
+    # Coarse passes worsen some maps of shapes with topological noise.
+    if not judge.score(after) <= judge.score(before) + repair.pass_tolerance:
         return outcome
     # Passes also lower the distortion of wrong maps. Therefore a low distortion after the passes does not
     # show that a map is right. (Table R36)
-    return judge.judged(further)._replace(suspicious=outcome.suspicious)
+    return after._replace(suspicious=outcome.suspicious)
 
 
 _View = tuple[Spectrum, Spectrum]
@@ -216,12 +219,8 @@ class _Repairer:
             outcomes.append(self._from_repeated(Outcome([], start)))
         best, *others = sorted(outcomes, key=self.judge.score)
         if not self.judge.looks_right(best):
-            # A right map with a fault can have a worse score than a wrong map without faults. Therefore the
-            # second-best map is used only if it has no faults after the repair.
-            faulty = (outcome for outcome in others[:1] if self.judge.faults(outcome))
-            mended = map(self._without_faults, faulty)
-            right = [other for other in mended if not self.judge.faults(other)]
-            best = min([self._without_faults(best), *right], key=self.judge.score)
+            # A right map with faults can have a worse score than a wrong map without faults.
+            best = min(map(self._without_faults, (best, *others[:1])), key=self.judge.score)
         best = best._replace(suspicious=not self.judge.looks_right(best))
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)

@@ -66,8 +66,8 @@ class ExpectedErrorSettings:
     distortion_weight: float = 2.0
     misplaced_weight: float = 0.5
     heat_time: float = 1e-3
-    area_weight: float = 0.8
-    isometric_difference: float = 0.06
+    area_weight: float = 0.7
+    isometric_difference: float = 0.09
 
 
 @dataclass(frozen=True)
@@ -203,6 +203,8 @@ class RepairSettings:
     - `passes` (Table R29): the number of usual passes, at least 0. In a usual pass, the repeated stage and
       all later stages run again. Maps between non-isometric shapes need further passes, because such maps
       converge more slowly than maps between poses of one body.
+    - `pass_tolerance` (Table R40): a number of at least 0. If all passes together increase the score by more
+      than this value, the map before the passes is kept.
     - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
       value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
       effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
@@ -232,9 +234,10 @@ class RepairSettings:
     finalists: int = 4
     uncertainty_weight: float = 30.0
     deformation_weight: float = 5.0
-    non_isometric: float = 0.09
+    non_isometric: float = 0.14
     passes: int = 2
-    coarse_from: float = 0.14
+    pass_tolerance: float = 0.35
+    coarse_from: float = 0.3
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
     aligned_preference: float = 0.9
     alternatives: AlternativeSettings = AlternativeSettings()
@@ -249,6 +252,7 @@ class RepairSettings:
             "uncertainty_weight",
             "deformation_weight",
             "non_isometric",
+            "pass_tolerance",
             "coarse_from",
             "aligned_preference",
         ):
