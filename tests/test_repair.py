@@ -1,6 +1,7 @@
 """Stages run one after the other, and maps that look wrong are repaired."""
 
 from dataclasses import fields, replace
+from functools import partial, partialmethod
 
 import numpy as np
 import pytest
@@ -155,6 +156,23 @@ def test_passes_do_not_clear_the_suspicion(body, identity):
     for suspicious in (True, False):
         found = refine_further(prepared, [STAGE], settings, once._replace(suspicious=suspicious))
         assert found.suspicious == suspicious and len(found.refinements) == 1 and found.distortion < 10
+
+
+def test_passes_that_worsen_the_score_are_undone(body, monkeypatch):
+    mesh, spectrum = body
+    noise = np.random.default_rng(0).normal(scale=0.3, size=mesh.vertices.shape)
+    start = KDTree(mesh.vertices).query(mesh.vertices + noise)[1]
+    settings = replace(REPAIR, non_isometric=0.0, coarse_from=10.0, passes=1, pass_tolerance=1.0)
+    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, start, start)
+    once = refine_in_stages(prepared, [Stage(FeatureRegression((30,)))], None)
+    further = partial(refine_further, prepared, [STAGE], settings)
+
+    def score(self, outcome, *, after):
+        return after if np.any(outcome.pointwise_map != once.pointwise_map) else 0.0
+
+    for after, kept in ((-1.0, False), (0.9, False), (1.1, True), (np.nan, True)):
+        monkeypatch.setattr(Judge, "score", partialmethod(score, after=after))
+        assert (further(once) is once) == kept
 
 
 def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity):

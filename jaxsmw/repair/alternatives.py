@@ -45,7 +45,7 @@ class Alternatives:
     """Alternative maps of a pair, computed and compared on proxies.
 
     Each shape is reduced to about a thousand samples. A feature regression with few eigenvectors refines many
-    initial maps of these samples. All refinements of samples take about as long as one refinement at all
+    initial maps of these samples. Five refinements of samples take about as long as one refinement at all
     vertices. An initial map is the result of a nearest-neighbour search in features. There are three kinds of
     features:
 

@@ -88,6 +88,8 @@ def refine_in_stages(
         )
     elif not computes or best.distortion < repair.compared:
         return best
+    else:
+        logger.info("the map is compared with alternative maps (distortion %.3f)", best.distortion)
     if computes:
         proxies = Alternatives(prepared, repair)
         judge = replace(judge, measure_deformation=proxies.deformation)
