@@ -33,7 +33,7 @@ class Preset:
     **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage has the
     position `repair.stage`. `InputError` is also raised if one of these rules is broken. The last stage must
     not end on samples. If a stage ends on samples, the next stage must start on samples, and must not have
-    more samples.
+    more samples. The stage that repair repeats must have levels.
     """
 
     stages: tuple[Stage, ...]
@@ -114,6 +114,11 @@ def _check_stages(name: str, stages: tuple[Stage, ...], repair: RepairSettings |
         raise InputError(
             f"repair repeats stage {repair.stage}, but the stages are 0 to {len(stages) - 1}: "
             "give RepairSettings(stage=...) with one of these numbers."
+        )
+    if not stages[repair.stage].refiner.levels:
+        raise InputError(
+            f"repair repeats stage {repair.stage}, but {type(stages[repair.stage].refiner).__name__} has no "
+            "levels: give RepairSettings(stage=...) with a stage of FeatureRegression or Registration."
         )
 
 

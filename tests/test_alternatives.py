@@ -9,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxsmw import creature_pair, geodesic_error, match, read_mesh
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import open_data_set
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
@@ -17,8 +19,11 @@ from jaxsmw.pair import Pair
 from jaxsmw.preparation import prepare
 from jaxsmw.presets import PRESETS
 from jaxsmw.repair.alternatives import Alternatives
+from jaxsmw.repair.outcome import Judge
 from jaxsmw.repair.proxies import Proxy, deformation, distance_error, map_difference
 from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.repair.settings import AlternativeSettings
+from jaxsmw.stage import Stage
 
 REPAIR = PRESETS["accurate"].repair
 # Fewer samples and levels, which compile faster.
@@ -151,6 +156,47 @@ def test_only_better_maps_that_differ_from_the_known_map_are_tried(pair):
     assert mean_error(mesh_y, better, truth) < 0.08
 
 
+@pytest.mark.parametrize(
+    ("init", "compared", "finalists", "is_partial", "compares"),
+    [
+        ("shot", 0.5, 1, False, True),
+        ("shot", 10.0, 1, False, False),
+        ("shot", 0.5, 0, False, False),
+        ("shot", 0.5, 1, True, False),
+        ("wks", 0.5, 1, False, False),
+    ],
+)
+def test_maps_that_look_right_are_compared(
+    pair, monkeypatch, init, compared, finalists, is_partial, compares
+):
+    """An alternative map replaces a map that looks right if its score is better."""
+    mesh_x, mesh_y, truth = pair
+    asked = []
+
+    def best(self, known, *, only_better):
+        asked.append(only_better)
+        yield truth
+
+    monkeypatch.setattr(Alternatives, "best", best)
+    monkeypatch.setattr(Judge, "score", lambda self, outcome: -float(len(outcome.refinements) == 1))
+    settings = replace(
+        REPAIR, stage=1, suspicious=100.0, suspicious_area=1.0, compared=compared, finalists=finalists
+    )
+    stages = [Stage(FeatureRegression((20,))), Stage(FeatureRegression((20, 40)))]
+    start = prepared(mesh_x, mesh_y, partial=is_partial)
+    found = refine_in_stages(replace(start, init=init), stages, settings)
+    assert asked == [True] * compares and not found.suspicious
+    assert len(found.refinements) == (1 if compares else 2)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"promising": 0}, {"repaired": -1}, {"fine_levels": ()}, {"different_areas": (0.03, 0.0)}]
+)
+def test_wrong_settings_of_alternatives_are_refused(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        AlternativeSettings(**wrong)
+
+
 def test_the_difference_of_two_maps_is_a_share_of_the_area(pair):
     """Matches that are close in space but not along the surface are different."""
     mesh, _, _ = pair
@@ -183,7 +229,7 @@ def test_further_alternatives_differ_from_all_maps_before_them(unchecked):
 @pytest.mark.parametrize(
     ("names", "looks_right"),
     [
-        # All eigenvectors and descriptors agree better with an upside-down map at first.
+        # After the first refinement on proxies, an upside-down map has the best score without more pairings.
         (("hippo_walking", "dog2"), False),
         # The usual map exchanges the front legs, but it looks right.
         (("muybridge_132_133_07", "muybridge_074_01"), True),
@@ -196,7 +242,6 @@ def test_animals_are_matched_in_any_position(shared, names, looks_right):
     meshes = [read_mesh(file) for file in pair.meshes]
     truth = pair.ground_truth(*meshes)
     preset = PRESETS["accurate"]
-    alone = replace(preset, repair=replace(preset.repair, finalists=0, rounds=0, non_isometric=10.0))
     wrong = refine_in_stages(
         prepare(
             Pair.make(*meshes),
@@ -204,8 +249,8 @@ def test_animals_are_matched_in_any_position(shared, names, looks_right):
             number_of_descriptors=preset.number_of_descriptors,
             number_of_samples=preset.number_of_samples,
         ),
-        alone.stages,
-        alone.repair,
+        preset.stages,
+        replace(preset.repair, finalists=0, rounds=0),
     )
     assert wrong.suspicious != looks_right
 

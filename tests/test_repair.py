@@ -170,6 +170,7 @@ def test_passes_that_worsen_the_score_are_undone(body, monkeypatch):
     def score(self, outcome, *, after):
         return after if np.any(outcome.pointwise_map != once.pointwise_map) else 0.0
 
+    assert refine_further(prepared, [STAGE], replace(settings, passes=0), once) is once
     for after, kept in ((-1.0, False), (0.9, False), (1.1, True), (np.nan, True)):
         monkeypatch.setattr(Judge, "score", partialmethod(score, after=after))
         assert (further(once) is once) == kept
@@ -229,6 +230,7 @@ def test_default_repair_settings_are_those_of_the_preset_and_documented():
     [
         (lambda: Preset(()), "at least one stage"),
         (lambda: Preset((STAGE,), RepairSettings()), "repair repeats stage 1, but the stages are 0 to 0"),
+        (lambda: Preset((Stage(),), REPAIR), "WaveletPreservation has no levels"),
         (lambda: Preset((SAMPLED, ENDING)), "the last stage ends on samples"),
         (
             lambda: Preset((STAGE,), large_stages=(ENDING, SAMPLED)),

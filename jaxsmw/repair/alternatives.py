@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import count, islice
+from itertools import chain, count, islice
 from typing import NamedTuple
 
 import equinox as eqx
@@ -81,9 +81,12 @@ class Alternatives:
             number_of_descriptors=0 if prepared.spectrum_x.descriptors is None else chosen.descriptors,
         )
         fewest = min(len(self.x.areas), len(self.y.areas))
-        self._coarse, self._fine = stage.fitted(fewest), stage.with_levels(chosen.fine_levels).fitted(fewest)
-        finer = max(self._coarse, self._fine, key=lambda stage: stage.number_of_eigenvectors)
-        spectra = finer.view(self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial)
+        self._coarse = stage.fitted(fewest)
+        self._fine = stage.with_levels(chosen.fine_levels).fitted(fewest)
+        largest = max(self._coarse, self._fine, key=lambda one: one.number_of_eigenvectors)
+        spectra = largest.view(
+            self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial
+        )
         self._spectra = [spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in spectra]
         coarse_x, coarse_y = (
             side.truncate(chosen.eigenvectors) for side in (prepared.spectrum_x, prepared.spectrum_y)
@@ -107,8 +110,8 @@ class Alternatives:
         """Yield alternative maps that differ from each other. Maps with better scores mostly come first.
 
         All initial maps are refined. For each fault of the best refined maps, a refinement without the faulty
-        samples gives a further map. The most promising of all these maps are then refined with more
-        eigenvectors. Afterwards, right maps are easier to distinguish from wrong maps. (Table R40)
+        samples gives a further map. The most promising of all these maps are then refined once more, with
+        `fine_levels`. Afterwards, right maps are easier to distinguish from wrong maps. (Table R40)
 
         **Arguments:**
 
@@ -118,8 +121,8 @@ class Alternatives:
         **Returns:** An iterator over maps T: X -> Y (m,), 0-based vertices of Y.
         """
         chosen, usual = self.settings.alternatives, self._reduced(known)
-        coarse = self._refined(self._coarse, [*self._initial_maps(), usual])
-        repaired = self._without_faults(list(islice(self._distinct(coarse), chosen.repaired)))
+        coarse = self._refined(self._coarse, chain(self._initial_maps(), [usual]))
+        repaired = self._without_faults(islice(self._distinct(coarse), chosen.repaired))
         coarse = sorted(coarse + repaired, key=lambda candidate: candidate.score)
         promising = islice(self._distinct(_within(chosen.coarse_margin, coarse)), chosen.promising)
         fine = self._refined(self._fine, [candidate.found for candidate in promising])
@@ -150,7 +153,7 @@ class Alternatives:
     def _difference(self, first: SampleMap, second: SampleMap) -> float:
         return map_difference(self.x, self.y, first, second, self.settings.alternatives.different_distance)
 
-    def _without_faults(self, candidates: Sequence[_Candidate]) -> list[_Candidate]:
+    def _without_faults(self, candidates: Iterable[_Candidate]) -> list[_Candidate]:
         """For each fault of each candidate, refine the map of samples without the faulty ones."""
         starts, faults = [], []
         for candidate in candidates:
@@ -243,13 +246,13 @@ class Alternatives:
             padded = jax.device_put(pad_rows(start, size).astype(np.int32))
             return stage.run(weighted, y, padded, partial=self.pair.partial)
 
-        # All refinements are started first. While they run, the host computes the scores of finished ones.
+        # All refinements are started first. The host scores a finished refinement while the others run.
         for refined in [run(*one) for one in enumerate(initial)]:
             if refined.result == RESULTS.successful:
                 found = np.asarray(refined.pointwise_map)[: len(self.x.areas)].astype(np.int64)
                 everywhere = jax.device_put(self._extended(found))  # scores are computed at all vertices
                 refined = eqx.tree_at(lambda tree: tree.pointwise_map, refined, everywhere)
-                score = self.judge.score(self.judge.judged(Outcome([refined], everywhere)))
+                score = self.judge.score(self.judge.measured(Outcome([refined], everywhere)))
                 candidates.append(_Candidate(score, found))
         return sorted(candidates, key=lambda candidate: candidate.score)
 

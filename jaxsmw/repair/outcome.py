@@ -108,17 +108,27 @@ class Judge:
         If `measure_deformation` is given, the attribute `deformation` is computed as well. If a stage failed,
         the distortion is infinite and the outcome is suspicious.
         """
+        outcome = self.measured(outcome)
+        assert outcome.distortion is not None
+        suspicious = not outcome.distortion < self.settings.suspicious
+        if not suspicious and self.settings.suspicious_area < 1:
+            largest = max(map(self.pair.mesh_x.average, self.faults(outcome)), default=0)
+            suspicious = bool(largest >= self.settings.suspicious_area)
+        return outcome._replace(suspicious=suspicious)
+
+    def measured(self, outcome: Outcome) -> Outcome:
+        """Compute the attributes that determine the `score` of an outcome, and return the outcome.
+
+        These are the distortion and, if `measure_deformation` is given, the deformation. If a stage failed,
+        the distortion is infinite.
+        """
         if not outcome.successful:
-            return outcome._replace(distortion=np.inf, suspicious=True)
+            return outcome._replace(distortion=np.inf)
         matches = outcome.unpadded_map(self.pair)
         if self.measure_deformation is not None:
             outcome = outcome._replace(deformation=self.measure_deformation(matches))
         found = distortion(self.pair, matches, self.spectrum_x, self.settings.scores)
-        outcome = outcome._replace(distortion=found, suspicious=not found < self.settings.suspicious)
-        if not outcome.suspicious and self.settings.suspicious_area < 1:
-            largest = max(map(self.pair.mesh_x.average, self.faults(outcome)), default=0)
-            outcome = outcome._replace(suspicious=bool(largest >= self.settings.suspicious_area))
-        return outcome
+        return outcome._replace(distortion=found)
 
     def score(self, outcome: Outcome) -> float:
         """Return the `score` of an outcome with the weights of the settings; lower is better."""

@@ -45,12 +45,13 @@ def refine_in_stages(
     2. Rounds: each round runs the repeated stage and all later stages again. Each round repairs one kind of
        fault of the previous map, orientation reversal or discontinuities. The first functional map of the
        repeated stage is computed without the vertices that have this fault. If a map has both kinds of fault,
-       the rounds alternate between the two kinds. The second-best outcome of step 1 is repaired as well. The
-       outcome with the best score is used.
+       the first round repairs the orientation reversal, and further rounds alternate between the two kinds.
+       If the second-best outcome of step 1 has faults, this outcome is repaired as well. The outcome with the
+       best score is used.
 
-    Some wrong maps look right. If the distortion of an outcome is at least `compared`, step 1 therefore runs
-    as well. Only alternatives that differ from the map and have a better score are then refined at all
-    vertices.
+    Some wrong maps look right. For two full shapes with the initial map `"shot"`, alternatives are therefore
+    computed if the distortion of the outcome is at least `compared`. Only alternatives that differ from the
+    map, and precede all similar maps in the order of their scores, are then refined at all vertices.
 
     Maps between non-isometric shapes need further passes; see `refine_further`.
 
@@ -77,7 +78,8 @@ def refine_in_stages(
         return best
     assert best.distortion is not None
     from_shot = isinstance(prepared.init, str) and prepared.init == "shot"
-    computes = alternatives is None and from_shot
+    computes_alternatives = alternatives is None and from_shot and repair.finalists > 0
+    compares = computes_alternatives and not prepared.pair.partial
     if best.suspicious:
         logger.info(
             "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
@@ -86,11 +88,11 @@ def refine_in_stages(
             repair.suspicious,
             100 * repair.suspicious_area,
         )
-    elif not computes or best.distortion < repair.compared:
-        return best
-    else:
+    elif compares and best.distortion >= repair.compared:
         logger.info("the map is compared with alternative maps (distortion %.3f)", best.distortion)
-    if computes:
+    else:
+        return best
+    if computes_alternatives:
         proxies = Alternatives(prepared, repair)
         judge = replace(judge, measure_deformation=proxies.deformation)
         alternatives = proxies.best(best.unpadded_map(prepared.pair), only_better=not best.suspicious)
@@ -120,8 +122,8 @@ def refine_further(
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Returns:** The `Outcome` of the last pass. The attribute `suspicious` is copied from the given outcome.
-    The given outcome is returned if no pass runs, if a pass fails, or if the passes make the score worse by
-    more than `repair.pass_tolerance`.
+    The given outcome is returned if no pass runs, if a pass fails, or if the passes make the score (without
+    the deformation) worse by more than `repair.pass_tolerance`.
     """
     if repair is None or not outcome.successful:
         return outcome
@@ -135,16 +137,18 @@ def refine_further(
     runners = [runner] * repair.passes
     if change >= repair.coarse_from or aligned:
         runners = [*map(runner.coarse, repair.coarse_levels), runner]
+    if not runners:
+        return outcome
     further = outcome
     for one in runners:
         if further.successful:
             further = _Repairer(one, judge, repair).repeated(further)
-    before, after = judge.judged(outcome._replace(deformation=0.0)), judge.judged(further)
+    before, after = outcome._replace(deformation=0.0), judge.judged(further)
     # Coarse passes worsen some maps of shapes with topological noise.
     if not judge.score(after) <= judge.score(before) + repair.pass_tolerance:
         return outcome
     # Passes also lower the distortion of wrong maps. Therefore a low distortion after the passes does not
-    # show that a map is right. (Table R36)
+    # show that a map is right. (Entry R36)
     return after._replace(suspicious=outcome.suspicious)
 
 
@@ -221,7 +225,8 @@ class _Repairer:
             outcomes.append(self._from_repeated(Outcome([], start)))
         best, *others = sorted(outcomes, key=self.judge.score)
         if not self.judge.looks_right(best):
-            # A right map with faults can have a worse score than a wrong map without faults.
+            # The second-best map is repaired as well, because a right map with faults can have a worse score
+            # than a wrong map without faults.
             best = min(map(self._without_faults, (best, *others[:1])), key=self.judge.score)
         best = best._replace(suspicious=not self.judge.looks_right(best))
         left = "; limbs may still be swapped" if best.suspicious else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxsmw.errors import check_number, check_whole_number
+from jaxsmw.errors import InputError, check_number, check_whole_number
 
 
 @dataclass(frozen=True)
@@ -124,19 +124,20 @@ class AlternativeSettings:
     - `repaired`: the number of refined maps whose faults are repaired. For each fault of such a map, the map
       is refined again without the faulty vertices.
     - `fine_levels` (Table R40): the levels of a second refinement, which only promising maps receive. If
-      there are as many levels as in `levels`, and the largest level is the same, no further program is
-      compiled.
-    - `coarse_margin`, `promising`: a map is promising if its score exceeds the best score by at most
-      `coarse_margin`. At most `promising` maps are refined with `fine_levels`.
+      there are as many levels as in `levels`, no further program is compiled.
+    - `coarse_margin`: a map is promising if its score exceeds the best score by at most this number.
+    - `promising`: the largest number of promising maps, at least 1.
     - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
     - `patch_radius` (Table R28): the radius of the patches on which the deformation is measured.
     - `different_distance`: two maps differ at a sample if the distance between its two matches along the
-      surface exceeds this value.
+      surface exceeds this value. Between connected components, the Euclidean distance counts.
     - `different_areas` (Table R27): a tuple of shares of X's area, each above 0. An alternative map must
       differ from all earlier alternative maps on a minimum share. The entries of the tuple are the minimum
       shares for the second map, the third map, and so on. The last entry also applies to all further maps.
     - `margin` (Table R28): the largest difference of scores between the best map and a returned map, after
       the second refinement. Several maps are returned, because a wrong map can have the best score.
+
+    **Raises:** `InputError` if a number is out of its range, or if a tuple is empty.
     """
 
     samples: int = 1000
@@ -158,6 +159,14 @@ class AlternativeSettings:
     different_areas: tuple[float, ...] = (0.03, 0.03, 0.2)
     margin: float = 1.0
 
+    def __post_init__(self) -> None:
+        for name, least in (("samples", 1), ("pairings", 0), ("repaired", 0), ("promising", 1)):
+            check_whole_number(name, getattr(self, name), least)
+        for name in ("levels", "fine_levels", "different_areas"):
+            values = getattr(self, name)
+            if not values or min(values) <= 0:
+                raise InputError(f"{name} is {values}: give at least one number, and only positive numbers.")
+
 
 @dataclass(frozen=True)
 class RepairSettings:
@@ -172,13 +181,14 @@ class RepairSettings:
 
     **Attributes:**
 
-    - `stage`: the stage that repair repeats, as a 0-based position in the stages of the preset.
+    - `stage`: the stage that repair repeats, as a 0-based position in the stages of the preset. The refiner
+      of this stage must have levels.
     - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
       value is suspicious and is repaired. Correct maps between poses of one body have a distortion below this
       value.
-    - `compared` (Table R40): a positive number, usually above 1. A map with a distortion of at least this
-      value is compared with alternative maps, even if it is not suspicious. A value above `suspicious` has no
-      effect.
+    - `compared` (Table R40): a positive number, usually above 1. A map of two full shapes with a distortion
+      of at least this value is compared with alternative maps, even if it is not suspicious. If `compared` is
+      at least `suspicious`, only suspicious maps are compared.
     - `suspicious_area` (Table R28): a share of X's area, from 0 to 1. A map is also suspicious if a fault
       covers at least this share.
     - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
@@ -203,8 +213,8 @@ class RepairSettings:
     - `passes` (Table R29): the number of usual passes, at least 0. In a usual pass, the repeated stage and
       all later stages run again. Maps between non-isometric shapes need further passes, because such maps
       converge more slowly than maps between poses of one body.
-    - `pass_tolerance` (Table R40): a number of at least 0. If all passes together increase the score by more
-      than this value, the map before the passes is kept.
+    - `pass_tolerance` (Table R40): a number of at least 0. If all passes together increase the score without
+      the deformation by more than this value, the map before the passes is kept.
     - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
       value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
       effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
@@ -219,8 +229,8 @@ class RepairSettings:
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 
-    **Raises:** `InputError` if a number is out of its range. `Preset` raises `InputError` if there is no
-    stage at position `stage`.
+    **Raises:** `InputError` if a number is out of its range. `Preset` raises `InputError` if the stage at
+    position `stage` does not exist or has a refiner without levels.
     """
 
     stage: int = 1
