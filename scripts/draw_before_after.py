@@ -1,7 +1,7 @@
 """Draws the errors of several pairs before and after a change of the code, side by side.
 
-Each pair has three bodies: the source with the errors of the map before, the source with the errors of the
-map after, and the target. The two directories contain one map per pair. The map of the pair "a b" is the file
+For each pair, the picture shows the source coloured by the errors before, the source coloured by the errors
+after, and the target. The two directories contain one map per pair. The map of the pair "a b" is the file
 `a__b.npy`, which `jaxsmw match a.off b.off --output a__b.npy` writes. Run
 
     python scripts/draw_before_after.py DATA_DIRECTORY/smal_r PAIRS.txt BEFORE AFTER PICTURE.png

@@ -176,6 +176,35 @@ def test_passes_that_worsen_the_score_are_undone(body, monkeypatch):
         assert (further(once) is once) == kept
 
 
+def test_a_rival_replaces_the_map_if_its_score_is_better_after_the_passes(body, mirrored, identity):
+    mesh, spectrum = body
+    settings = replace(REPAIR, non_isometric=0.0, passes=1)
+    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, identity, identity)
+    right = refine_in_stages(prepared, [STAGE], None)
+    wrong = refine_in_stages(replace(prepared, initial_map=mirrored), [STAGE], None)
+    for first, rival, margin, expected in (
+        (wrong, right, 0.35, identity),
+        (right, wrong, 0.35, identity),
+        (wrong, right, 100.0, mirrored),
+    ):
+        chosen = replace(settings, rival_margin=margin)
+        found = refine_further(prepared, [STAGE], chosen, first._replace(suspicious=True, rivals=(rival,)))
+        matches = np.asarray(found.pointwise_map)[: len(identity)]
+        assert found.suspicious and np.mean(matches == expected) > 0.9
+
+
+def test_rivals_are_kept_only_for_maps_that_look_wrong(body, mirrored, identity):
+    always_wrong = replace(REPAIR, suspicious=1.0, suspicious_area=1.0, doubtful=1.0, rounds=0)
+    for settings, margin, number in ((always_wrong, 100.0, 1), (always_wrong, 0.0, 0), (REPAIR, 100.0, 0)):
+        _, found = outcome(
+            body,
+            mirrored,
+            replace(settings, rival_margin=margin, non_isometric=10.0),
+            alternatives=[identity],
+        )
+        assert len(found.rivals) == number
+
+
 def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity):
     def none():
         raise AssertionError("an alternative initial map was computed")

@@ -39,7 +39,7 @@ def match_pairs(
     Spectra, descriptors and samples are computed once per shape. The descriptors of all shapes have the same
     axes (`DescriptorAxes`), so a map can differ slightly from the map of `match`. On accelerators or on
     several devices, pairs are refined in batches (`jaxsmw.refine_pairs`). On one CPU, pairs are refined one
-    after another. Only maps that look wrong are repaired. Mirror images are not considered.
+    after another. Maps are repaired as in `match`. Mirror images are not considered.
 
     **Arguments:**
 

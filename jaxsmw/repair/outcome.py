@@ -33,6 +33,8 @@ class Outcome(NamedTuple):
     - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed yet.
     - `deformation`: `jaxsmw.repair.proxies.deformation` of the final map; 0 if it was not computed.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
+    - `rivals`: other outcomes with nearly the same score. Rivals are kept only if the map still looks wrong
+      after repair.
     """
 
     refinements: list[Refinement]
@@ -40,6 +42,7 @@ class Outcome(NamedTuple):
     distortion: float | None = None
     deformation: float = 0.0
     suspicious: bool = False
+    rivals: tuple[Outcome, ...] = ()
 
     @property
     def successful(self) -> bool:

@@ -111,7 +111,9 @@ def refine_further(
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
     In each pass, the repeated stage and all later stages run again. `RepairSettings` explains how many passes
-    run, and which passes are coarse.
+    run, and which passes are coarse. If repair did not find a map that looks right, the passes also run from
+    the `rivals` of the outcome. A rival replaces the map if its score after the passes is better by more than
+    `repair.rival_margin`.
 
     **Arguments:**
 
@@ -139,13 +141,20 @@ def refine_further(
         runners = [*map(runner.coarse, repair.coarse_levels), runner]
     if not runners:
         return outcome
-    further = outcome
-    for one in runners:
-        if further.successful:
-            further = _Repairer(one, judge, repair).repeated(further)
-    before, after = outcome._replace(deformation=0.0), judge.judged(further)
+
+    def passed(start: Outcome) -> Outcome:
+        for one in runners:
+            if start.successful:
+                start = _Repairer(one, judge, repair).repeated(start)
+        return judge.judged(start)
+
+    after = passed(outcome)
+    # After the passes, scores distinguish right maps from wrong maps better than before. (Entry R36)
+    best_rival = min(map(passed, outcome.rivals), key=judge.score, default=after)
+    if judge.score(best_rival) < judge.score(after) - repair.rival_margin:
+        after = best_rival
     # Coarse passes worsen some maps of shapes with topological noise.
-    if not judge.score(after) <= judge.score(before) + repair.pass_tolerance:
+    if not judge.score(after) <= judge.score(outcome._replace(deformation=0.0)) + repair.pass_tolerance:
         return outcome
     # Passes also lower the distortion of wrong maps. Therefore a low distortion after the passes does not
     # show that a map is right. (Entry R36)
@@ -227,8 +236,11 @@ class _Repairer:
         if not self.judge.looks_right(best):
             # The second-best map is repaired as well, because a right map with faults can have a worse score
             # than a wrong map without faults.
-            best = min(map(self._without_faults, (best, *others[:1])), key=self.judge.score)
+            best, *others = sorted(map(self._without_faults, (best, *others[:1])), key=self.judge.score)
         best = best._replace(suspicious=not self.judge.looks_right(best))
+        if best.suspicious:
+            limit = self.judge.score(best) + self.settings.rival_margin
+            best = best._replace(rivals=tuple(one for one in others if self.judge.score(one) <= limit))
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)
         return best

@@ -215,6 +215,9 @@ class RepairSettings:
       converge more slowly than maps between poses of one body.
     - `pass_tolerance` (Table R40): a number of at least 0. If all passes together increase the score without
       the deformation by more than this value, the map before the passes is kept.
+    - `rival_margin` (entry R36): a number of at least 0. If the map still looks wrong after repair, an
+      outcome whose score is worse by at most this value is a rival. The passes also run from the rival. The
+      rival replaces the map if its score after the passes is better by more than this value.
     - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
       value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
       effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
@@ -247,6 +250,7 @@ class RepairSettings:
     non_isometric: float = 0.14
     passes: int = 2
     pass_tolerance: float = 0.35
+    rival_margin: float = 0.35
     coarse_from: float = 0.3
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
     aligned_preference: float = 0.9
@@ -263,6 +267,7 @@ class RepairSettings:
             "deformation_weight",
             "non_isometric",
             "pass_tolerance",
+            "rival_margin",
             "coarse_from",
             "aligned_preference",
         ):
