@@ -157,7 +157,7 @@ class AlternativeSettings:
     patch_radius: float = 0.2
     different_distance: float = 0.2
     different_areas: tuple[float, ...] = (0.03, 0.03, 0.2)
-    margin: float = 1.0
+    margin: float = 1.5
 
     def __post_init__(self) -> None:
         for name, least in (("samples", 1), ("pairings", 0), ("repaired", 0), ("promising", 1)):
@@ -243,7 +243,7 @@ class RepairSettings:
     doubtful: float = 1.15
     negligible_area: float = 0.002
     excessive_area: float = 0.5
-    rounds: int = 1
+    rounds: int = 4
     finalists: int = 4
     uncertainty_weight: float = 30.0
     deformation_weight: float = 5.0
