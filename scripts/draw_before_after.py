@@ -78,10 +78,10 @@ def main() -> None:
     sheet = Image.new("RGB", (PAIRS_PER_ROW * width, rows * height), "white")
     for number, panel in enumerate(panels):
         sheet.paste(panel, (number % PAIRS_PER_ROW * width, number // PAIRS_PER_ROW * height))
-    buffer = options.picture.with_suffix(".full.png")
-    sheet.save(buffer)
-    save_small(options.picture, buffer)
-    buffer.unlink()
+    full = options.picture.with_suffix(".full.png")
+    sheet.save(full)
+    save_small(options.picture, full)
+    full.unlink()
 
 
 if __name__ == "__main__":

@@ -123,7 +123,7 @@ def test_the_best_alternative_is_right_and_does_not_depend_on_the_position_in_sp
     first, *others = Alternatives(prepared(mesh_x, mesh_y), REPAIR).best(nonsense)
     assert first.dtype == np.int64 and first.shape == truth.shape
     assert mean_error(mesh_y, first, truth) < 0.08
-    assert len(others) < REPAIR.alternatives.promising
+    assert len(others) <= 3
     turned = moved(mesh_x, Rotation.random(random_state=1)), moved(mesh_y, Rotation.random(random_state=2))
     (again, *_) = Alternatives(prepared(*turned), REPAIR).best(nonsense)
     assert np.mean(again == first) > 0.99
@@ -210,6 +210,9 @@ def test_the_difference_of_two_maps_is_a_share_of_the_area(pair):
     assert far.any()
     expected = pytest.approx(proxy.areas[far].sum())
     assert map_difference(proxy, proxy, identity, moved, 0.2) == expected
+    # On the small piece of a partial pair, distances are small, because their unit comes from the full shape.
+    piece = Proxy(mesh, proxy.spectrum, proxy.samples, 100 * mesh.area**0.5)
+    assert map_difference(proxy, piece, identity, moved, 0.2) == 0
 
 
 def test_further_alternatives_differ_from_all_maps_before_them(unchecked):

@@ -97,7 +97,7 @@ def refine_in_stages(
         judge = replace(judge, measure_deformation=proxies.deformation)
         alternatives = proxies.best(best.unpadded_map(prepared.pair), only_better=not best.suspicious)
     repairer = _Repairer(runner, judge, repair)
-    return repairer.repaired(judge.judged(best), map(prepared.padded_map, alternatives or ()))
+    return repairer.repaired(judge.measured(best), map(prepared.padded_map, alternatives or ()))
 
 
 def refine_further(
@@ -146,7 +146,7 @@ def refine_further(
         for one in runners:
             if start.successful:
                 start = _Repairer(one, judge, repair).repeated(start)
-        return judge.judged(start)
+        return judge.measured(start)
 
     after = passed(outcome)
     # After the passes, scores distinguish right maps from wrong maps better than before. (Entry R36)
