@@ -150,21 +150,24 @@ def match(
     automatic = isinstance(init, str) and init == "auto"
     first_init = DEFAULT_INITIAL_MAP if automatic else init
     check_initial_map(pair, first_init)  # the check runs before the slow computation of the eigenbases
+    if isinstance(first_init, SurfacePoints):
+        first_init = first_init.nearest_corners(pair.mesh_y)  # cut meshes have other face numbers
+    surfaces = pair.without_shortcuts() if chosen.cuts_shortcuts else pair
     compiling = _compile_ahead(pair, chosen, history)
     seconds: dict[str, float] = {}
     with timed("eigenbases", seconds):
         spectra = paired_spectra(
-            pair, chosen.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
+            surfaces, chosen.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
         )
     decision = Decision(mirror == "yes")
     aligns = automatic and chosen.repair is not None  # "aligned" is used only for asymmetric shapes
     if (mirror == "auto" or aligns) and not partial:
         with timed("mirror test", seconds):
-            decision = Hands(pair, *spectra).decide(mirror)
+            decision = Hands(surfaces, *spectra).decide(mirror)
         if decision.mirrored and mirror == "auto":
             logger.info("%s: the mirror image of the source is matched", pair.name)
     prepared = prepare(
-        pair.mirrored() if decision.mirrored else pair,
+        surfaces.mirrored() if decision.mirrored else surfaces,
         number_of_eigenvectors=chosen.number_of_eigenvectors,
         number_of_descriptors=chosen.number_of_descriptors,
         number_of_samples=chosen.number_of_samples,
@@ -339,7 +342,9 @@ def _correspondence(
     )
     return Correspondence(
         pair=pair,
-        pointwise_map=extend_to_unreferenced(pair.mesh_x, np.asarray(last.pointwise_map).astype(np.int64)),
+        pointwise_map=extend_to_unreferenced(
+            prepared.pair.mesh_x, np.asarray(last.pointwise_map).astype(np.int64)
+        ),
         initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
         init=prepared.init if isinstance(prepared.init, str) else None,
         preset=preset,

@@ -14,6 +14,7 @@ from jaxsmw.errors import InputError, check_choice, check_number
 from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.geometry.scale import estimate_scale, relative_boundary
+from jaxsmw.geometry.shortcuts import cut_shortcuts
 from jaxsmw.runtime.threads import side_by_side
 
 logger = logging.getLogger("jaxsmw")
@@ -144,6 +145,14 @@ class Pair:
     def mirrored(self) -> Pair:
         """Return the pair with the mirror image of X in place of X; see `jaxsmw.Mesh.mirrored`."""
         return replace(self, mesh_x=self.mesh_x.mirrored())
+
+    def without_shortcuts(self) -> Pair:
+        """Return the pair with both meshes cut where they are fused with themselves; see `cut_shortcuts`.
+
+        All vertices keep their numbers. If nothing is cut, the result is `self`.
+        """
+        meshes = cut_shortcuts(self.mesh_x), cut_shortcuts(self.mesh_y)
+        return self if meshes == self.meshes else replace(self, mesh_x=meshes[0], mesh_y=meshes[1])
 
     def reversed(self) -> Pair:
         """Return the pair with X and Y exchanged."""

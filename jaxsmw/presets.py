@@ -72,6 +72,11 @@ class Preset:
         return replace(self, stages=without(self.stages), large_stages=large)
 
     @property
+    def cuts_shortcuts(self) -> bool:
+        """Whether meshes are cut where they are fused with themselves; see `RepairSettings.cut_shortcuts`."""
+        return self.repair is not None and self.repair.cut_shortcuts
+
+    @property
     def number_of_eigenvectors(self) -> int:
         """The largest number of eigenvectors that a stage uses."""
         return max(stage.number_of_eigenvectors for stage in self.stages)

@@ -229,6 +229,8 @@ class RepairSettings:
       matched from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean
       expected error is below this multiple of the other map's mean expected error. Both expected errors are
       computed without `ExpectedErrorSettings.area_weight`, and before further passes.
+    - `cut_shortcuts` (Table R41): whether a mesh is cut before it is matched, where its surface is fused with
+      another part of itself, for example a hand with a hip. See `jaxsmw.geometry.cut_shortcuts`.
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 
@@ -254,6 +256,7 @@ class RepairSettings:
     coarse_from: float = 0.3
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
     aligned_preference: float = 0.9
+    cut_shortcuts: bool = True
     alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
 
@@ -274,6 +277,8 @@ class RepairSettings:
             check_number(name, getattr(self, name))
         for name in ("suspicious", "compared", "doubtful"):
             check_number(name, getattr(self, name), positive=True)
+        if not isinstance(self.cut_shortcuts, bool):
+            raise InputError(f"cut_shortcuts is {self.cut_shortcuts!r}: give True or False.")
 
 
 WITHOUT_REPAIR = RepairSettings(suspicious=1.25, suspicious_area=1.0, doubtful=1.25)

@@ -16,6 +16,7 @@ from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
+from jaxsmw.preparation import prepare
 from jaxsmw.presets import PRESETS, PresetName
 from jaxsmw.repair.rounds import refine_further, refine_in_stages
 from jaxsmw.stage import Stage
@@ -79,9 +80,19 @@ class Chosen(Method):
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """Return the map X -> Y and the status code; see `Method`."""
         assert pair.prepared is not None
-        preset = PRESETS[self.preset].fitted(pair.prepared.pair.fewest_vertices())
-        outcome = refine_in_stages(pair.prepared, preset.stages, preset.repair)
-        outcome = refine_further(pair.prepared, preset.stages, preset.repair, outcome)
+        prepared, preset = pair.prepared, PRESETS[self.preset].fitted(pair.prepared.pair.fewest_vertices())
+        if preset.cuts_shortcuts:
+            surfaces = prepared.pair.without_shortcuts()
+            if surfaces is not prepared.pair:
+                prepared = prepare(
+                    surfaces,
+                    number_of_eigenvectors=preset.number_of_eigenvectors,
+                    number_of_descriptors=preset.number_of_descriptors,
+                    number_of_samples=preset.number_of_samples,
+                    init=prepared.init,
+                )
+        outcome = refine_in_stages(prepared, preset.stages, preset.repair)
+        outcome = refine_further(prepared, preset.stages, preset.repair, outcome)
         return outcome.pointwise_map, outcome.refinements[-1].result
 
 

@@ -1,0 +1,252 @@
+"""Cuts shortcuts, the places where a surface is fused with another part of itself."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import igl
+import numpy as np
+from jaxtyping import Bool, Float64, Int32, Int64
+from scipy.sparse import csgraph, csr_array
+
+from jaxsmw.geometry.mesh import Mesh, connected_components
+from jaxsmw.geometry.sampling import farthest_point_samples
+from jaxsmw.geometry.scans import in_small_components
+from jaxsmw.wording import count_of
+
+logger = logging.getLogger("jaxsmw")
+
+# A surface with more handles than this number is porous, for example a scanned bone, and is not cut.
+_MOST_HANDLES = 30
+# Edges in valleys count less than their length. The angle between the normals of the two faces decides. From
+# _FLAT to _VALLEY, the weight of the length falls from 1 to _VALLEY_WEIGHT.
+_FLAT, _VALLEY, _VALLEY_WEIGHT = np.radians(30), np.radians(60), 0.05
+# A loop surrounds a contact if its weighted length is at most _CONTACT times its length.
+_CONTACT = 0.35
+# Loops are searched from this number of vertices in valleys.
+_BASE_POINTS = 160
+
+
+def cut_shortcuts(mesh: Mesh) -> Mesh:
+    """Cut a mesh where the surface is fused with another part of itself, for example a hand with a hip.
+
+    If parts of a body touch each other, a scan often contains one surface that surrounds both parts. Such
+    *topological noise* shortens geodesic distances. Each contact is a handle of the surface and is surrounded
+    by a valley. The function searches the shortest loop around each handle, where edges in valleys count less
+    than their length. Candidates are the loops of tree-cotree decompositions (Erickson, Whittlesey 2005,
+    *Greedy optimal homotopy and homology generators*). A loop is cut if it mainly follows valleys. The cut
+    is a gap, which is one face wide.
+
+    **Arguments:**
+
+    - `mesh`: the surface, a `Mesh` (n vertices).
+
+    **Returns:** A `Mesh` with the same n vertices and fewer faces. The result is `mesh` itself if there is
+    nothing to cut, or if the surface has more than 30 handles.
+    """
+    manifold, origin = igl.split_nonmanifold(mesh.faces)
+    genus = _genus(manifold)
+    if not 0 < genus <= _MOST_HANDLES:
+        return mesh
+    surface = Mesh(mesh.vertices[origin], manifold)
+    cut, opened, chosen = np.zeros(manifold.shape, bool), manifold, []
+    loops = {loop.edges: loop for loop in _loops(surface)}
+    for loop in sorted(loops.values(), key=lambda loop: loop.weighted_length):
+        if loop.weighted_length > _CONTACT * loop.length:
+            continue
+        trial = cut.copy()
+        trial.flat[np.concatenate([loop.left, loop.right])] = True
+        further = igl.cut_mesh(surface.vertices, manifold, trial)[1]
+        # A second cut around the same handle does not reduce the genus.
+        if _genus(further) < genus:
+            cut, opened, genus = trial, further, _genus(further)
+            chosen.append(loop)
+        if genus == 0:
+            break
+    if not chosen:
+        return mesh
+    logger.info("%s: fused with itself, and cut along %s", mesh.name, count_of(len(chosen), "loop"))
+    removed = np.zeros(len(manifold), bool)
+    for loop in chosen:
+        strips = _faces_along(opened, loop.left), _faces_along(opened, loop.right)
+        removed |= min(strips, key=lambda strip: float(mesh.face_areas[strip].sum()))
+    # A gap can isolate a few faces, whose eigenfunctions would be useless.
+    kept = np.flatnonzero(~removed)
+    edges = np.concatenate([mesh.faces[kept, :2], mesh.faces[kept, 1:]])
+    component = connected_components(edges, len(mesh.vertices))[1][mesh.faces[kept, 0]]
+    removed[kept] = in_small_components(component, mesh.face_areas[kept], np.ones(len(kept), bool))[0]
+    dropped = np.union1d(mesh.dropped_faces, mesh.face_numbers[removed])
+    return replace(mesh, faces=mesh.faces[~removed], dropped_faces=dropped)
+
+
+def _genus(manifold: Int64[np.ndarray, "f 3"]) -> int:
+    """Return the number of handles of a manifold surface, which may have boundaries and several components.
+
+    The number of handles follows from Euler's formula. With c components and b boundary loops, the formula is
+    V - E + F = 2 (c - genus) - b.
+    """
+    edges = np.concatenate([manifold[:, :2], manifold[:, 1:]])
+    components, _ = connected_components(edges, int(manifold.max()) + 1)
+    boundaries = len(igl.boundary_loop_all(manifold))
+    return components - (igl.euler_characteristic(manifold) + boundaries) // 2
+
+
+def _faces_along(opened: Int64[np.ndarray, "f 3"], sides: Int64[np.ndarray, " l"]) -> Bool[np.ndarray, " f"]:
+    """Return a mask of the faces that touch the given sides of faces, after the surface was cut open."""
+    touched = np.zeros(int(opened.max()) + 1, bool)
+    touched[opened.ravel()[sides]] = True
+    touched[np.roll(opened, -1, axis=1).ravel()[sides]] = True
+    return np.asarray(touched[opened].any(axis=1))
+
+
+class _Loop(NamedTuple):
+    """A closed path along interior edges, with the sides of faces to its left and to its right.
+
+    Side i of face f leads from corner i to the next corner, and has the number 3 f + i.
+    """
+
+    weighted_length: float
+    length: float
+    left: Int64[np.ndarray, " l"]
+    right: Int64[np.ndarray, " l"]
+
+    @property
+    def edges(self) -> bytes:
+        """A key that is the same for all loops along the same edges."""
+        return np.sort(np.minimum(self.left, self.right)).tobytes()
+
+
+class _Edges(NamedTuple):
+    """The interior edges of a manifold surface. Each edge leads along the side `left` of a face."""
+
+    tail: Int64[np.ndarray, " e"]
+    head: Int64[np.ndarray, " e"]
+    left: Int64[np.ndarray, " e"]
+    right: Int64[np.ndarray, " e"]
+    length: Float64[np.ndarray, " e"]
+    weighted_length: Float64[np.ndarray, " e"]
+    in_valley: Bool[np.ndarray, " e"]
+
+    @classmethod
+    def of(cls, surface: Mesh, twin: Int64[np.ndarray, " s"]) -> _Edges:
+        """Return the interior edges. `twin` is the number of the same side in the other face, or -1."""
+        left = np.flatnonzero(np.arange(len(twin)) < twin)
+        right = twin[left]
+        tail, head, _ = (np.roll(surface.faces, -i, axis=1).ravel()[left] for i in range(3))
+        beyond = np.roll(surface.faces, -2, axis=1).ravel()[right]
+        normals = surface.area_vectors[left // 3], surface.area_vectors[right // 3]
+        # In a valley, the face to the right rises above the plane of the face to the left.
+        above = np.sum((surface.vertices[beyond] - surface.vertices[tail]) * normals[0], axis=1)
+        sine, cosine = np.linalg.norm(np.cross(*normals), axis=1), np.sum(normals[0] * normals[1], axis=1)
+        angle = np.arctan2(sine, cosine) * np.sign(above) * (-1 if surface.is_inside_out else 1)
+        # A valley does not follow edges exactly, so the steepest edge at each vertex decides.
+        steepest = np.zeros(len(surface.vertices))
+        np.maximum.at(steepest, np.concatenate([tail, head]), np.tile(angle, 2))
+        depth = np.minimum(steepest[tail], steepest[head])
+        length = np.linalg.norm(surface.vertices[head] - surface.vertices[tail], axis=1)
+        weight = np.interp(depth, [_FLAT, _VALLEY], [1, _VALLEY_WEIGHT])
+        return cls(tail, head, left, right, length, weight * length, depth >= _VALLEY)
+
+
+def _loops(surface: Mesh) -> Iterator[_Loop]:
+    """Return short loops around the handles of a manifold surface."""
+    n = len(surface.vertices)
+    adjacent, side = igl.triangle_triangle_adjacency(surface.faces)
+    twin = np.where(adjacent < 0, -1, 3 * adjacent + side).ravel()
+    edges = _Edges.of(surface, twin)
+    if not edges.in_valley.any():
+        return
+    valleys = replace(surface, faces=surface.faces[np.unique(edges.left[edges.in_valley] // 3)])
+    number = min(_BASE_POINTS, int(valleys.referenced_vertices.sum()))
+    graph = csr_array((edges.weighted_length, (edges.tail, edges.head)), shape=(n, n))
+    distances, predecessors = csgraph.dijkstra(
+        graph, directed=False, indices=farthest_point_samples(valleys, number), return_predecessors=True
+    )
+    dual = _Dual.of(surface, edges, twin)
+    # A loop traverses an edge from tail to head, with the side `left` on its left, or from head to tail.
+    key = np.concatenate([edges.tail * n + edges.head, edges.head * n + edges.tail])
+    order = np.argsort(key)
+    for distance, predecessor in zip(distances, predecessors, strict=True):
+        in_tree = (predecessor[edges.tail] == edges.head) | (predecessor[edges.head] == edges.tail)
+        weighted_length = distance[edges.tail] + distance[edges.head] + edges.weighted_length
+        for edge in dual.generators(np.where(in_tree, np.inf, weighted_length)):
+            path = _closed_path(predecessor, int(edges.tail[edge]), int(edges.head[edge]))
+            along = order[np.searchsorted(key, path * n + np.roll(path, -1), sorter=order)]
+            number = along % len(edges.tail)
+            left = np.where(along == number, edges.left[number], edges.right[number])
+            yield _Loop(
+                float(edges.weighted_length[number].sum()),
+                float(edges.length[number].sum()),
+                left,
+                twin[left],
+            )
+
+
+def _closed_path(predecessor: Int32[np.ndarray, " n"], tail: int, head: int) -> Int64[np.ndarray, " l"]:
+    """Return the vertices of the closed path through an edge and the shortest paths of its ends."""
+    branches = []
+    for vertex in (tail, head):
+        branch = [vertex]
+        while (vertex := int(predecessor[vertex])) >= 0:
+            branch.append(vertex)
+        branches.append(branch)
+    there, back = branches
+    while len(there) > 1 and len(back) > 1 and there[-2] == back[-2]:
+        there.pop()
+        back.pop()
+    return np.array(there + back[-2::-1])
+
+
+class _Dual(NamedTuple):
+    """The dual graph of a manifold surface. Its nodes are the faces and the boundary loops.
+
+    The first arcs cross the interior edges, and the other arcs cross the boundary edges.
+    """
+
+    nodes: Int64[np.ndarray, "a 2"]
+
+    @classmethod
+    def of(cls, surface: Mesh, edges: _Edges, twin: Int64[np.ndarray, " s"]) -> _Dual:
+        boundary = np.flatnonzero(twin < 0)
+        ends = np.stack([np.roll(surface.faces, -i, axis=1).ravel()[boundary] for i in range(2)], axis=1)
+        _, loop = connected_components(ends, len(surface.vertices))
+        return cls(
+            np.concatenate(
+                [
+                    np.stack([edges.left // 3, edges.right // 3], axis=1),
+                    np.stack([boundary // 3, len(twin) // 3 + loop[ends[:, 0]]], axis=1),
+                ]
+            )
+        )
+
+    def generators(self, length: Float64[np.ndarray, " e"]) -> Int64[np.ndarray, " g"]:
+        """Return the edges whose loops generate all loops of the surface.
+
+        `length` contains, for each interior edge, the length of the loop through this edge. Edges with an
+        infinite length are in the tree of shortest paths, or in another component. The generators are the
+        other edges that the dual tree does not cross. The dual tree crosses the edges with the longest loops.
+        """
+        usable = np.flatnonzero(np.isfinite(length))
+        crossed = np.concatenate([usable, np.arange(len(length), len(self.nodes))])
+        # Short arcs are in the minimum spanning tree, so arcs that cross the boundary come first.
+        arc = np.full(len(crossed), 0.5)
+        arc[: len(usable)] = 2 - length[usable] / max(float(length[usable].max()), 1e-300)
+        nodes = np.sort(self.nodes[crossed], axis=1)
+        order = np.lexsort((arc, nodes[:, 1], nodes[:, 0]))
+        nodes, arc, crossed = nodes[order], arc[order], crossed[order]
+        first = np.append(True, (nodes[1:] != nodes[:-1]).any(axis=1))  # the shortest of parallel arcs
+        size = int(self.nodes.max()) + 1
+        tree = csgraph.minimum_spanning_tree(
+            csr_array((arc[first], (nodes[first, 0], nodes[first, 1])), shape=(size, size))
+        ).tocoo()
+        is_first = crossed[first]
+        key = nodes[first, 0] * size + nodes[first, 1]
+        in_dual_tree = is_first[
+            np.searchsorted(
+                key, np.minimum(tree.row, tree.col).astype(np.int64) * size + np.maximum(tree.row, tree.col)
+            )
+        ]
+        return np.setdiff1d(usable, in_dual_tree)
