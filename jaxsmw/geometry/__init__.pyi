@@ -6,6 +6,7 @@ from .mesh import Mesh, diagnose, make_mesh
 from .point_cloud import triangulate_points
 from .sampling import farthest_point_samples
 from .scale import ScaleEstimate, estimate_scale
+from .shortcuts import cut_shortcuts
 from .shot import shot_descriptors
 from .surface_distance import distances_to_surface, nearest_surface_points
 
@@ -16,6 +17,7 @@ __all__ = [
     "SurfacePoints",
     "compute_spectrum",
     "creature_pair",
+    "cut_shortcuts",
     "diagnose",
     "distances_to_surface",
     "estimate_scale",

@@ -47,7 +47,7 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
     **Returns:** A `Mesh` with the same n vertices and fewer faces. The result is `mesh` itself if there is
     nothing to cut, or if the surface has more than 30 handles.
     """
-    manifold, origin = igl.split_nonmanifold(mesh.faces)
+    manifold, origin = (part.astype(np.int64) for part in igl.split_nonmanifold(mesh.faces))
     genus = _genus(manifold)
     if not 0 < genus <= _MOST_HANDLES:
         return mesh
@@ -59,7 +59,7 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
             continue
         trial = cut.copy()
         trial.flat[np.concatenate([loop.left, loop.right])] = True
-        further = igl.cut_mesh(surface.vertices, manifold, trial)[1]
+        further = igl.cut_mesh(surface.vertices, manifold, trial)[1].astype(np.int64)
         # A second cut around the same handle does not reduce the genus.
         if _genus(further) < genus:
             cut, opened, genus = trial, further, _genus(further)
@@ -155,7 +155,7 @@ def _loops(surface: Mesh) -> Iterator[_Loop]:
     """Return short loops around the handles of a manifold surface."""
     n = len(surface.vertices)
     adjacent, side = igl.triangle_triangle_adjacency(surface.faces)
-    twin = np.where(adjacent < 0, -1, 3 * adjacent + side).ravel()
+    twin = np.where(adjacent < 0, -1, 3 * adjacent + side).ravel().astype(np.int64)
     edges = _Edges.of(surface, twin)
     if not edges.in_valley.any():
         return

@@ -1,0 +1,226 @@
+"""Shortcuts of a surface that is fused with itself, and how they are cut before a match."""
+
+from dataclasses import replace
+
+import igl
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from synthetic import bumpy_mesh
+
+from jaxsmw import InputError, geodesic_error, make_mesh, match, read_mesh
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
+from jaxsmw.geometry import cut_shortcuts, geodesic_distances
+from jaxsmw.geometry.mesh import Mesh, diagnose
+from jaxsmw.pair import Pair
+from jaxsmw.presets import PRESETS, Preset
+from jaxsmw.repair.settings import RepairSettings
+from jaxsmw.stage import Stage
+
+
+def bent_tube(gap: float, *, spacing: float = 0.08, thickness: float = 0.3) -> Mesh:
+    """A tube around most of a circle of radius 1, whose ends are round.
+
+    `gap` is the distance between the centres of the ends. If it is less than twice the thickness, the ends
+    are fused.
+    """
+    half = np.arcsin(gap / 2)
+    along = np.linspace(half, 2 * np.pi - half, 400)
+    line = np.stack([np.cos(along), np.sin(along), 0.2 * np.sin(3 * along)], axis=1)
+    extent = np.arange(-1.6, 1.6, spacing)
+    grid = np.stack(np.meshgrid(extent, extent, extent, indexing="ij"), axis=-1).reshape(-1, 3)[:, ::-1]
+    distance = np.full(len(grid), np.inf)
+    for point in line:
+        np.minimum(distance, np.linalg.norm(grid - point, axis=1), out=distance)
+    size = len(extent)
+    vertices, faces = igl.marching_cubes(distance - thickness, np.ascontiguousarray(grid), size, size, size)[
+        :2
+    ]
+    return make_mesh(vertices, faces, name="tube")
+
+
+def handles(mesh: Mesh) -> float:
+    """The number of handles of a connected mesh, by Euler's formula with V, E and F of the mesh itself."""
+    manifold = igl.split_nonmanifold(mesh.faces)[0]
+    boundaries = len(igl.boundary_loop_all(manifold))
+    return 1 - (igl.euler_characteristic(manifold) + boundaries) / 2
+
+
+@pytest.fixture(scope="module")
+def fused():
+    return bent_tube(0.5)
+
+
+@pytest.fixture(scope="module")
+def separate():
+    return bent_tube(0.75)
+
+
+def lost_faces(mesh: Mesh, cut: Mesh) -> np.ndarray:
+    return mesh.faces[np.isin(mesh.face_numbers, cut.dropped_faces)]
+
+
+def test_the_contact_is_cut(fused, separate):
+    cut = cut_shortcuts(fused)
+    assert handles(fused) == 1
+    assert handles(separate) == handles(cut) == 0
+    assert np.array_equal(cut.vertices, fused.vertices)
+    assert np.array_equal(cut.faces, fused.faces[np.isin(fused.face_numbers, cut.face_numbers)])
+    assert diagnose(cut).components == 1
+    # All lost faces are near the contact, whose middle is (1, 0, 0).
+    distance = np.linalg.norm(fused.vertices[lost_faces(fused, cut)] - [1, 0, 0], axis=2)
+    assert 0 < distance.size < 0.1 * len(fused.faces)
+    assert distance.max() < 0.4
+
+
+def test_distances_across_the_contact_become_long(fused, separate):
+    def between_ends(mesh: Mesh) -> float:
+        ends = [np.argmin(np.linalg.norm(mesh.vertices - [0.7, y, 0], axis=1)) for y in (0.7, -0.7)]
+        return float(geodesic_distances(mesh, ends[:1])[0, ends[1]])
+
+    assert between_ends(fused) < 2
+    assert between_ends(cut_shortcuts(fused)) == pytest.approx(between_ends(separate), rel=0.05)
+    assert between_ends(separate) > 3
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e4])
+def test_cuts_do_not_depend_on_the_position(fused, scale):
+    turn = Rotation.random(random_state=1).as_matrix()
+    moved = replace(fused, vertices=scale * fused.vertices @ turn.T + scale)
+    expected = cut_shortcuts(fused).dropped_faces
+    assert np.array_equal(cut_shortcuts(moved).dropped_faces, expected)
+    assert np.array_equal(cut_shortcuts(fused.mirrored()).dropped_faces, expected)
+
+
+def test_inside_out_surfaces_are_cut(fused):
+    inside_out = replace(fused, faces=np.ascontiguousarray(fused.faces[:, ::-1]))
+    assert handles(cut_shortcuts(inside_out)) == 0
+
+
+def test_the_order_of_vertices_and_faces_does_not_matter(fused):
+    random = np.random.default_rng(0)
+    order, faces = random.permutation(len(fused.vertices)), random.permutation(len(fused.faces))
+    permuted = make_mesh(fused.vertices[order], np.argsort(order)[fused.faces[faces]])
+    lost = np.sort(faces[cut_shortcuts(permuted).dropped_faces])
+    assert np.array_equal(lost, cut_shortcuts(fused).dropped_faces)
+
+
+def test_dropped_faces_of_the_file_stay_dropped(fused):
+    faces = np.concatenate([fused.faces[:5], fused.faces])  # the first five faces occur twice
+    mesh = make_mesh(fused.vertices, faces)
+    cut = cut_shortcuts(mesh)
+    assert len(mesh.dropped_faces) == 5
+    assert set(mesh.dropped_faces) < set(cut.dropped_faces)
+    assert np.array_equal(faces[cut.face_numbers], cut.faces)
+    assert len(cut.faces) + len(cut.dropped_faces) == len(faces)
+
+
+@pytest.mark.parametrize("thickness", [0.2, 0.4])
+def test_smooth_handles_are_not_cut(thickness):
+    ring = bent_tube(0.05, thickness=thickness)
+    assert handles(ring) == 1
+    assert cut_shortcuts(ring) is ring
+
+
+def test_surfaces_without_handles_stay_unchanged(separate):
+    for mesh in (separate, bumpy_mesh(2)):
+        assert cut_shortcuts(mesh) is mesh
+    # Boundary loops are not handles, even if they touch each other.
+    punched = make_mesh(separate.vertices, separate.faces[np.arange(len(separate.faces)) % 7 > 0])
+    assert cut_shortcuts(punched) is punched
+
+
+def test_porous_surfaces_stay_unchanged(fused):
+    def copies(number: int) -> Mesh:
+        shifts = 4.0 * np.arange(number)[:, None, None] * [1, 0, 0]
+        faces = fused.faces + len(fused.vertices) * np.arange(number)[:, None, None]
+        return make_mesh((fused.vertices + shifts).reshape(-1, 3), faces.reshape(-1, 3))
+
+    three, many = copies(3), copies(31)
+    assert len(cut_shortcuts(three).dropped_faces) == 3 * len(cut_shortcuts(fused).dropped_faces)
+    assert cut_shortcuts(many) is many
+
+
+def test_nonmanifold_surfaces_are_cut(fused):
+    """A face that stands on an edge does not hide the handle."""
+    fin = np.concatenate([fused.vertices, fused.vertices[fused.faces[0, :1]] * 1.05])
+    a, b, _ = fused.faces[0]
+    mesh = make_mesh(fin, np.concatenate([fused.faces, [[a, b, len(fin) - 1]]]))
+    assert len(mesh.nonmanifold_edges) == 1
+    assert len(cut_shortcuts(mesh).faces) < len(mesh.faces)
+
+
+SHORT = Stage(FeatureRegression((10, 15, 20)), number_of_descriptors=20)
+# Repair that changes no map.
+NEVER = RepairSettings(stage=0, suspicious=1e3, compared=1e3, non_isometric=1e3)
+REPAIRED = Preset((SHORT,), NEVER)
+
+
+def test_match_cuts_both_meshes_if_the_preset_repairs(fused, separate):
+    """Maps refer to the vertices of the given meshes, and vertices that a cut isolates have matches."""
+    assert not PRESETS["paper"].cuts_shortcuts
+    assert not PRESETS["fast"].cuts_shortcuts
+    assert PRESETS["accurate"].cuts_shortcuts
+    pair = Pair(fused, separate)
+    cut = pair.without_shortcuts()
+    assert len(cut.mesh_x.faces) < len(fused.faces)
+    assert cut.mesh_y is separate
+    assert Pair(separate, separate).without_shortcuts().mesh_x is separate
+    found = {}
+    for cuts in (True, False):
+        preset = Preset((SHORT,), replace(NEVER, cut_shortcuts=cuts))
+        found[cuts] = match(fused, separate, preset=preset, init="shot", mirror="no")
+        assert found[cuts].mesh_x is fused
+        assert found[cuts].pointwise_map.shape == (len(fused.vertices),)
+    # The spectrum of the cut tube is closer to the spectrum of the separate tube.
+    eigenvalues = {cuts: np.asarray(one.spectrum_x.eigenvalues)[1:10] for cuts, one in found.items()}
+    target = np.asarray(found[True].spectrum_y.eigenvalues)[1:10]
+    difference = {cuts: np.abs(np.log(values / target)).max() for cuts, values in eigenvalues.items()}
+    assert difference[True] < 0.2 < difference[False]
+    direct = match(cut.mesh_x, separate, preset=SHORT, init="shot", mirror="no")
+    assert np.array_equal(direct.pointwise_map, found[True].pointwise_map)
+
+
+def test_isolated_vertices_receive_the_match_of_their_neighbor(fused, separate, monkeypatch):
+    """A vertex that loses all its faces is matched like the nearest other vertex."""
+    gone = 100
+    holed = replace(fused, faces=fused.faces[(fused.faces != gone).all(axis=1)])
+    monkeypatch.setattr("jaxsmw.pair.cut_shortcuts", lambda mesh: holed if mesh is fused else mesh)
+    found = match(fused, separate, preset=REPAIRED, init="shot", mirror="no").pointwise_map
+    distance = np.linalg.norm(fused.vertices - fused.vertices[gone], axis=1)
+    distance[gone] = np.inf
+    assert found[gone] == found[np.argmin(distance)]
+
+
+def test_surface_points_as_initial_map_refer_to_the_given_faces(fused, separate):
+    first = match(separate, fused, preset=REPAIRED, init="shot", mirror="no")
+    points = first.surface_points()
+    again = match(separate, fused, preset=REPAIRED, init=points, mirror="no")
+    assert np.array_equal(again.initial_map, points.nearest_corners(fused))
+
+
+def test_the_setting_is_checked():
+    settings = RepairSettings()
+    object.__setattr__(settings, "cut_shortcuts", "no")
+    with pytest.raises(InputError, match="cut_shortcuts is 'no': give True or False"):
+        settings.__post_init__()  # without the run-time type checks of the tests
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
+def test_real_contacts(shared):
+    """With topological noise, the map becomes better if contacts are cut."""
+    data = open_data_set(shared / "data" / "shrec16_topology")
+    pair = next(one for one in choose_pairs(data, None, 0) if "kid06" in one.name)
+    mesh_x, mesh_y = map(read_mesh, pair.meshes)
+    assert handles(mesh_x) == 3
+    assert handles(cut_shortcuts(mesh_x)) == 0
+    truth, errors = pair.ground_truth(mesh_x, mesh_y), []
+    preset = PRESETS["accurate"]
+    for cuts in (True, False):
+        chosen = replace(preset, repair=replace(preset.repair, cut_shortcuts=cuts))
+        found = match(mesh_x, mesh_y, preset=chosen)
+        errors.append(geodesic_error(mesh_y, found.pointwise_map, truth, number_of_samples=300).mean)
+    assert errors[0] < 0.9 * errors[1]
+    assert errors[0] < 0.03
