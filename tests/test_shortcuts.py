@@ -8,11 +8,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
-from jaxsmw import InputError, geodesic_error, make_mesh, match, read_mesh
+from jaxsmw import (
+    InputError,
+    geodesic_error,
+    make_mesh,
+    match,
+    match_collection,
+    match_pairs,
+    read_mesh,
+)
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
-from jaxsmw.geometry import cut_shortcuts, geodesic_distances
+from jaxsmw.geometry import SurfacePoints, cut_shortcuts, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, diagnose
+from jaxsmw.geometry.shortcuts import points_on_uncut
 from jaxsmw.pair import Pair
 from jaxsmw.presets import PRESETS, Preset
 from jaxsmw.repair.settings import RepairSettings
@@ -198,6 +207,39 @@ def test_surface_points_as_initial_map_refer_to_the_given_faces(fused, separate)
     points = first.surface_points()
     again = match(separate, fused, preset=REPAIRED, init=points, mirror="no")
     assert np.array_equal(again.initial_map, points.nearest_corners(fused))
+
+
+def test_pairs_of_a_collection_are_cut(fused, separate):
+    """The results refer to the given meshes."""
+    (_, found), (_, backward) = match_pairs([fused, separate], [(0, 1), (1, 0)], preset=REPAIRED)
+    assert found.mesh_x is backward.mesh_y is fused
+    direct = match(fused, separate, preset=REPAIRED, init="shot", mirror="no")
+    assert np.allclose(found.spectrum_x.eigenvalues, direct.spectrum_x.eigenvalues, rtol=1e-4)
+
+
+def test_points_on_a_cut_surface_keep_their_positions(fused):
+    random = np.random.default_rng(0)
+    cut = cut_shortcuts(fused)
+    points = SurfacePoints(random.permutation(len(cut.faces)), random.dirichlet(np.ones(3), len(cut.faces)))
+    on_fused = points_on_uncut(points, cut, fused)
+    assert np.array_equal(fused.faces[on_fused.faces], cut.faces[points.faces])
+    assert np.array_equal(on_fused.weights, points.weights)
+
+
+def test_collections_are_cut(fused, separate):
+    """The points of the template lie on the given surfaces."""
+    found = match_collection(
+        [separate, fused, fused.mirrored()], preset=REPAIRED, mirror=[False, False, True]
+    )
+    assert np.array_equal(found.meshes[1].faces, fused.faces)
+    middle = [
+        (mesh.vertices[mesh.faces[points.faces]] * points.weights[:, :, None]).sum(axis=1)
+        for mesh, points in zip(found.meshes, found.points, strict=True)
+    ]
+    # Mirrored tubes have mirrored points.
+    assert np.median(np.linalg.norm(middle[1] - middle[2] * [-1, 1, 1], axis=1)) < 0.1
+    distance = np.linalg.norm(middle[0] - middle[1], axis=1)
+    assert np.quantile(distance, 0.9) < 0.3
 
 
 def test_the_setting_is_checked():

@@ -23,6 +23,7 @@ from jaxsmw.collection.shapes import PreparedShape, describe_shapes, prepare_usa
 from jaxsmw.errors import InputError, check_choice, check_number, check_whole_number
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
+from jaxsmw.geometry.shortcuts import points_on_uncut
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.cache import Store
@@ -140,8 +141,8 @@ def match_collection(
         first = ConsistentMaps.of(shapes, maps, settings, position)
         consistent, replaced = _match_contradicted(first, edges, matcher, position)
     points = [
-        _reflected(of_shape) if other else of_shape
-        for of_shape, other in zip(consistent.points, mirrored, strict=True)
+        points_on_uncut(_reflected(of_shape) if other else of_shape, shape.mesh, mesh)
+        for of_shape, other, shape, mesh in zip(consistent.points, mirrored, shapes, kept, strict=True)
     ]
     registered = []
     with timed("registered meshes", seconds):

@@ -14,6 +14,7 @@ from jaxsmw.correspondence import Correspondence
 from jaxsmw.errors import check_whole_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.matching import match_prepared
+from jaxsmw.pair import Pair
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.batches import refine_batch
@@ -69,7 +70,8 @@ def match_pairs(
         prepared = ([prepare_pair(shapes[i], shapes[j])] for i, j in checked)
         outcomes = refined_starts(prepared, chosen, batch_size=batch_size, devices=devices)
         for number, (starts, fitted, refined) in enumerate(outcomes):
-            pair = starts[0].pair
+            i, j = checked[number]
+            pair = Pair(given[i], given[j])
             found = match_prepared(pair, starts, fitted, refined=refined, alternatives=alternatives)
             yield number, found.correspondence
 

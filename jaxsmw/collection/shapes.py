@@ -21,6 +21,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import choose_eigensolver, compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
+from jaxsmw.geometry.shortcuts import cut_shortcuts
 from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.initial_maps.nearest import nearest_map
 from jaxsmw.pair import Pair, check_eigenvalues, number_of_usable_vertices
@@ -43,7 +44,8 @@ class PreparedShape:
 
     **Attributes:**
 
-    - `mesh`: the `Mesh` (n vertices).
+    - `mesh`: the `Mesh` (n vertices). If the preset cuts shortcuts, the mesh can have fewer faces than the
+      given mesh; see `jaxsmw.geometry.cut_shortcuts`.
     - `spectrum`: the `Spectrum` in units in which the area is 1, with descriptors if the preset uses them.
     - `compared`: the `SurfaceSamples` at which descriptors are compared; None for all vertices.
     - `samples`: the samples (s,) on which stages iterate, as 0-based vertices in farthest-point order; None
@@ -104,6 +106,8 @@ def prepare_shape(
     **Raises:** `InputError` if the spectrum cannot be computed, or SHOT is not defined on the mesh.
     """
     preset = fitted_preset(preset, mesh)
+    if preset.cuts_shortcuts:
+        mesh = cut_shortcuts(mesh)
     spectrum = compute_spectrum(
         mesh, preset.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
     )

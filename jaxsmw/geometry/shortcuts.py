@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.sparse import csgraph, csr_array
 
+from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, connected_components
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.scans import in_small_components
@@ -80,6 +81,12 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
     removed[kept] = in_small_components(component, mesh.face_areas[kept], np.ones(len(kept), bool))[0]
     dropped = np.union1d(mesh.dropped_faces, mesh.face_numbers[removed])
     return replace(mesh, faces=mesh.faces[~removed], dropped_faces=dropped)
+
+
+def points_on_uncut(points: SurfacePoints, cut: Mesh, mesh: Mesh) -> SurfacePoints:
+    """Return points of a cut mesh as points of the given mesh; see `cut_shortcuts`."""
+    faces = np.searchsorted(mesh.face_numbers, cut.face_numbers[points.faces])
+    return SurfacePoints(faces, points.weights)
 
 
 def _genus(manifold: Int64[np.ndarray, "f 3"]) -> int:
