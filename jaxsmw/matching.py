@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Sequence
 from concurrent.futures import Future, wait
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -36,7 +37,7 @@ from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision, Hands
 from jaxsmw.repair.outcome import Outcome
-from jaxsmw.repair.rounds import refine_further, refine_in_stages
+from jaxsmw.repair.rounds import finish, refine_further, refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.repair.settings import WITHOUT_REPAIR, ExpectedErrorSettings, RepairSettings
 from jaxsmw.runtime.progress import timed
@@ -256,7 +257,7 @@ def match_prepared(
         outcomes = [
             refine_in_stages(
                 start,
-                preset.stages,
+                preset.judged_stages,
                 preset.repair,
                 alternatives=None if alternatives else (),
                 history=history,
@@ -267,23 +268,27 @@ def match_prepared(
         jax.block_until_ready([outcome.refinements[-1] for outcome in outcomes])
     times = {} if seconds is None else seconds
 
-    def found(start: PreparedPair, outcome: Outcome) -> Match:
-        return Match(_correspondence(pair, start, preset, outcome, times, decision), start, outcome, decision)
+    def found(start: PreparedPair, outcome: Outcome, used: Preset) -> Match:
+        return Match(_correspondence(pair, start, used, outcome, times, decision), start, outcome, decision)
 
     candidates = [one for one in zip(starts, outcomes, strict=True) if one[1].successful]
     start, outcome = candidates[0] if candidates else (starts[0], outcomes[0])
     if len(candidates) > 1:
         assert preset.repair is not None
         with _step("expected error", seconds):
-            from_shot, from_aligned = (_inconsistency(found(*one)) for one in candidates)
+            judged = replace(
+                preset, stages=preset.judged_stages, repair=replace(preset.repair, final_stages=0)
+            )
+            from_shot, from_aligned = (_inconsistency(found(*one, judged)) for one in candidates)
         start, outcome = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
     begin = time.perf_counter()
     with one_blas_thread():
-        outcome = refine_further(start, preset.stages, preset.repair, outcome, history=history)
+        outcome = refine_further(start, preset.judged_stages, preset.repair, outcome, history=history)
+        outcome = finish(start, preset.final_stages, preset.repair, outcome, history=history)
         jax.block_until_ready(outcome.refinements[-1])
     if seconds is not None:
         seconds["refinement"] += time.perf_counter() - begin
-    return found(start, outcome)
+    return found(start, outcome, preset)
 
 
 def _inconsistency(found: Match) -> float:

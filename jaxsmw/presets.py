@@ -30,10 +30,11 @@ class Preset:
     - `large_stages`: the stages that run instead of `stages` if both meshes have at least 15 000 vertices;
       None (the default) to run `stages` on meshes of any size.
 
-    **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage has the
-    position `repair.stage`. `InputError` is also raised if one of these rules is broken. The last stage must
-    not end on samples. If a stage ends on samples, the next stage must start on samples, and must not have
-    more samples. The stage that repair repeats must have levels.
+    **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage before
+    the final stages has the position `repair.stage`. `InputError` is also raised if one of these rules is
+    broken. The last stage, and the last stage before the final stages, must not end on samples. If a stage
+    ends on samples, the next stage must start on samples, and must not have more samples. The stage that
+    repair repeats must have levels.
     """
 
     stages: tuple[Stage, ...]
@@ -70,6 +71,17 @@ class Preset:
 
         large = None if self.large_stages is None else without(self.large_stages)
         return replace(self, stages=without(self.stages), large_stages=large)
+
+    @property
+    def judged_stages(self) -> tuple[Stage, ...]:
+        """The stages whose map is judged and repaired; see `final_stages`."""
+        return self.stages[: len(self.stages) - len(self.final_stages)]
+
+    @property
+    def final_stages(self) -> tuple[Stage, ...]:
+        """The stages that run once, after repair; see `RepairSettings.final_stages`."""
+        number = 0 if self.repair is None else self.repair.final_stages
+        return self.stages[len(self.stages) - number :]
 
     @property
     def cuts_shortcuts(self) -> bool:
@@ -115,10 +127,20 @@ def _check_stages(name: str, stages: tuple[Stage, ...], repair: RepairSettings |
             )
     if repair is None:
         return
-    if not 0 <= repair.stage < len(stages):
+    last = len(stages) - repair.final_stages - 1
+    if last < 0:
         raise InputError(
-            f"repair repeats stage {repair.stage}, but the stages are 0 to {len(stages) - 1}: "
-            "give RepairSettings(stage=...) with one of these numbers."
+            f"repair has {repair.final_stages} final stages, but there are {len(stages)} stages: give "
+            "RepairSettings(final_stages=...) with a smaller number."
+        )
+    if not 0 <= repair.stage <= last:
+        raise InputError(
+            f"repair repeats stage {repair.stage}, but it can repeat only the stages 0 to {last}: give "
+            "RepairSettings(stage=...) with one of these numbers."
+        )
+    if stages[last].ends_on_samples:
+        raise InputError(
+            f"stage {last} ends on samples, but its map is judged at all vertices: use the default."
         )
     if not stages[repair.stage].refiner.levels:
         raise InputError(
@@ -134,18 +156,20 @@ _REGRESSION = Stage(
 _REGISTRATION = Stage(
     Registration(levels=(35, 60, 100, 200)), number_of_descriptors=30, number_of_samples=1000
 )
+_FINAL = Stage(Registration(levels=(70, 100, 141, 200)), number_of_descriptors=30)
 
 PRESETS: dict[PresetName, Preset] = {
     "fast": Preset((Stage(number_of_samples=500),)),
     "paper": Preset((Stage(),)),
     "accurate": Preset(
-        (_WAVELETS, _REGRESSION, _REGISTRATION),
-        RepairSettings(stage=1),
+        (_WAVELETS, _REGRESSION, _REGISTRATION, _FINAL),
+        RepairSettings(stage=1, final_stages=1),
         # On large meshes, searches that match all vertices take most of the time.
         large_stages=(
             replace(_WAVELETS, number_of_samples=1000),
             replace(_REGRESSION, ends_on_samples=True),
             replace(_REGISTRATION, starts_on_samples=True),
+            replace(_FINAL, number_of_samples=1000, starts_on_samples=True),
         ),
     ),
 }

@@ -111,7 +111,7 @@ def refined_starts(
             flat = [start for one in waiting for start in one]
             release_programs()
             described = flat[0].spectrum_x.descriptors is not None
-            stages = (own if described else own.without_descriptors()).stages
+            stages = (own if described else own.without_descriptors()).judged_stages
             outcomes = iter(refine_batch(flat, stages, batch_size=batch_size, devices=devices))
             for one in waiting:
                 yield one, own, [next(outcomes) for _ in one]

@@ -161,6 +161,33 @@ def refine_further(
     return after._replace(suspicious=outcome.suspicious)
 
 
+def finish(
+    prepared: PreparedPair,
+    stages: Sequence[Stage],
+    repair: RepairSettings | None,
+    outcome: Outcome,
+    *,
+    history: bool = False,
+) -> Outcome:
+    """Run the final stages, which are not repeated by repair; see `RepairSettings.final_stages`.
+
+    **Arguments:**
+
+    - `prepared`: the pair with its spectra.
+    - `stages`: the final stages, in the order in which they run.
+    - `repair`: the settings of the repair, or None.
+    - `outcome`: an outcome of `refine_further`.
+    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
+
+    **Returns:** The `Outcome` with the distortion of the final map. The attribute `suspicious` is copied from
+    the given outcome, and so is the whole outcome if there are no final stages.
+    """
+    if not stages:
+        return outcome
+    runner, judge = _runner_and_judge(prepared, stages, repair or WITHOUT_REPAIR, history)
+    return judge.measured(runner.run(0, outcome))
+
+
 _View = tuple[Spectrum, Spectrum]
 
 

@@ -183,6 +183,8 @@ class RepairSettings:
 
     - `stage`: the stage that repair repeats, as a 0-based position in the stages of the preset. The refiner
       of this stage must have levels.
+    - `final_stages` (Table R42): the number of last stages that repair and further passes do not repeat, at
+      least 0. These stages run once, after the map has been repaired.
     - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
       value is suspicious and is repaired. Correct maps between poses of one body have a distortion below this
       value.
@@ -239,6 +241,7 @@ class RepairSettings:
     """
 
     stage: int = 1
+    final_stages: int = 0
     suspicious: float = 1.12
     compared: float = 1.05
     suspicious_area: float = 0.02
@@ -261,7 +264,7 @@ class RepairSettings:
     scores: ScoreSettings = ScoreSettings()
 
     def __post_init__(self) -> None:
-        for name in ("stage", "rounds", "finalists", "passes"):
+        for name in ("stage", "final_stages", "rounds", "finalists", "passes"):
             check_whole_number(name, getattr(self, name), 0)
         for name in ("suspicious_area", "negligible_area", "excessive_area"):
             check_number(name, getattr(self, name), most=1.0)
