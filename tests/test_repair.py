@@ -258,7 +258,25 @@ def test_default_repair_settings_are_those_of_the_preset_and_documented():
     ("make", "fault"),
     [
         (lambda: Preset(()), "at least one stage"),
-        (lambda: Preset((STAGE,), RepairSettings()), "repair repeats stage 1, but it can repeat only the stages 0 to 0"),
+        (
+            lambda: Preset((STAGE,), RepairSettings()),
+            "repair repeats stage 1, but it can repeat only the stages 0 to 0",
+        ),
+        (
+            lambda: Preset((STAGE, STAGE), RepairSettings(stage=1, final_stages=1)),
+            "can repeat only the stages 0 to 0",
+        ),
+        (
+            lambda: Preset((STAGE,), RepairSettings(stage=0, final_stages=1)),
+            "1 final stages, but there are 1",
+        ),
+        (
+            lambda: Preset(
+                (ENDING, replace(SAMPLED, starts_on_samples=True)), RepairSettings(stage=0, final_stages=1)
+            ),
+            "stage 0 ends on samples, but its map is judged",
+        ),
+        (lambda: RepairSettings(final_stages=-1), "final_stages is -1"),
         (lambda: Preset((Stage(),), REPAIR), "WaveletPreservation has no levels"),
         (lambda: Preset((SAMPLED, ENDING)), "the last stage ends on samples"),
         (
@@ -283,6 +301,32 @@ def test_default_repair_settings_are_those_of_the_preset_and_documented():
 def test_invalid_presets_and_settings_are_refused(make, fault):
     with pytest.raises(InputError, match=fault):
         make()
+
+
+def test_final_stages_run_once_after_repair(body, swapped, identity, monkeypatch):
+    """Repair and passes repeat only the stages before the final stage."""
+    mesh, _ = body
+    final = Stage(FeatureRegression((30, 40)))
+    repair = replace(REPAIR, final_stages=1, non_isometric=0.0, coarse_from=1e3, passes=1, suspicious=1.0)
+    preset = Preset((STAGE, final), repair)
+    assert preset.judged_stages == (STAGE,) and preset.final_stages == (final,)
+    assert Preset((STAGE, final)).final_stages == ()
+    ran = []
+    run = Stage.run
+    monkeypatch.setattr(
+        Stage, "run", lambda self, *args, **options: ran.append(self) or run(self, *args, **options)
+    )
+    found = match(mesh, mesh, preset=preset, init=swapped, mirror="no", history=True)
+    assert ran.count(final) == 1 and ran[-1] == final and ran.count(STAGE) > 2
+    assert found.refinement.history.energy.shape[0] == 2
+    before = match(
+        mesh, mesh, preset=Preset((STAGE,), replace(repair, final_stages=0)), init=swapped, mirror="no"
+    )
+    after = match(mesh, mesh, preset=Preset((final,)), init=before.pointwise_map, mirror="no")
+    assert np.array_equal(found.pointwise_map, after.pointwise_map)
+    assert found.distortion == pytest.approx(after.distortion)
+    assert found.suspicious == before.suspicious
+    assert found.iterations == before.iterations + 2
 
 
 def test_sizes_follow_from_levels():
