@@ -75,7 +75,7 @@ def match(
       preset is at least the number of vertices of the smaller mesh, the preset uses all vertices instead of
       samples. If you give stages instead of a preset, `match` uses the stages unchanged.
 
-        - `"accurate"` (the default): three stages, with repair; see `jaxsmw.PRESETS`.
+        - `"accurate"` (the default): four stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
         - `"fast"`: the method of the MWP paper on 500 samples of each shape.
         - a `Preset`.

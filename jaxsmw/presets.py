@@ -177,10 +177,10 @@ PRESETS: dict[PresetName, Preset] = {
 
 `"paper"` has the settings of the MWP paper: one stage of `WaveletPreservation` with 100 eigenvectors and 3
 iterations. `"fast"` has the same stage with iterations on 500 samples of each shape, as in the fast variant
-of the MWP authors' program. `"accurate"` has three stages and repair: the stage of `"paper"`,
-`FeatureRegression` with up to 35 eigenvectors, and `Registration` with up to 200 eigenvectors. If both
-meshes have at least 15 000 vertices, the first stage of `"accurate"` iterates on 1000 samples. The third
-stage then starts from the matches of 1000 samples. `docs/accuracy.md` reports the errors of `"accurate"`.
+of the MWP authors' program. `"accurate"` has four stages and repair: the stage of `"paper"`,
+`FeatureRegression` with up to 35 eigenvectors, and `Registration` with up to 200 eigenvectors, twice. The
+fourth stage runs once, after repair. If both meshes have at least 15 000 vertices, all stages of `"accurate"`
+iterate on 1000 samples. `docs/accuracy.md` reports the errors of `"accurate"`.
 """
 
 

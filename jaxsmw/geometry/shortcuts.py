@@ -22,13 +22,15 @@ logger = logging.getLogger("jaxsmw")
 
 # A surface with more handles than this number is porous, for example a scanned bone, and is not cut.
 _MOST_HANDLES = 30
-# Edges in valleys count less than their length. The angle between the normals of the two faces decides. From
-# _FLAT to _VALLEY, the weight of the length falls from 1 to _VALLEY_WEIGHT.
+# The depth of a vertex is the largest angle between the normals of the two faces of a concave edge. Between
+# the depths _FLAT and _VALLEY, the weight of an edge's length falls from 1 to _VALLEY_WEIGHT. (Table R41 of
+# docs/research_log.md)
 _FLAT, _VALLEY, _VALLEY_WEIGHT = np.radians(30), np.radians(60), 0.05
-# A loop surrounds a contact if its weighted length is at most _CONTACT times its length.
+# A loop surrounds a contact if its weighted length is at most _CONTACT times its length. (Table R41)
 _CONTACT = 0.35
-# Loops are searched from this number of vertices in valleys.
-_BASE_POINTS = 160
+# Shortest paths begin at this number of vertices in valleys. On large meshes, which take longer, there are
+# fewer of these vertices, so that all shortest paths together reach _REACHED vertices.
+_BASE_POINTS, _FEWEST_BASE_POINTS, _REACHED = 160, 16, 1_600_000
 
 
 def cut_shortcuts(mesh: Mesh) -> Mesh:
@@ -62,8 +64,8 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
         trial.flat[np.concatenate([loop.left, loop.right])] = True
         further = igl.cut_mesh(surface.vertices, manifold, trial)[1].astype(np.int64)
         # A second cut around the same handle does not reduce the genus.
-        if _genus(further) < genus:
-            cut, opened, genus = trial, further, _genus(further)
+        if (reduced := _genus(further)) < genus:
+            cut, opened, genus = trial, further, reduced
             chosen.append(loop)
         if genus == 0:
             break
@@ -142,7 +144,7 @@ class _Edges(NamedTuple):
         """Return the interior edges. `twin` is the number of the same side in the other face, or -1."""
         left = np.flatnonzero(np.arange(len(twin)) < twin)
         right = twin[left]
-        tail, head, _ = (np.roll(surface.faces, -i, axis=1).ravel()[left] for i in range(3))
+        tail, head = surface.faces.ravel()[left], np.roll(surface.faces, -1, axis=1).ravel()[left]
         beyond = np.roll(surface.faces, -2, axis=1).ravel()[right]
         normals = surface.area_vectors[left // 3], surface.area_vectors[right // 3]
         # In a valley, the face to the right rises above the plane of the face to the left.
@@ -167,19 +169,21 @@ def _loops(surface: Mesh) -> Iterator[_Loop]:
     if not edges.in_valley.any():
         return
     valleys = replace(surface, faces=surface.faces[np.unique(edges.left[edges.in_valley] // 3)])
-    number = min(_BASE_POINTS, int(valleys.referenced_vertices.sum()))
+    number = min(
+        _BASE_POINTS, max(_FEWEST_BASE_POINTS, _REACHED // n), int(valleys.referenced_vertices.sum())
+    )
     graph = csr_array((edges.weighted_length, (edges.tail, edges.head)), shape=(n, n))
     distances, predecessors = csgraph.dijkstra(
         graph, directed=False, indices=farthest_point_samples(valleys, number), return_predecessors=True
     )
-    dual = _Dual.of(surface, edges, twin)
+    arcs = _dual_arcs(surface, edges, twin)
     # A loop traverses an edge from tail to head, with the side `left` on its left, or from head to tail.
     key = np.concatenate([edges.tail * n + edges.head, edges.head * n + edges.tail])
     order = np.argsort(key)
     for distance, predecessor in zip(distances, predecessors, strict=True):
         in_tree = (predecessor[edges.tail] == edges.head) | (predecessor[edges.head] == edges.tail)
         weighted_length = distance[edges.tail] + distance[edges.head] + edges.weighted_length
-        for edge in dual.generators(np.where(in_tree, np.inf, weighted_length)):
+        for edge in _generators(*arcs, np.where(in_tree, np.inf, weighted_length)):
             path = _closed_path(predecessor, int(edges.tail[edge]), int(edges.head[edge]))
             along = order[np.searchsorted(key, path * n + np.roll(path, -1), sorter=order)]
             number = along % len(edges.tail)
@@ -207,53 +211,44 @@ def _closed_path(predecessor: Int32[np.ndarray, " n"], tail: int, head: int) -> 
     return np.array(there + back[-2::-1])
 
 
-class _Dual(NamedTuple):
-    """The dual graph of a manifold surface. Its nodes are the faces and the boundary loops.
+def _dual_arcs(
+    surface: Mesh, edges: _Edges, twin: Int64[np.ndarray, " s"]
+) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, "b 2"]]:
+    """Return the arcs of the dual graph that cross the interior edges and the boundary edges.
 
-    The first arcs cross the interior edges, and the other arcs cross the boundary edges.
+    The nodes of the dual graph are the faces, and then the boundary loops.
     """
+    boundary = np.flatnonzero(twin < 0)
+    ends = np.stack([np.roll(surface.faces, -i, axis=1).ravel()[boundary] for i in range(2)], axis=1)
+    loop = connected_components(ends, len(surface.vertices))[1][ends[:, 0]]
+    interior = np.sort(np.stack([edges.left // 3, edges.right // 3], axis=1), axis=1)
+    return interior, np.stack([boundary // 3, len(surface.faces) + loop], axis=1)
 
-    nodes: Int64[np.ndarray, "a 2"]
 
-    @classmethod
-    def of(cls, surface: Mesh, edges: _Edges, twin: Int64[np.ndarray, " s"]) -> _Dual:
-        boundary = np.flatnonzero(twin < 0)
-        ends = np.stack([np.roll(surface.faces, -i, axis=1).ravel()[boundary] for i in range(2)], axis=1)
-        _, loop = connected_components(ends, len(surface.vertices))
-        return cls(
-            np.concatenate(
-                [
-                    np.stack([edges.left // 3, edges.right // 3], axis=1),
-                    np.stack([boundary // 3, len(twin) // 3 + loop[ends[:, 0]]], axis=1),
-                ]
-            )
-        )
+def _generators(
+    interior: Int64[np.ndarray, "e 2"], boundary: Int64[np.ndarray, "b 2"], length: Float64[np.ndarray, " e"]
+) -> Int64[np.ndarray, " g"]:
+    """Return the edges whose loops generate all loops of a surface, two edges for each handle.
 
-    def generators(self, length: Float64[np.ndarray, " e"]) -> Int64[np.ndarray, " g"]:
-        """Return the edges whose loops generate all loops of the surface.
+    A dual tree crosses all boundary edges and the edges with the longest loops. The generators are the edges
+    that are neither in the tree of shortest paths nor crossed by the dual tree.
 
-        `length` contains, for each interior edge, the length of the loop through this edge. Edges with an
-        infinite length are in the tree of shortest paths, or in another component. The generators are the
-        other edges that the dual tree does not cross. The dual tree crosses the edges with the longest loops.
-        """
-        usable = np.flatnonzero(np.isfinite(length))
-        crossed = np.concatenate([usable, np.arange(len(length), len(self.nodes))])
-        # Short arcs are in the minimum spanning tree, so arcs that cross the boundary come first.
-        arc = np.full(len(crossed), 0.5)
-        arc[: len(usable)] = 2 - length[usable] / max(float(length[usable].max()), 1e-300)
-        nodes = np.sort(self.nodes[crossed], axis=1)
-        order = np.lexsort((arc, nodes[:, 1], nodes[:, 0]))
-        nodes, arc, crossed = nodes[order], arc[order], crossed[order]
-        first = np.append(True, (nodes[1:] != nodes[:-1]).any(axis=1))  # the shortest of parallel arcs
-        size = int(self.nodes.max()) + 1
-        tree = csgraph.minimum_spanning_tree(
-            csr_array((arc[first], (nodes[first, 0], nodes[first, 1])), shape=(size, size))
-        ).tocoo()
-        is_first = crossed[first]
-        key = nodes[first, 0] * size + nodes[first, 1]
-        in_dual_tree = is_first[
-            np.searchsorted(
-                key, np.minimum(tree.row, tree.col).astype(np.int64) * size + np.maximum(tree.row, tree.col)
-            )
-        ]
-        return np.setdiff1d(usable, in_dual_tree)
+    **Arguments:**
+
+    - `interior`, `boundary`: the arcs of the dual graph; see `_dual_arcs`.
+    - `length`: for each interior edge, the length of the loop through this edge and the shortest paths of
+      its ends. The length is infinite for edges in the tree of shortest paths, and for edges of components
+      without the base point.
+    """
+    usable = np.flatnonzero(np.isfinite(length))
+    crossing = np.concatenate([interior[usable], boundary])
+    # The minimum spanning tree prefers small weights, which must be positive.
+    weight = np.concatenate([2 - length[usable] / length[usable].max(), np.full(len(boundary), 0.5)])
+    size = int(crossing.max()) + 1
+    key = crossing[:, 0] * size + crossing[:, 1]
+    order = np.lexsort((weight, key))
+    first = order[np.diff(key[order], prepend=-1) > 0]  # the smallest weight of parallel arcs
+    graph = csr_array((weight[first], tuple(crossing[first].T)), shape=(size, size))
+    tree = csgraph.minimum_spanning_tree(graph).tocoo()
+    in_tree = first[np.isin(key[first], tree.row.astype(np.int64) * size + tree.col)]
+    return np.setdiff1d(usable, usable[in_tree[in_tree < len(usable)]])

@@ -224,8 +224,8 @@ class RepairSettings:
       value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
       effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
       run (entry R24).
-    - `coarse_levels` (Table R32): the levels of the last stage in each coarse pass, as one tuple per pass.
-      Tuples with the same length and the same maximum share a compiled program. If the refiner of the last
+    - `coarse_levels` (Table R32): the levels of the last repeated stage in each coarse pass, as one tuple per
+      pass. Tuples with the same length and the same maximum share a compiled program. If the refiner of this
       stage has no levels, each coarse pass is the same as a usual pass.
     - `aligned_preference` (entry R24): a number of at least 0. With `init="auto"`, asymmetric shapes are
       matched from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean
