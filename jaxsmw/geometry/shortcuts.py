@@ -38,10 +38,10 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
 
     If parts of a body touch each other, a scan often contains one surface that surrounds both parts. Such
     *topological noise* shortens geodesic distances. Each contact is a handle of the surface and is surrounded
-    by a valley. The function searches the shortest loop around each handle, where edges in valleys count less
+    by a valley. The function searches loops around handles that are short, where edges in valleys count less
     than their length. Candidates are the loops of tree-cotree decompositions (Erickson, Whittlesey 2005,
-    *Greedy optimal homotopy and homology generators*). A loop is cut if it mainly follows valleys. The cut
-    is a gap, which is one face wide.
+    *Greedy optimal homotopy and homology generators*). For each handle, the function cuts the loop that
+    follows valleys best, if most of this loop is in valleys. The cut is a gap, which is one face wide.
 
     **Arguments:**
 
@@ -56,10 +56,9 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
         return mesh
     surface = Mesh(mesh.vertices[origin], manifold)
     cut, opened, chosen = np.zeros(manifold.shape, bool), manifold, []
-    loops = {loop.edges: loop for loop in _loops(surface)}
-    for loop in sorted(loops.values(), key=lambda loop: loop.weighted_length):
-        if loop.weighted_length > _CONTACT * loop.length:
-            continue
+    # Loops that follow valleys best come first. Shorter loops can cross a limb beside the contact.
+    loops = {loop.edges: loop for loop in _loops(surface) if loop.relative_length <= _CONTACT}
+    for loop in sorted(loops.values(), key=lambda loop: loop.relative_length):
         trial = cut.copy()
         trial.flat[np.concatenate([loop.left, loop.right])] = True
         further = igl.cut_mesh(surface.vertices, manifold, trial)[1].astype(np.int64)
@@ -121,6 +120,11 @@ class _Loop(NamedTuple):
     length: float
     left: Int64[np.ndarray, " l"]
     right: Int64[np.ndarray, " l"]
+
+    @property
+    def relative_length(self) -> float:
+        """The ratio of weighted length to length, which is smaller the more of the loop is in valleys."""
+        return self.weighted_length / self.length
 
     @property
     def edges(self) -> bytes:
