@@ -144,7 +144,9 @@ def match(
     check_choice(mirror, Mirror, "a mirror setting")
     pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
     adapts = isinstance(preset, str | Preset)
-    chosen, fewest = choose_preset(preset), pair.fewest_vertices()
+    chosen = choose_preset(preset)
+    surfaces = pair.without_shortcuts() if chosen.cuts_shortcuts else pair
+    fewest = surfaces.fewest_vertices()
     if adapts:
         chosen = chosen.fitted(fewest)
 
@@ -153,7 +155,6 @@ def match(
     check_initial_map(pair, first_init)  # the check runs before the slow computation of the eigenbases
     if isinstance(first_init, SurfacePoints):
         first_init = first_init.nearest_corners(pair.mesh_y)  # cut meshes have other face numbers
-    surfaces = pair.without_shortcuts() if chosen.cuts_shortcuts else pair
     compiling = _compile_ahead(pair, chosen, history)
     seconds: dict[str, float] = {}
     with timed("eigenbases", seconds):

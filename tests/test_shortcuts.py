@@ -93,7 +93,7 @@ def test_distances_across_the_contact_become_long(fused, separate):
     assert between_ends(separate) > 3
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1e4])
+@pytest.mark.parametrize("scale", [1e-45, 1e-3, 1e4, 1e45])
 def test_cuts_do_not_depend_on_the_position(fused, scale):
     turn = Rotation.random(random_state=1).as_matrix()
     moved = replace(fused, vertices=scale * fused.vertices @ turn.T + scale)
@@ -140,14 +140,17 @@ def test_surfaces_without_handles_stay_unchanged(separate):
     assert cut_shortcuts(punched) is punched
 
 
-def test_porous_surfaces_stay_unchanged(fused):
+def test_porous_surfaces_stay_unchanged(fused, monkeypatch):
     def copies(number: int) -> Mesh:
         shifts = 4.0 * np.arange(number)[:, None, None] * [1, 0, 0]
         faces = fused.faces + len(fused.vertices) * np.arange(number)[:, None, None]
         return make_mesh((fused.vertices + shifts).reshape(-1, 3), faces.reshape(-1, 3))
 
-    three, many = copies(3), copies(31)
-    assert len(cut_shortcuts(three).dropped_faces) == 3 * len(cut_shortcuts(fused).dropped_faces)
+    several, many = copies(12), copies(31)
+    # Also with few base points, each component has a base point.
+    monkeypatch.setattr("jaxsmw.geometry.shortcuts._REACHED", 1)
+    assert len(igl.boundary_loop_all(cut_shortcuts(several).faces)) == 2 * 12
+    assert diagnose(cut_shortcuts(several)).components == 12
     assert cut_shortcuts(many) is many
 
 
@@ -158,6 +161,15 @@ def test_nonmanifold_surfaces_are_cut(fused):
     mesh = make_mesh(fin, np.concatenate([fused.faces, [[a, b, len(fin) - 1]]]))
     assert len(mesh.nonmanifold_edges) == 1
     assert len(cut_shortcuts(mesh).faces) < len(mesh.faces)
+
+
+def test_components_without_loops_do_no_harm(fused):
+    """All edges of two folded triangles are in the tree of shortest paths."""
+    n = len(fused.vertices)
+    corners = np.array([[3, 0, 0], [4, 0, 0], [3.5, 1, 0], [3.5, 0.3, 1]])
+    faces = np.concatenate([fused.faces, n + np.array([[0, 1, 2], [1, 0, 3]])])
+    mesh = make_mesh(np.concatenate([fused.vertices, corners]), faces)
+    assert np.array_equal(cut_shortcuts(mesh).dropped_faces, cut_shortcuts(fused).dropped_faces)
 
 
 SHORT = Stage(FeatureRegression((10, 15, 20)), number_of_descriptors=20)
@@ -200,6 +212,15 @@ def test_isolated_vertices_receive_the_match_of_their_neighbor(fused, separate, 
     distance = np.linalg.norm(fused.vertices - fused.vertices[gone], axis=1)
     distance[gone] = np.inf
     assert found[gone] == found[np.argmin(distance)]
+
+
+def test_presets_fit_the_cut_meshes(fused, separate, monkeypatch):
+    """A cut can leave fewer vertices than a stage has samples."""
+    holed = replace(fused, faces=fused.faces[(fused.faces > 30).all(axis=1)])
+    monkeypatch.setattr("jaxsmw.pair.cut_shortcuts", lambda mesh: holed)
+    stage = replace(SHORT, number_of_samples=len(fused.vertices) - 5)
+    found = match(fused, fused, preset=Preset((stage,), NEVER), init="shot", mirror="no")
+    assert found.preset.stages[0].number_of_samples is None
 
 
 def test_surface_points_as_initial_map_refer_to_the_given_faces(fused, separate):

@@ -105,9 +105,9 @@ def prepare_shape(
 
     **Raises:** `InputError` if the spectrum cannot be computed, or SHOT is not defined on the mesh.
     """
-    preset = fitted_preset(preset, mesh)
     if preset.cuts_shortcuts:
         mesh = cut_shortcuts(mesh)
+    preset = fitted_preset(preset, mesh)
     spectrum = compute_spectrum(
         mesh, preset.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
     )

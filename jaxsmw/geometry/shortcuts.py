@@ -47,8 +47,9 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
 
     - `mesh`: the surface, a `Mesh` (n vertices).
 
-    **Returns:** A `Mesh` with the same n vertices and fewer faces. The result is `mesh` itself if there is
-    nothing to cut, or if the surface has more than 30 handles.
+    **Returns:** A `Mesh` with the same n vertices and fewer faces. A few vertices beside a gap can lose all
+    their faces. The result is `mesh` itself if no loop is cut, or if the surface has more than 30 handles.
+    Handles are not found if many faces are misoriented, or if the faces share no vertices (triangle soup).
     """
     manifold, origin = (part.astype(np.int64) for part in igl.split_nonmanifold(mesh.faces))
     genus = _genus(manifold)
@@ -57,7 +58,7 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
     surface = Mesh(mesh.vertices[origin], manifold)
     cut, opened, chosen = np.zeros(manifold.shape, bool), manifold, []
     # Loops that follow valleys best come first. Shorter loops can cross a limb beside the contact.
-    loops = {loop.edges: loop for loop in _loops(surface) if loop.relative_length <= _CONTACT}
+    loops = {loop.edges: loop for loop in _loops(surface, genus) if loop.relative_length <= _CONTACT}
     for loop in sorted(loops.values(), key=lambda loop: loop.relative_length):
         trial = cut.copy()
         trial.flat[np.concatenate([loop.left, loop.right])] = True
@@ -78,8 +79,10 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
     # A gap can isolate a few faces, whose eigenfunctions would be useless.
     kept = np.flatnonzero(~removed)
     edges = np.concatenate([mesh.faces[kept, :2], mesh.faces[kept, 1:]])
-    component = connected_components(edges, len(mesh.vertices))[1][mesh.faces[kept, 0]]
-    removed[kept] = in_small_components(component, mesh.face_areas[kept], np.ones(len(kept), bool))[0]
+    component = connected_components(edges, len(mesh.vertices))[1]
+    at_gap = np.isin(component[mesh.faces[kept, 0]], component[mesh.faces[removed]])
+    small, _ = in_small_components(component[mesh.faces[kept, 0]], mesh.face_areas[kept], at_gap)
+    removed[kept] = small & at_gap
     dropped = np.union1d(mesh.dropped_faces, mesh.face_numbers[removed])
     return replace(mesh, faces=mesh.faces[~removed], dropped_faces=dropped)
 
@@ -150,8 +153,12 @@ class _Edges(NamedTuple):
         right = twin[left]
         tail, head = surface.faces.ravel()[left], np.roll(surface.faces, -1, axis=1).ravel()[left]
         beyond = np.roll(surface.faces, -2, axis=1).ravel()[right]
-        normals = surface.area_vectors[left // 3], surface.area_vectors[right // 3]
-        # In a valley, the face to the right rises above the plane of the face to the left.
+        # Unit vectors keep products of normals in the range of float64, whatever the unit of length.
+        lengths = np.linalg.norm(surface.area_vectors, axis=1, keepdims=True)
+        unit = np.divide(surface.area_vectors, lengths, out=np.zeros((len(lengths), 3)), where=lengths > 0)
+        normals = unit[left // 3], unit[right // 3]
+        # Normals point outward, so the face to the right of a valley rises above the plane of the left
+        # face. If the surface is inside out, the signs are reversed.
         above = np.sum((surface.vertices[beyond] - surface.vertices[tail]) * normals[0], axis=1)
         sine, cosine = np.linalg.norm(np.cross(*normals), axis=1), np.sum(normals[0] * normals[1], axis=1)
         angle = np.arctan2(sine, cosine) * np.sign(above) * (-1 if surface.is_inside_out else 1)
@@ -164,8 +171,8 @@ class _Edges(NamedTuple):
         return cls(tail, head, left, right, length, weight * length, depth >= _VALLEY)
 
 
-def _loops(surface: Mesh) -> Iterator[_Loop]:
-    """Return short loops around the handles of a manifold surface."""
+def _loops(surface: Mesh, genus: int) -> Iterator[_Loop]:
+    """Return short loops around the handles of a manifold surface with the given number of handles."""
     n = len(surface.vertices)
     adjacent, side = igl.triangle_triangle_adjacency(surface.faces)
     twin = np.where(adjacent < 0, -1, 3 * adjacent + side).ravel().astype(np.int64)
@@ -173,9 +180,9 @@ def _loops(surface: Mesh) -> Iterator[_Loop]:
     if not edges.in_valley.any():
         return
     valleys = replace(surface, faces=surface.faces[np.unique(edges.left[edges.in_valley] // 3)])
-    number = min(
-        _BASE_POINTS, max(_FEWEST_BASE_POINTS, _REACHED // n), int(valleys.referenced_vertices.sum())
-    )
+    # The handles can belong to different components.
+    number = max(min(_BASE_POINTS, max(_FEWEST_BASE_POINTS, _REACHED // n)), 3 * genus)
+    number = min(number, int(valleys.referenced_vertices.sum()))
     graph = csr_array((edges.weighted_length, (edges.tail, edges.head)), shape=(n, n))
     distances, predecessors = csgraph.dijkstra(
         graph, directed=False, indices=farthest_point_samples(valleys, number), return_predecessors=True
@@ -190,11 +197,12 @@ def _loops(surface: Mesh) -> Iterator[_Loop]:
         for edge in _generators(*arcs, np.where(in_tree, np.inf, weighted_length)):
             path = _closed_path(predecessor, int(edges.tail[edge]), int(edges.head[edge]))
             along = order[np.searchsorted(key, path * n + np.roll(path, -1), sorter=order)]
-            number = along % len(edges.tail)
-            left = np.where(along == number, edges.left[number], edges.right[number])
+            edge_numbers = along % len(edges.tail)
+            forward = along == edge_numbers
+            left = np.where(forward, edges.left[edge_numbers], edges.right[edge_numbers])
             yield _Loop(
-                float(edges.weighted_length[number].sum()),
-                float(edges.length[number].sum()),
+                float(edges.weighted_length[edge_numbers].sum()),
+                float(edges.length[edge_numbers].sum()),
                 left,
                 twin[left],
             )
@@ -232,7 +240,7 @@ def _dual_arcs(
 def _generators(
     interior: Int64[np.ndarray, "e 2"], boundary: Int64[np.ndarray, "b 2"], length: Float64[np.ndarray, " e"]
 ) -> Int64[np.ndarray, " g"]:
-    """Return the edges whose loops generate all loops of a surface, two edges for each handle.
+    """Return the edges whose loops generate all loops of a component, two edges for each handle.
 
     A dual tree crosses all boundary edges and the edges with the longest loops. The generators are the edges
     that are neither in the tree of shortest paths nor crossed by the dual tree.
@@ -245,6 +253,8 @@ def _generators(
       without the base point.
     """
     usable = np.flatnonzero(np.isfinite(length))
+    if not usable.size:
+        return usable
     crossing = np.concatenate([interior[usable], boundary])
     # The minimum spanning tree prefers small weights, which must be positive.
     weight = np.concatenate([2 - length[usable] / length[usable].max(), np.full(len(boundary), 0.5)])

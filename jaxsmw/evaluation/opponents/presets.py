@@ -80,17 +80,18 @@ class Chosen(Method):
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """Return the map X -> Y and the status code; see `Method`."""
         assert pair.prepared is not None
-        prepared, preset = pair.prepared, PRESETS[self.preset].fitted(pair.prepared.pair.fewest_vertices())
-        if preset.cuts_shortcuts:
-            surfaces = prepared.pair.without_shortcuts()
-            if surfaces is not prepared.pair:
-                prepared = prepare(
-                    surfaces,
-                    number_of_eigenvectors=preset.number_of_eigenvectors,
-                    number_of_descriptors=preset.number_of_descriptors,
-                    number_of_samples=preset.number_of_samples,
-                    init=prepared.init,
-                )
+        prepared, preset = pair.prepared, PRESETS[self.preset]
+        given = prepared.pair
+        surfaces = given.without_shortcuts() if preset.cuts_shortcuts else given
+        preset = preset.fitted(surfaces.fewest_vertices())
+        if surfaces is not given:
+            prepared = prepare(
+                surfaces,
+                number_of_eigenvectors=preset.number_of_eigenvectors,
+                number_of_descriptors=preset.number_of_descriptors,
+                number_of_samples=preset.number_of_samples,
+                init=prepared.init,
+            )
         outcome = refine_in_stages(prepared, preset.judged_stages, preset.repair)
         outcome = refine_further(prepared, preset.judged_stages, preset.repair, outcome)
         outcome = finish(prepared, preset.final_stages, preset.repair, outcome)
