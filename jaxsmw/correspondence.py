@@ -55,7 +55,8 @@ class Correspondence:
       the stages of a preset differ from the stages in `PRESETS`; see `match`.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. They contain the k_X and k_Y
       eigenvectors that the last stage uses. Two full shapes are each scaled to area 1. The shapes of a
-      partial pair are scaled by one common factor, so that the larger shape has area 1.
+      partial pair are scaled by one common factor, so that the larger shape has area 1. If a mesh was cut
+      before it was matched (`jaxsmw.geometry.cut_shortcuts`), the spectrum belongs to the cut mesh.
     - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.

@@ -62,6 +62,9 @@ def match(
 ) -> Correspondence:
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
+    If the preset has repair, each mesh is first cut where its surface is fused with itself, for example a
+    hand with a hip; see `jaxsmw.geometry.cut_shortcuts`. The result refers to the given meshes.
+
     The function issues a `UserWarning` if the final map looks wrong, if X and its mirror image match Y about
     equally well, or if a mesh is too coarse for the descriptors of the preset.
 
