@@ -37,7 +37,7 @@ from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision, Hands
 from jaxsmw.repair.outcome import Outcome
-from jaxsmw.repair.rounds import finish, refine_further, refine_in_stages
+from jaxsmw.repair.rounds import finish, refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.repair.settings import WITHOUT_REPAIR, ExpectedErrorSettings, RepairSettings
 from jaxsmw.runtime.progress import timed
@@ -287,8 +287,9 @@ def match_prepared(
         start, outcome = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
     begin = time.perf_counter()
     with one_blas_thread():
-        outcome = refine_further(start, preset.judged_stages, preset.repair, outcome, history=history)
-        outcome = finish(start, preset.final_stages, preset.repair, outcome, history=history)
+        outcome = finish(
+            start, preset.judged_stages, preset.final_stages, preset.repair, outcome, history=history
+        )
         jax.block_until_ready(outcome.refinements[-1])
     if seconds is not None:
         seconds["refinement"] += time.perf_counter() - begin

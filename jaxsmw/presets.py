@@ -28,7 +28,8 @@ class Preset:
     - `repair`: the `RepairSettings` that determine when and how a map is repaired; None (the default) for no
       repair.
     - `large_stages`: the stages that run instead of `stages` if both meshes have at least 15 000 vertices;
-      None (the default) to run `stages` on meshes of any size.
+      None (the default) to run `stages` on meshes of any size. `repair.stage` and `repair.final_stages` count
+      these stages as well.
 
     **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage before
     the final stages has the position `repair.stage`. `InputError` is also raised if one of these rules is

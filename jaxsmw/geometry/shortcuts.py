@@ -78,8 +78,7 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
         removed |= min(strips, key=lambda strip: float(mesh.face_areas[strip].sum()))
     # A gap can isolate a few faces, whose eigenfunctions would be useless.
     kept = np.flatnonzero(~removed)
-    edges = np.concatenate([mesh.faces[kept, :2], mesh.faces[kept, 1:]])
-    component = connected_components(edges, len(mesh.vertices))[1]
+    _, component = _components(mesh.faces[kept], len(mesh.vertices))
     at_gap = np.isin(component[mesh.faces[kept, 0]], component[mesh.faces[removed]])
     small, _ = in_small_components(component[mesh.faces[kept, 0]], mesh.face_areas[kept], at_gap)
     removed[kept] = small & at_gap
@@ -99,10 +98,14 @@ def _genus(manifold: Int64[np.ndarray, "f 3"]) -> int:
     The number of handles follows from Euler's formula. With c components and b boundary loops, the formula is
     V - E + F = 2 (c - genus) - b.
     """
-    edges = np.concatenate([manifold[:, :2], manifold[:, 1:]])
-    components, _ = connected_components(edges, int(manifold.max()) + 1)
+    components, _ = _components(manifold, int(manifold.max()) + 1)
     boundaries = len(igl.boundary_loop_all(manifold))
     return components - (igl.euler_characteristic(manifold) + boundaries) // 2
+
+
+def _components(faces: Int64[np.ndarray, "f 3"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
+    """Compute the connected components of n vertices; see `connected_components`."""
+    return connected_components(np.concatenate([faces[:, :2], faces[:, 1:]]), n)
 
 
 def _faces_along(opened: Int64[np.ndarray, "f 3"], sides: Int64[np.ndarray, " l"]) -> Bool[np.ndarray, " f"]:

@@ -164,27 +164,26 @@ def refine_further(
 def finish(
     prepared: PreparedPair,
     stages: Sequence[Stage],
+    final_stages: Sequence[Stage],
     repair: RepairSettings | None,
     outcome: Outcome,
     *,
     history: bool = False,
 ) -> Outcome:
-    """Run the final stages, which are not repeated by repair; see `RepairSettings.final_stages`.
+    """Refine a map further, and run the final stages; see `RepairSettings.final_stages`.
 
     **Arguments:**
 
-    - `prepared`: the pair with its spectra.
-    - `stages`: the final stages, in the order in which they run.
-    - `repair`: the settings of the repair, or None.
-    - `outcome`: an outcome of `refine_further`.
-    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
+    - `final_stages`: the final stages, in the order in which they run.
+    - the other arguments: see `refine_further`.
 
     **Returns:** The `Outcome` with the distortion of the final map. The attribute `suspicious` is copied from
-    the given outcome, and so is the whole outcome if there are no final stages.
+    the given outcome.
     """
-    if not stages:
+    outcome = refine_further(prepared, stages, repair, outcome, history=history)
+    if not final_stages:
         return outcome
-    runner, judge = _runner_and_judge(prepared, stages, repair or WITHOUT_REPAIR, history)
+    runner, judge = _runner_and_judge(prepared, final_stages, repair or WITHOUT_REPAIR, history)
     return judge.measured(runner.run(0, outcome))
 
 

@@ -18,7 +18,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.preparation import prepare
 from jaxsmw.presets import PRESETS, PresetName
-from jaxsmw.repair.rounds import finish, refine_further, refine_in_stages
+from jaxsmw.repair.rounds import finish, refine_in_stages
 from jaxsmw.stage import Stage
 
 
@@ -93,8 +93,7 @@ class Chosen(Method):
                 init=prepared.init,
             )
         outcome = refine_in_stages(prepared, preset.judged_stages, preset.repair)
-        outcome = refine_further(prepared, preset.judged_stages, preset.repair, outcome)
-        outcome = finish(prepared, preset.final_stages, preset.repair, outcome)
+        outcome = finish(prepared, preset.judged_stages, preset.final_stages, preset.repair, outcome)
         return outcome.pointwise_map, outcome.refinements[-1].result
 
 
