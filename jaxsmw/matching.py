@@ -175,6 +175,7 @@ def match(
         surfaces.mirrored() if decision.mirrored else surfaces,
         number_of_eigenvectors=chosen.number_of_eigenvectors,
         number_of_descriptors=chosen.number_of_descriptors,
+        number_of_crease_eigenvectors=chosen.number_of_crease_eigenvectors,
         number_of_samples=chosen.number_of_samples,
         init=first_init,
         descriptors_required=not adapts,

@@ -16,6 +16,7 @@ from jaxsmw.core.refiner import Samples
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import SampledPair, describe, sample_pair
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.creases import crease_eigenvectors
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
@@ -49,7 +50,7 @@ class PreparedPair:
 
     - `pair`: the `Pair` of the source X (m vertices) and the target Y (n vertices).
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum` in `Pair.units_of_length`, without
-      padding. The spectra contain descriptors if descriptors were requested.
+      padding. The spectra contain descriptors and crease eigenvectors if they were requested.
     - `init`: the argument `init` of `prepare`, from which the initial map was computed.
     - `initial_map`: T: X -> Y (m,), int64, as 0-based vertices of Y.
     - `samples`: the samples of X (s,) and of Y (s,), a pair of arrays of 0-based vertices in farthest-point
@@ -80,6 +81,28 @@ class PreparedPair:
             start = initial_map(self.pair, self.spectrum_x, self.spectrum_y, init=init, sampled=self.sampled)
         return replace(self, init=init, initial_map=start, seconds=seconds)
 
+    def with_crease_eigenvectors(self, number: int) -> PreparedPair:
+        """Return the prepared pair with crease eigenvectors in its spectra.
+
+        The `seconds` of the result also contain the time of the crease eigenvectors.
+
+        **Arguments:**
+
+        - `number`: the number of crease eigenvectors of each shape, at least 1; see
+          `jaxsmw.geometry.crease_eigenvectors`.
+
+        **Raises:** `InputError` if the crease eigenvectors cannot be computed.
+        """
+        seconds = dict(self.seconds)
+        with timed("crease eigenvectors", seconds):
+            of_x, of_y = side_by_side(lambda mesh: crease_eigenvectors(mesh, number), *self.pair.meshes)
+        return replace(
+            self,
+            spectrum_x=self.spectrum_x.with_crease_eigenvectors(jax.device_put(of_x)),
+            spectrum_y=self.spectrum_y.with_crease_eigenvectors(jax.device_put(of_y)),
+            seconds=seconds,
+        )
+
     @cached_property
     def padded(self) -> tuple[Spectrum, Spectrum]:
         """Both spectra, padded to the sizes that `program_size` returns."""
@@ -97,7 +120,7 @@ class PreparedPair:
         return jax.device_put(padded)
 
     def view(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
-        """Return the padded spectra, restricted to the eigenvectors and descriptors that a stage uses.
+        """Return the padded spectra, restricted to the data that a stage uses.
 
         See `Stage.view`.
         """
@@ -109,6 +132,7 @@ def prepare(
     *,
     number_of_eigenvectors: int,
     number_of_descriptors: int = 0,
+    number_of_crease_eigenvectors: int = 0,
     number_of_samples: int = 0,
     init: InitialMap | ArrayLike | SurfacePoints = "shot",
     laplacian: Laplacian = "auto",
@@ -124,6 +148,8 @@ def prepare(
     - `number_of_eigenvectors`: the largest number of eigenvectors that a stage uses, at least 1.
     - `number_of_descriptors`: the largest number of descriptors that a stage uses, from 0 to 352. With 0, no
       descriptors are computed.
+    - `number_of_crease_eigenvectors`: the largest number of crease eigenvectors that a stage uses. With 0, no
+      crease eigenvectors are computed.
     - `number_of_samples`: the largest number of samples of each shape that a stage uses. With 0, no samples
       are computed.
     - `init`: the initial map; see `match`. The argument is `"shot"`, `"wks"`, `"hks"`, `"wavelet"`,
@@ -173,4 +199,7 @@ def prepare(
                 lambda mesh: farthest_point_samples(mesh, number_of_samples), *pair.meshes
             )
             samples = jax.device_put(samples_x), jax.device_put(samples_y)
-    return PreparedPair(pair, *spectra, init, start, samples, sampled, seconds)
+    prepared = PreparedPair(pair, *spectra, init, start, samples, sampled, seconds)
+    if number_of_crease_eigenvectors:
+        return prepared.with_crease_eigenvectors(number_of_crease_eigenvectors)
+    return prepared

@@ -40,6 +40,8 @@ class Stage:
       argument out, because each level is one iteration.
     - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
       352; 0 by default.
+    - `number_of_crease_eigenvectors`: the number of crease eigenvectors of each shape that the refiner uses,
+      at least 0; 0 by default. See `jaxsmw.geometry.crease_eigenvectors`.
     - `number_of_samples`: the number of samples of each shape, at least the number of eigenvectors. The
       iterations match only the samples, and a final nearest-neighbour search matches all vertices. With None
       (the default), all iterations use all vertices.
@@ -52,14 +54,15 @@ class Stage:
     **Raises:** `InputError` if `refiner` is not a `Refiner`, or if there are fewer samples than eigenvectors.
     `InputError` is also raised if `starts_on_samples` or `ends_on_samples` is True, but the stage has no
     samples, or its refiner does not support the option. `WaveletPreservation` supports neither option.
-    `InputError` is also raised if a number of eigenvectors, iterations, descriptors or samples is not an
-    integer, is out of range or contradicts the refiner's levels.
+    `InputError` is also raised if a number of eigenvectors, iterations, descriptors, crease eigenvectors or
+    samples is not an integer, is out of range or contradicts the refiner's levels.
     """
 
     refiner: Refiner
     number_of_eigenvectors: int
     iterations: int
     number_of_descriptors: int
+    number_of_crease_eigenvectors: int
     number_of_samples: int | None
     starts_on_samples: bool
     ends_on_samples: bool
@@ -72,6 +75,7 @@ class Stage:
         number_of_eigenvectors: int | None = None,
         iterations: int | None = None,
         number_of_descriptors: int = 0,
+        number_of_crease_eigenvectors: int = 0,
         number_of_samples: int | None = None,
         starts_on_samples: bool = False,
         ends_on_samples: bool = False,
@@ -88,6 +92,7 @@ class Stage:
             ),
             "iterations": _derived("iterations", iterations, count, ITERATIONS),
             "number_of_descriptors": number_of_descriptors,
+            "number_of_crease_eigenvectors": number_of_crease_eigenvectors,
         }
         if number_of_samples is not None:
             sizes["number_of_samples"] = number_of_samples
@@ -116,6 +121,10 @@ class Stage:
             raise InputError(
                 f"{self.number_of_descriptors} descriptors were requested, but SHOT has {SHOT_DIMENSION}: "
                 f"give a number from 0 to {SHOT_DIMENSION}."
+            )
+        if self.number_of_crease_eigenvectors < 0:
+            raise InputError(
+                f"{self.number_of_crease_eigenvectors} crease eigenvectors were requested: give 0 or more."
             )
         if self.number_of_samples is not None and self.number_of_samples < self.number_of_eigenvectors:
             raise InputError(
@@ -165,8 +174,9 @@ class Stage:
     def fitted(self, number_of_vertices: int) -> Stage:
         """Return the stage adapted to a small mesh.
 
-        The number of eigenvectors is reduced to at most half the number of vertices. If the number of samples
-        is at least the number of vertices, the stage uses all vertices instead of samples.
+        The numbers of eigenvectors and of crease eigenvectors are reduced to at most half the number of
+        vertices. If the number of samples is at least the number of vertices, the stage uses all vertices
+        instead of samples.
 
         **Arguments:**
 
@@ -175,6 +185,8 @@ class Stage:
         most, fitted = max(1, number_of_vertices // 2), self
         if self.number_of_samples is not None and self.number_of_samples >= number_of_vertices:
             fitted = replace(self, number_of_samples=None, starts_on_samples=False, ends_on_samples=False)
+        if self.number_of_crease_eigenvectors > most:
+            fitted = replace(fitted, number_of_crease_eigenvectors=most)
         if self.number_of_eigenvectors <= most:
             return fitted
         if self.refiner.levels:
@@ -184,7 +196,11 @@ class Stage:
     def view(
         self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
     ) -> tuple[Spectrum, Spectrum]:
-        """Return both spectra, restricted to the eigenvectors and descriptors that this stage uses.
+        """Return both spectra, restricted to the data that this stage uses.
+
+        The result contains the eigenvectors, descriptors and crease eigenvectors that the stage uses. If one
+        of the spectra has no crease eigenvectors, the result has none either. This happens in a collection if
+        only one of two meshes is large.
 
         The two spectra of a partial pair end at a common limit. If the stage leaves out eigenvectors of a
         partial pair, `jaxsmw.pair.common_range` cuts both spectra at a new common limit.
@@ -196,11 +212,17 @@ class Stage:
         - `partial`: whether one of the shapes is a partial shape.
         """
         spectra, seen = (spectrum_x, spectrum_y), []
+        creased = all(spectrum.crease_eigenvectors is not None for spectrum in spectra)
         for spectrum in spectra:
             descriptors = None
             if self.number_of_descriptors and spectrum.descriptors is not None:
                 descriptors = spectrum.descriptors[:, : self.number_of_descriptors]
-            seen.append(spectrum.truncate(self.number_of_eigenvectors).with_descriptors(descriptors))
+            creases = None
+            if self.number_of_crease_eigenvectors and creased:
+                assert spectrum.crease_eigenvectors is not None
+                creases = spectrum.crease_eigenvectors[:, : self.number_of_crease_eigenvectors]
+            used = spectrum.truncate(self.number_of_eigenvectors)
+            seen.append(used.with_descriptors(descriptors).with_crease_eigenvectors(creases))
         fewer = [now.eigenvalues.shape != s.eigenvalues.shape for now, s in zip(seen, spectra, strict=True)]
         return common_range(*seen) if partial and any(fewer) else (seen[0], seen[1])
 
@@ -258,11 +280,11 @@ class Stage:
     def _outline(self, number_of_vertices: int) -> Spectrum:
         """Return a spectrum of zeros for the compilation of the program."""
         n, k, d = number_of_vertices, self.number_of_eigenvectors, self.number_of_descriptors
-        descriptors = jnp.zeros((n, d)) if d else None
-        places = {"positions": jnp.zeros((n, 3)), "normals": jnp.zeros((n, 3))}
-        return Spectrum(
-            jnp.zeros(k), jnp.zeros((n, k)), jnp.zeros(n), jnp.zeros(n, bool), descriptors, **places
-        )
+        c = self.number_of_crease_eigenvectors
+        spectrum = Spectrum(jnp.zeros(k), jnp.zeros((n, k)), jnp.zeros(n), jnp.zeros(n, bool))
+        described = spectrum.with_descriptors(jnp.zeros((n, d)) if d else None)
+        creased = described.with_crease_eigenvectors(jnp.zeros((n, c)) if c else None)
+        return creased.with_positions(jnp.zeros((n, 3)), jnp.zeros((n, 3)))
 
     def _arguments(
         self,

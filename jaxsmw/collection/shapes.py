@@ -18,6 +18,7 @@ from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes, SampledPair, SampledShape, compared_samples
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.creases import crease_eigenvectors
 from jaxsmw.geometry.eigenbasis import choose_eigensolver, compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
@@ -46,7 +47,8 @@ class PreparedShape:
 
     - `mesh`: the `Mesh` (n vertices). If the preset cuts shortcuts, the mesh can have fewer faces than the
       given mesh; see `jaxsmw.geometry.cut_shortcuts`.
-    - `spectrum`: the `Spectrum` in units in which the area is 1, with descriptors if the preset uses them.
+    - `spectrum`: the `Spectrum` in units in which the area is 1, with descriptors and crease
+      eigenvectors if the preset uses them.
     - `compared`: the `SurfaceSamples` at which descriptors are compared; None for all vertices.
     - `samples`: the samples (s,) on which stages iterate, as 0-based vertices in farthest-point order; None
       if no stage uses samples.
@@ -111,6 +113,9 @@ def prepare_shape(
     spectrum = compute_spectrum(
         mesh, preset.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
     )
+    if preset.number_of_crease_eigenvectors:
+        creases = crease_eigenvectors(mesh, preset.number_of_crease_eigenvectors)
+        spectrum = spectrum.with_crease_eigenvectors(jax.device_put(creases))
     samples = None
     if preset.number_of_samples:
         samples = jax.device_put(farthest_point_samples(mesh, preset.number_of_samples))

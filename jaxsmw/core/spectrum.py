@@ -34,6 +34,9 @@ class Spectrum(eqx.Module):
     - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, without unit, zero for
       masked vertices; or None (the default). Only the refiners `FeatureRegression` and `Registration` use
       descriptors.
+    - `crease_eigenvectors`: (n, c), without unit, zero for masked vertices; or None (the default). Unlike
+      `eigenvectors`, they depend on how the surface bends; see `jaxsmw.geometry.crease_eigenvectors`. Only
+      the refiner `FeatureRegression` uses crease eigenvectors.
     - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None (the
       default). Only the refiner `Registration` uses positions.
     - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None (the default). Only the
@@ -47,6 +50,7 @@ class Spectrum(eqx.Module):
     descriptors: Float[Array, "n d"] | None = None
     positions: Float[Array, "n 3"] | None = None
     normals: Float[Array, "n 3"] | None = None
+    crease_eigenvectors: Float[Array, "n c"] | None = None
 
     def truncate(self, number_of_eigenvectors: int) -> Spectrum:
         """Return the spectrum with only the first `number_of_eigenvectors` eigenpairs."""
@@ -76,8 +80,8 @@ class Spectrum(eqx.Module):
     def reflect(self) -> Spectrum:
         """Return the spectrum of the mirror image.
 
-        The first coordinate of each position and of each normal changes its sign. The attribute `descriptors`
-        is not changed.
+        The first coordinate of each position and of each normal changes its sign. The other attributes are
+        not changed.
         """
         flip = jnp.array([[-1, 1, 1]])
         return dataclasses.replace(
@@ -93,6 +97,14 @@ class Spectrum(eqx.Module):
         """
         self._check_rows("descriptors", descriptors)
         return dataclasses.replace(self, descriptors=descriptors)
+
+    def with_crease_eigenvectors(self, crease_eigenvectors: Float[Array, "n c"] | None) -> Spectrum:
+        """Return the spectrum with the given crease eigenvectors (n, c), or without them if they are None.
+
+        **Raises:** `ValueError` if the crease eigenvectors do not have one row per vertex.
+        """
+        self._check_rows("crease eigenvectors", crease_eigenvectors)
+        return dataclasses.replace(self, crease_eigenvectors=crease_eigenvectors)
 
     def with_positions(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
         """Return the spectrum with the given vertex positions (n, 3) and unit normals (n, 3).

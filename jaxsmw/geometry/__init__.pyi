@@ -1,4 +1,5 @@
 from .assignment import one_to_one_map
+from .creases import crease_eigenvectors
 from .creature import CreaturePair, creature_pair
 from .eigenbasis import compute_spectrum
 from .geodesics import SurfacePoints, geodesic_distances
@@ -16,6 +17,7 @@ __all__ = [
     "ScaleEstimate",
     "SurfacePoints",
     "compute_spectrum",
+    "crease_eigenvectors",
     "creature_pair",
     "cut_shortcuts",
     "diagnose",

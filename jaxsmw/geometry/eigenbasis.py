@@ -129,16 +129,7 @@ def eigenpairs(
     **Returns:** Eigenvalues (k,), eigenvectors (n, k) and vertex areas (n,), in units in which the area is 1.
     """
     check_kind("mesh", mesh, Mesh)
-    referenced = np.flatnonzero(mesh.referenced_vertices)
-    if not isinstance(number_of_eigenvectors, int | np.integer):
-        raise InputError(
-            f"{mesh.name}: the number of eigenvectors is {number_of_eigenvectors!r}: give an integer."
-        )
-    if not 1 <= number_of_eigenvectors < len(referenced):
-        raise InputError(
-            f"{mesh.name}: cannot compute {number_of_eigenvectors} eigenvectors from {len(referenced)} "
-            f"referenced vertices: choose a number from 1 to {len(referenced) - 1}, or use a finer mesh."
-        )
+    check_number_of_eigenvectors(mesh, number_of_eigenvectors)
     check_choice(eigensolver, Eigensolver, "an eigensolver")
     check_choice(laplacian, Laplacian, "a Laplacian")
     if laplacian == "auto":
@@ -149,25 +140,68 @@ def eigenpairs(
     def compute() -> dict[str, np.ndarray]:
         stiffness, areas = assemble_laplacian(mesh, laplacian=laplacian)
         areas = areas / areas.sum()
-        if all_referenced := len(referenced) == len(areas):
-            local = stiffness, areas
-        else:
-            local = stiffness[referenced][:, referenced], areas[referenced]
-        with one_blas_thread():
-            values, vectors = _solve(*local, number_of_eigenvectors, eigensolver, mesh.name)
-        # Signs are changed in place, because another copy of the eigenvectors of a large mesh may not fit
-        # into memory.
-        for column in vectors.T:
-            column *= np.sign(column[np.argmax(np.abs(column))])
-        if not all_referenced:
-            eigenvectors = np.zeros((len(areas), number_of_eigenvectors))
-            eigenvectors[referenced] = vectors
-            vectors = eigenvectors
+        values, vectors = solve_on_surface(mesh, stiffness, areas, number_of_eigenvectors, eigensolver)
         return {"eigenvalues": values, "eigenvectors": vectors, "vertex_areas": areas}
 
     inputs = mesh.vertices, mesh.faces, number_of_eigenvectors, laplacian, eigensolver
     result = cached("spectrum", inputs, compute)
     return result["eigenvalues"], result["eigenvectors"], result["vertex_areas"]
+
+
+def check_number_of_eigenvectors(mesh: Mesh, number: int) -> None:
+    """Check that a mesh has enough vertices for a number of eigenvectors.
+
+    **Raises:** `InputError` if the number is not an integer, is less than 1, or is not less than the number
+    of referenced vertices.
+    """
+    if not isinstance(number, int | np.integer):
+        raise InputError(f"{mesh.name}: the number of eigenvectors is {number!r}: give an integer.")
+    referenced = int(mesh.referenced_vertices.sum())
+    if not 1 <= number < referenced:
+        raise InputError(
+            f"{mesh.name}: cannot compute {number} eigenvectors from {referenced} referenced vertices: "
+            f"choose a number from 1 to {referenced - 1}, or use a finer mesh."
+        )
+
+
+def solve_on_surface(
+    mesh: Mesh,
+    stiffness: sp.csc_matrix,
+    areas: Float64[np.ndarray, " n"],
+    number: int,
+    eigensolver: Eigensolver = "exact",
+) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"]]:
+    """Compute the smallest eigenpairs of a Laplacian at the referenced vertices of a mesh.
+
+    **Arguments:**
+
+    - `mesh`: the mesh (n vertices).
+    - `stiffness`, `areas`: the stiffness matrix (n, n) and the vertex areas (n,). The unit of the eigenpairs
+      is the unit of the areas.
+    - `number`: the number k of eigenpairs.
+    - `eigensolver`: `"exact"` or `"approximate"`; see `compute_spectrum`.
+
+    **Returns:** The eigenvalues (k,), ascending, and the eigenvectors (n, k). The entry of largest absolute
+    value of each eigenvector is positive. The eigenvectors are zero at unreferenced vertices.
+
+    **Raises:** `InputError` if the eigenproblem cannot be solved accurately.
+    """
+    referenced = np.flatnonzero(mesh.referenced_vertices)
+    if all_referenced := len(referenced) == len(areas):
+        local = stiffness, areas
+    else:
+        local = stiffness[referenced][:, referenced], areas[referenced]
+    with one_blas_thread():
+        values, vectors = _solve(*local, number, eigensolver, mesh.name)
+    # Signs are changed in place, because another copy of the eigenvectors of a large mesh may not fit into
+    # memory.
+    for column in vectors.T:
+        column *= np.sign(column[np.argmax(np.abs(column))])
+    if not all_referenced:
+        eigenvectors = np.zeros((len(areas), number))
+        eigenvectors[referenced] = vectors
+        vectors = eigenvectors
+    return values, vectors
 
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:

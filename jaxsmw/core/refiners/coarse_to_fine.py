@@ -107,16 +107,19 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
 
 
 def check_descriptors(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """Check that two shapes have the same number of descriptors, which may be zero.
+    """Check that two shapes have equal numbers of descriptors and of crease eigenvectors, which may be zero.
 
-    **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
+    **Raises:** `ValueError` if one of the two numbers differs between the shapes.
     """
-    numbers = [0 if s.descriptors is None else s.descriptors.shape[1] for s in (spectrum_x, spectrum_y)]
-    if numbers[0] != numbers[1]:
-        raise ValueError(
-            f"X has {numbers[0]} descriptors and Y has {numbers[1]}: give both shapes the same number of "
-            "descriptors"
-        )
+    for kind in ("descriptors", "crease_eigenvectors"):
+        arrays = [getattr(spectrum, kind) for spectrum in (spectrum_x, spectrum_y)]
+        numbers = [0 if array is None else array.shape[1] for array in arrays]
+        if numbers[0] != numbers[1]:
+            name = kind.replace("_", " ")
+            raise ValueError(
+                f"X has {numbers[0]} {name} and Y has {numbers[1]}: give both shapes the same number of "
+                f"{name}"
+            )
 
 
 def partial_matching_weights(

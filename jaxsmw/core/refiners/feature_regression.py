@@ -31,16 +31,18 @@ _RIDGE, _LEAST_RESIDUAL = 1e-3, 0.03
 class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     """A refiner that finds matches by linear regression between the features of both shapes.
 
-    The features of a vertex are the values of the eigenvectors and, if the spectra have descriptors, the
-    descriptors (`Spectrum.descriptors`). Each iteration regresses the features of vertices of X on the
-    features of their matches. The first iteration uses the matches of the initial map. Later iterations use
-    the matches of the map and of the reverse map. Eigenvectors are regressed on eigenvectors, which gives the
-    functional map by least squares (Ovsjanikov et al. 2012). Descriptors are regressed on descriptors. The
-    covariance of the residuals measures how accurately each combination of features is predicted. This
-    covariance defines a Mahalanobis distance between the features of a vertex of X and the features predicted
-    from a vertex of Y. The next match of a vertex of X is the nearest vertex of Y in this distance. For the
-    reverse map, the features of Y are regressed on the features of X in the same way. The argument `levels`
-    increases the number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi et al. 2019).
+    The features of a vertex are the values of the eigenvectors and, if the spectra have them, the descriptors
+    and the crease eigenvectors (`Spectrum.descriptors`, `Spectrum.crease_eigenvectors`). Each iteration
+    regresses the features of vertices of X on the features of their matches. The first iteration uses the
+    matches of the initial map. Later iterations use the matches of the map and of the reverse map.
+    Eigenvectors are regressed on eigenvectors, which gives the functional map by least squares (Ovsjanikov et
+    al. 2012). Descriptors and crease eigenvectors together are regressed on descriptors and crease
+    eigenvectors. The covariance of the residuals measures how accurately each combination of features is
+    predicted. This covariance defines a Mahalanobis distance between the features of a vertex of X and the
+    features predicted from a vertex of Y. The next match of a vertex of X is the nearest vertex of Y in this
+    distance. For the reverse map, the features of Y are regressed on the features of X in the same way. The
+    argument `levels` increases the number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi
+    et al. 2019).
 
     The method does not assume isometry. If the initial map is as accurate as a map from
     `WaveletPreservation`, refinement makes the map more accurate. docs/accuracy.md contains the measurements.
@@ -70,7 +72,8 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def prepare(self, problem: Problem) -> PreparedFeatures:
         """Collect the features of all vertices. If there are samples, also collect their features.
 
-        **Raises:** `ValueError` if only one shape has descriptors, or the numbers of descriptors differ.
+        **Raises:** `ValueError` if the shapes have different numbers of descriptors or of crease
+        eigenvectors.
         """
         check_descriptors(problem.spectrum_x, problem.spectrum_y)
         all_x, all_y = _Features.of(problem.spectrum_x), _Features.of(problem.spectrum_y)
@@ -162,8 +165,9 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 class _Features(NamedTuple):
     """The features, weights and mask of the vertices of one shape.
 
-    Each row of `values` contains the values of the eigenvectors at a vertex, and then the descriptors of the
-    vertex if the spectrum has descriptors. The weights are the vertex areas, scaled so that they sum to 1.
+    Each row of `values` contains the values of the eigenvectors at a vertex, and then the descriptors and the
+    crease eigenvectors if the spectrum has them. The weights are the vertex areas, scaled so that they sum
+    to 1.
     """
 
     values: Float[Array, "n d"]
@@ -175,8 +179,8 @@ class _Features(NamedTuple):
         area = jnp.sum(spectrum.vertex_areas)
         # The square root of the area scales each eigenvector to mean square 1, whatever the unit of length.
         values = spectrum.eigenvectors * jnp.sqrt(area)
-        if spectrum.descriptors is not None:
-            values = jnp.concatenate([values, spectrum.descriptors], axis=1)
+        further = [spectrum.descriptors, spectrum.crease_eigenvectors]
+        values = jnp.concatenate([values, *(f for f in further if f is not None)], axis=1)
         return cls(values, spectrum.vertex_areas / area, spectrum.mask)
 
 

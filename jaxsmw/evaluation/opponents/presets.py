@@ -19,6 +19,7 @@ from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.preparation import prepare
 from jaxsmw.presets import PRESETS, PresetName
 from jaxsmw.repair.rounds import finish, refine_in_stages
+from jaxsmw.runtime.cache import recomputing
 from jaxsmw.stage import Stage
 
 
@@ -58,6 +59,9 @@ class Refined(Method):
 class Chosen(Method):
     """A method that refines the initial map with one of `jaxsmw.PRESETS`, exactly as `jaxsmw.match` does.
 
+    No other method uses crease eigenvectors. They are therefore computed as a part of the method, anew for
+    each pair, and their time counts.
+
     **Attributes:**
 
     - `reference`: the publication and the settings, as text; see `Method`.
@@ -92,6 +96,9 @@ class Chosen(Method):
                 number_of_samples=preset.number_of_samples,
                 init=prepared.init,
             )
+        if preset.number_of_crease_eigenvectors:
+            with recomputing():
+                prepared = prepared.with_crease_eigenvectors(preset.number_of_crease_eigenvectors)
         outcome = refine_in_stages(prepared, preset.judged_stages, preset.repair)
         outcome = finish(prepared, preset.judged_stages, preset.final_stages, preset.repair, outcome)
         return outcome.pointwise_map, outcome.refinements[-1].result
