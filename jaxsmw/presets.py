@@ -173,8 +173,8 @@ PRESETS: dict[PresetName, Preset] = {
     "accurate": Preset(
         (_WAVELETS, _REGRESSION, _REGISTRATION, _FINAL),
         RepairSettings(stage=1, final_stages=1),
-        # On large meshes, searches that match all vertices take most of the time. Crease eigenvectors would
-        # need the exact eigensolver, and the small details of scans would dominate them.
+        # On large meshes, searches that match all vertices take most of the time. Crease eigenvectors are
+        # left out, because they need the exact eigensolver.
         large_stages=(
             replace(_WAVELETS, number_of_samples=1000),
             replace(_REGRESSION, number_of_crease_eigenvectors=0, ends_on_samples=True),

@@ -155,7 +155,8 @@ def prepare_usable_shapes(
 
 def shape_key(shape: PreparedShape, preset: Preset) -> tuple[Any, ...]:
     """Return the part of a `Store` key that identifies a shape, apart from its descriptors."""
-    return shape.mesh.vertices, shape.mesh.faces, preset.number_of_eigenvectors
+    numbers = preset.number_of_eigenvectors, preset.number_of_crease_eigenvectors
+    return shape.mesh.vertices, shape.mesh.faces, *numbers
 
 
 def preset_key(preset: Preset) -> tuple[Any, ...]:

@@ -27,9 +27,8 @@ def crease_eigenvectors(mesh: Mesh, number: int) -> Float64[np.ndarray, "n c"]:
     of the unit normals at its ends, multiplied by 0.07². Lengths are in units of the square root of the area.
     Distances across creases and strongly curved regions are therefore longer than on the surface. Unlike the
     usual eigenvectors, crease eigenvectors depend on how the surface bends. They therefore contain further
-    information on the place of a vertex on the body, for example whether a vertex is on the back or on the
-    belly. (Hybrid functional maps use a basis of a thin-shell energy for this purpose; Bastian, Xie, Navab,
-    Lähner 2024.)
+    information on the place of a vertex on the body. (Hybrid functional maps use a basis of a thin-shell
+    energy for this purpose; Bastian, Xie, Navab, Lähner 2024.)
 
     Crease eigenvectors do not depend on the scale, position and rotation of the mesh. The mirror image of a
     mesh has the same crease eigenvectors. The sign of each eigenvector is chosen so that its entry of largest
@@ -52,7 +51,8 @@ def crease_eigenvectors(mesh: Mesh, number: int) -> Float64[np.ndarray, "n c"]:
     def compute() -> dict[str, np.ndarray]:
         return {"eigenvectors": solve_on_surface(mesh, *_assemble(mesh), number)[1]}
 
-    return cached("crease-eigenvectors", (mesh.vertices, mesh.faces, number), compute)["eigenvectors"]
+    inputs = mesh.vertices, mesh.faces, number, _NORMAL_WEIGHT
+    return cached("crease-eigenvectors", inputs, compute)["eigenvectors"]
 
 
 def _assemble(mesh: Mesh) -> tuple[sp.csc_matrix, Float64[np.ndarray, " n"]]:
