@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS
 from jaxsmw.core.refinement import Refinement, check_samples_use, refine
@@ -213,14 +213,10 @@ class Stage:
         """
         spectra, seen = (spectrum_x, spectrum_y), []
         creased = all(spectrum.crease_eigenvectors is not None for spectrum in spectra)
+        number_of_creases = self.number_of_crease_eigenvectors if creased else 0
         for spectrum in spectra:
-            descriptors = None
-            if self.number_of_descriptors and spectrum.descriptors is not None:
-                descriptors = spectrum.descriptors[:, : self.number_of_descriptors]
-            creases = None
-            if self.number_of_crease_eigenvectors and creased:
-                assert spectrum.crease_eigenvectors is not None
-                creases = spectrum.crease_eigenvectors[:, : self.number_of_crease_eigenvectors]
+            descriptors = _first(spectrum.descriptors, self.number_of_descriptors)
+            creases = _first(spectrum.crease_eigenvectors, number_of_creases)
             used = spectrum.truncate(self.number_of_eigenvectors)
             seen.append(used.with_descriptors(descriptors).with_crease_eigenvectors(creases))
         fewer = [now.eigenvalues.shape != s.eigenvalues.shape for now, s in zip(seen, spectra, strict=True)]
@@ -301,6 +297,11 @@ class Stage:
         if self.number_of_samples is not None and samples is not None:
             chosen = samples[0][: self.number_of_samples], samples[1][: self.number_of_samples]
         return (spectrum_x, spectrum_y, pointwise_map), {"samples": chosen}
+
+
+def _first(columns: Float[Array, "n d"] | None, number: int) -> Float[Array, "n c"] | None:
+    """Return the first columns of an array; None if there is no array, or if the number is 0."""
+    return columns[:, :number] if number and columns is not None else None
 
 
 def _derived(name: str, given: int | None, derived: int | None, default: int) -> int:
