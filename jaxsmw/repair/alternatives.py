@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import chain, count, islice
 from typing import NamedTuple
 
@@ -41,6 +42,14 @@ class _Candidate(NamedTuple):
     found: SampleMap
 
 
+class _Step(NamedTuple):
+    """A stage, and the padded spectra of the samples on which it runs."""
+
+    stage: Stage
+    x: Spectrum
+    y: Spectrum
+
+
 class Alternatives:
     """Alternative maps of a pair, computed and compared on proxies.
 
@@ -76,18 +85,12 @@ class Alternatives:
         )
         self.x, self.y = side_by_side(self._proxy, *sides)
         chosen = settings.alternatives
-        stage = Stage(
+        self._stage = Stage(
             FeatureRegression(chosen.levels),
             number_of_descriptors=0 if prepared.spectrum_x.descriptors is None else chosen.descriptors,
         )
-        fewest = min(len(self.x.areas), len(self.y.areas))
-        self._coarse = stage.fitted(fewest)
-        self._fine = stage.with_levels(chosen.fine_levels).fitted(fewest)
-        largest = max(self._coarse, self._fine, key=lambda one: one.number_of_eigenvectors)
-        spectra = largest.view(
-            self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial
-        )
-        self._spectra = [spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in spectra]
+        self._coarse = self._step(self._stage)
+        self._fine = self._step(self._stage.with_levels(chosen.fine_levels))
         coarse_x, coarse_y = (
             side.truncate(chosen.eigenvectors) for side in (prepared.spectrum_x, prepared.spectrum_y)
         )
@@ -99,13 +102,25 @@ class Alternatives:
         samples = SurfaceSamples.along_surface(mesh, farthest_point_samples(mesh, number))
         return Proxy(mesh, spectrum, samples, unit)
 
+    @property
+    def has_creases(self) -> bool:
+        """Whether `best` can use crease eigenvectors."""
+        spectra = self.prepared.spectrum_x, self.prepared.spectrum_y
+        available = all(spectrum.crease_eigenvectors is not None for spectrum in spectra)
+        return available and self.settings.alternatives.crease_eigenvectors > 0
+
+    def _step(self, stage: Stage) -> _Step:
+        fitted = stage.fitted(min(len(self.x.areas), len(self.y.areas)))
+        spectra = fitted.view(self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial)
+        return _Step(fitted, *(spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in spectra))
+
     def deformation(self, pointwise_map: Int64[np.ndarray, " m"]) -> float:
         """Return the deformation of a map X -> Y (m,), measured on the proxies."""
         radius = self.settings.alternatives.patch_radius
         return deformation(self.x, self.y, self._reduced(pointwise_map), radius)
 
     def best(
-        self, known: Int64[np.ndarray, " m"], *, only_better: bool = False
+        self, known: Int64[np.ndarray, " m"], *, only_better: bool = False, creased: bool = False
     ) -> Iterator[Int64[np.ndarray, " m"]]:
         """Yield alternative maps that differ from each other. Maps with better scores mostly come first.
 
@@ -117,12 +132,16 @@ class Alternatives:
 
         - `known`: a map X -> Y (m,), which is refined as a further initial map.
         - `only_better`: whether the iterator ends at the first map that does not differ from `known`.
+        - `creased`: whether the first refinement uses crease eigenvectors; see `has_creases`.
 
         **Returns:** An iterator over maps T: X -> Y (m,), 0-based vertices of Y.
         """
         chosen, usual = self.settings.alternatives, self._reduced(known)
-        coarse = self._refined(self._coarse, chain(self._initial_maps(), [usual]))
-        repaired = self._without_faults(islice(self._distinct(coarse), chosen.repaired))
+        step = self._coarse
+        if creased:
+            step = self._step(replace(self._stage, number_of_crease_eigenvectors=chosen.crease_eigenvectors))
+        coarse = self._refined(step, chain(self._initial_maps(), [usual]))
+        repaired = self._without_faults(step, islice(self._distinct(coarse), chosen.repaired))
         coarse = sorted(coarse + repaired, key=lambda candidate: candidate.score)
         promising = islice(self._distinct(_within(chosen.coarse_margin, coarse)), chosen.promising)
         fine = self._refined(self._fine, [candidate.found for candidate in promising])
@@ -153,7 +172,7 @@ class Alternatives:
     def _difference(self, first: SampleMap, second: SampleMap) -> float:
         return map_difference(self.x, self.y, first, second, self.settings.alternatives.different_distance)
 
-    def _without_faults(self, candidates: Iterable[_Candidate]) -> list[_Candidate]:
+    def _without_faults(self, step: _Step, candidates: Iterable[_Candidate]) -> list[_Candidate]:
         """For each fault of each candidate, refine the map of samples without the faulty ones."""
         starts, faults = [], []
         for candidate in candidates:
@@ -161,7 +180,7 @@ class Alternatives:
             for fault in self.judge.faults(everywhere):
                 starts.append(candidate.found)
                 faults.append(fault[self.x.samples.vertices])
-        return self._refined(self._coarse, starts, faults)
+        return self._refined(step, starts, faults)
 
     def _initial_maps(self) -> Iterator[SampleMap]:
         """Yield the initial maps, each from the samples of X to the samples of Y."""
@@ -230,15 +249,15 @@ class Alternatives:
 
     def _refined(
         self,
-        stage: Stage,
+        step: _Step,
         initial: Iterable[SampleMap],
         faults: Sequence[Bool[np.ndarray, " s"]] | None = None,
     ) -> list[_Candidate]:
-        """Refine maps of samples by a stage, and return the successful results, the best score first.
+        """Refine maps of samples by a step, and return the successful results, the best score first.
 
         With `faults`, map number i is refined without the samples of X in the mask `faults[i]`.
         """
-        x, y = self._spectra
+        stage, x, y = step
         size, candidates = len(x.mask), []
 
         def run(number: int, start: SampleMap) -> Refinement:

@@ -43,6 +43,8 @@ class Proxy:
     def sampled_spectrum(self, descriptors: Float[np.ndarray, "s d"] | None = None) -> Spectrum:
         """Return the spectrum at the samples, with the areas of the samples as vertex areas.
 
+        If `spectrum` has descriptors and crease eigenvectors, the result has them as well.
+
         **Arguments:**
 
         - `descriptors`: the descriptors of the samples (s, d); by default, the descriptors of `spectrum`.
@@ -58,6 +60,7 @@ class Proxy:
             jnp.asarray(areas, dtype),
             at_samples.mask,
             at_samples.descriptors,
+            crease_eigenvectors=at_samples.crease_eigenvectors,
         )
 
     @functools.cached_property

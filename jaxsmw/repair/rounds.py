@@ -49,6 +49,9 @@ def refine_in_stages(
        If the second-best outcome of step 1 has faults, this outcome is repaired as well. The outcome with the
        best score is used.
 
+    If the map of two near-isometric full shapes still looks wrong, both steps run a second time. The
+    alternatives are then refined with crease eigenvectors as well (Table R45). The better outcome is kept.
+
     Some wrong maps look right. For two full shapes with the initial map `"shot"`, alternatives are therefore
     computed if the distortion of the outcome is at least `compared`. Only alternatives that differ from the
     map, and precede all similar maps in the order of their scores, are then refined at all vertices.
@@ -92,12 +95,22 @@ def refine_in_stages(
         logger.info("the map is compared with alternative maps (distortion %.3f)", best.distortion)
     else:
         return best
-    if computes_alternatives:
-        proxies = Alternatives(prepared, repair)
-        judge = replace(judge, measure_deformation=proxies.deformation)
-        alternatives = proxies.best(best.unpadded_map(prepared.pair), only_better=not best.suspicious)
-    repairer = _Repairer(runner, judge, repair)
-    return repairer.repaired(judge.measured(best), map(prepared.padded_map, alternatives or ()))
+    if not computes_alternatives:
+        repairer = _Repairer(runner, judge, repair)
+        return repairer.repaired([best], map(prepared.padded_map, alternatives or ()))
+    proxies = Alternatives(prepared, repair)
+    judge = replace(judge, measure_deformation=proxies.deformation)
+    repairer, usual = _Repairer(runner, judge, repair), best.unpadded_map(prepared.pair)
+    found = proxies.best(usual, only_better=not best.suspicious)
+    best = repairer.repaired([judge.measured(best)], map(prepared.padded_map, found))
+    # Near-isometric bodies bend at the same places, so crease eigenvectors can find further maps.
+    near_isometric = compares and judge.area_change(best) < repair.non_isometric
+    if best.suspicious and near_isometric and proxies.has_creases:
+        logger.info("further alternative maps are computed with crease eigenvectors ...")
+        maps = [prepared.padded_map(one) for one in proxies.best(usual, creased=True)]
+        if maps:
+            best = min(best, repairer.repaired([], maps), key=judge.score)
+    return best
 
 
 def refine_further(
@@ -252,9 +265,9 @@ class _Repairer:
     judge: Judge
     settings: RepairSettings
 
-    def repaired(self, first: Outcome, alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
-        """Repair a judged outcome by alternative maps and, if the best outcome looks wrong, by rounds."""
-        outcomes = [first]
+    def repaired(self, known: Sequence[Outcome], alternatives: Iterable[Int[Array, " m"]]) -> Outcome:
+        """Return the best of judged outcomes and alternative maps, repaired by rounds if it looks wrong."""
+        outcomes = [*known]
         for number, start in enumerate(islice(alternatives, self.settings.finalists), 1):
             logger.info("alternative map %d ...", number)
             outcomes.append(self._from_repeated(Outcome([], start)))

@@ -121,6 +121,10 @@ class AlternativeSettings:
     - `position_weight`: the weight of the positions along the principal axes in the same search.
     - `levels`, `descriptors`: the levels and the number of descriptors of the feature regression that refines
       the initial maps.
+    - `crease_eigenvectors` (Table R45): the number of crease eigenvectors in the second attempt, at least 0.
+      The second attempt refines the same initial maps with these further features. It runs if the first
+      attempt ends with a map that looks wrong, and the area-based shape difference of two full shapes is
+      below `RepairSettings.non_isometric`. With 0, there is no second attempt.
     - `repaired`: the number of refined maps whose faults are repaired. For each fault of such a map, the map
       is refined again without the faulty vertices.
     - `fine_levels` (Table R40): the levels of a second refinement, which only promising maps receive. If
@@ -149,6 +153,7 @@ class AlternativeSettings:
     position_weight: float = 10.0
     levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20, 26, 35)
     descriptors: int = 30
+    crease_eigenvectors: int = 20
     repaired: int = 3
     fine_levels: tuple[int, ...] = (20, 20, 26, 26, 35, 35, 35, 35, 35, 35)
     coarse_margin: float = 1.5
@@ -160,8 +165,9 @@ class AlternativeSettings:
     margin: float = 1.5
 
     def __post_init__(self) -> None:
-        for name, least in (("samples", 1), ("pairings", 0), ("repaired", 0), ("promising", 1)):
-            check_whole_number(name, getattr(self, name), least)
+        least = {"samples": 1, "pairings": 0, "crease_eigenvectors": 0, "repaired": 0, "promising": 1}
+        for name, number in least.items():
+            check_whole_number(name, getattr(self, name), number)
         for name in ("levels", "fine_levels", "different_areas"):
             values = getattr(self, name)
             if not values or min(values) <= 0:
