@@ -189,8 +189,85 @@ def test_maps_that_look_right_are_compared(
     assert len(found.refinements) == (1 if compares else 2)
 
 
+def test_creased_alternatives_are_right_and_use_other_features(pair, monkeypatch):
+    mesh_x, mesh_y, truth = pair
+    creased = prepared(mesh_x, mesh_y).with_crease_eigenvectors(12)
+    found = Alternatives(creased, REPAIR)
+    numbers = []
+    refined = Alternatives._refined
+
+    def recorded(self, step, *arguments):
+        numbers.append(
+            [0 if s.crease_eigenvectors is None else s.crease_eigenvectors.shape[1] for s in step[1:]]
+        )
+        return refined(self, step, *arguments)
+
+    monkeypatch.setattr(Alternatives, "_refined", recorded)
+    assert mean_error(mesh_y, next(found.best(np.zeros_like(truth), creased=True)), truth) < 0.08
+    # The first refinement and the repair of its faults use crease eigenvectors. The second refinement does not.
+    assert numbers == [[12, 12], [12, 12], [0, 0]]
+    without = replace(REPAIR, alternatives=replace(REPAIR.alternatives, crease_eigenvectors=0))
+    assert found.has_creases and not Alternatives(creased, without).has_creases
+    assert not Alternatives(prepared(mesh_x, mesh_y), REPAIR).has_creases
+
+
 @pytest.mark.parametrize(
-    "wrong", [{"promising": 0}, {"repaired": -1}, {"fine_levels": ()}, {"different_areas": (0.03, 0.0)}]
+    ("creases", "is_partial", "non_isometric", "score", "tried", "replaced"),
+    [
+        (12, False, 10.0, -1.0, True, True),
+        (12, False, 10.0, 1.0, True, False),  # the further map has a worse score
+        (12, False, 0.0, -1.0, False, False),  # the shapes are not near-isometric
+        (12, True, 10.0, -1.0, False, False),
+        (0, False, 10.0, -1.0, False, False),
+    ],
+)
+def test_a_second_attempt_uses_crease_eigenvectors(
+    pair, monkeypatch, creases, is_partial, non_isometric, score, tried, replaced
+):
+    """If the first attempt ends with a suspicious map, alternatives with crease eigenvectors are tried."""
+    mesh_x, mesh_y, truth = pair
+    asked = []
+
+    def best(self, known, *, only_better=False, creased=False):
+        asked.append((known.tolist(), creased))
+        yield from [truth] * creased
+
+    monkeypatch.setattr(Alternatives, "best", best)
+    monkeypatch.setattr(Judge, "score", lambda self, outcome: score * (len(outcome.refinements) == 1))
+    settings = replace(
+        REPAIR, stage=1, suspicious=0.1, doubtful=0.1, non_isometric=non_isometric, finalists=1, rounds=0
+    )
+    stages = [Stage(FeatureRegression((20,))), Stage(FeatureRegression((20, 40)))]
+    start = prepared(mesh_x, mesh_y, partial=is_partial)
+    start = start.with_crease_eigenvectors(creases) if creases else start
+    found = refine_in_stages(start, stages, settings)
+    assert [creased for _, creased in asked] == [False] + [True] * tried
+    assert all(known == asked[0][0] for known, _ in asked)  # both attempts also start from the usual map
+    assert len(found.refinements) == (1 if replaced else 2)
+    assert found.suspicious
+
+
+@pytest.mark.slow
+def test_a_pair_that_only_crease_eigenvectors_match_right(shared):
+    """The two cats have a mean error above 0.1 without the second attempt."""
+    cats = open_data_set(shared / "data" / "tosca_r")
+    pair = next(one for one in cats.pairs if one.names == ("cat4", "cat9"))
+    meshes = [read_mesh(file) for file in pair.meshes]
+    found = match(*meshes)
+    truth = pair.ground_truth(*meshes)
+    assert geodesic_error(meshes[1], found.pointwise_map, truth, number_of_samples=300).mean < 0.03
+    assert not found.suspicious
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"promising": 0},
+        {"repaired": -1},
+        {"crease_eigenvectors": -1},
+        {"fine_levels": ()},
+        {"different_areas": (0.03, 0.0)},
+    ],
 )
 def test_wrong_settings_of_alternatives_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
