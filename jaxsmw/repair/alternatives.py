@@ -89,6 +89,7 @@ class Alternatives:
             FeatureRegression(chosen.levels),
             number_of_descriptors=0 if prepared.spectrum_x.descriptors is None else chosen.descriptors,
         )
+        self._sampled = self.x.sampled_spectrum(), self.y.sampled_spectrum()
         self._coarse = self._step(self._stage)
         self._fine = self._step(self._stage.with_levels(chosen.fine_levels))
         coarse_x, coarse_y = (
@@ -111,7 +112,7 @@ class Alternatives:
 
     def _step(self, stage: Stage) -> _Step:
         fitted = stage.fitted(min(len(self.x.areas), len(self.y.areas)))
-        spectra = fitted.view(self.x.sampled_spectrum(), self.y.sampled_spectrum(), partial=self.pair.partial)
+        spectra = fitted.view(*self._sampled, partial=self.pair.partial)
         return _Step(fitted, *(spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in spectra))
 
     def deformation(self, pointwise_map: Int64[np.ndarray, " m"]) -> float:

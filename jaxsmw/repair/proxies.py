@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -54,14 +55,7 @@ class Proxy:
         areas = self.areas * float(np.sum(self.spectrum.vertex_areas))
         if descriptors is not None:
             at_samples = at_samples.with_descriptors(jnp.asarray(descriptors, dtype))
-        return Spectrum(
-            at_samples.eigenvalues,
-            at_samples.eigenvectors,
-            jnp.asarray(areas, dtype),
-            at_samples.mask,
-            at_samples.descriptors,
-            crease_eigenvectors=at_samples.crease_eigenvectors,
-        )
+        return replace(at_samples, vertex_areas=jnp.asarray(areas, dtype), positions=None, normals=None)
 
     @functools.cached_property
     def distances(self) -> Float[np.ndarray, "s s"]:

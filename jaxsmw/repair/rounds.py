@@ -103,9 +103,9 @@ def refine_in_stages(
     repairer, usual = _Repairer(runner, judge, repair), best.unpadded_map(prepared.pair)
     found = proxies.best(usual, only_better=not best.suspicious)
     best = repairer.repaired([judge.measured(best)], map(prepared.padded_map, found))
-    # Near-isometric bodies bend at the same places, so crease eigenvectors can find further maps.
-    near_isometric = compares and judge.area_change(best) < repair.non_isometric
-    if best.suspicious and near_isometric and proxies.has_creases:
+    tries_again = best.suspicious and proxies.has_creases and not prepared.pair.partial
+    # Between shapes that differ more, crease eigenvectors make some maps worse. (Table R45)
+    if tries_again and judge.area_change(best) < repair.non_isometric:
         logger.info("further alternative maps are computed with crease eigenvectors ...")
         maps = [prepared.padded_map(one) for one in proxies.best(usual, creased=True)]
         if maps:
