@@ -21,7 +21,7 @@ from jaxsmw.core.triangles import nearest_point_on_candidates
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices
-from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced
+from jaxsmw.geometry.mesh import Mesh, extend_from
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import program_size
 from jaxsmw.presets import Preset
@@ -148,8 +148,7 @@ class Correspondence:
         Y receives the point of the nearest referenced vertex.
         """
         embedded_x, embedded_y = self._embeddings()
-        queries = extend_to_unreferenced(self.mesh_y, embedded_y)
-        return self._points_near(self.pair.reversed(), self.reverse_map(), queries, embedded_x)
+        return self._points_near(self.pair.reversed(), self.reverse_map(), embedded_y, embedded_x)
 
     def reverse_map(self) -> Int64[np.ndarray, " n"]:
         """Compute the map Y -> X from the embeddings of the last stage, without a second call of `match`.
@@ -159,7 +158,8 @@ class Correspondence:
         """
         with self._precision():
             padded = np.asarray(compiled(reverse_map)(*self._last_stage()))
-        return extend_to_unreferenced(self.mesh_y, padded[: len(self.mesh_y.vertices)].astype(np.int64))
+        found = padded[: len(self.mesh_y.vertices)].astype(np.int64)
+        return extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, found)
 
     def _points_near(
         self,
@@ -224,7 +224,7 @@ class Correspondence:
         queries, database = self._embeddings()
         used = self.mesh_x.referenced_vertices
         found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.referenced_vertices)
-        return extend_to_unreferenced(self.mesh_x, found)
+        return extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, found)
 
     def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
         """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
@@ -363,18 +363,20 @@ class Correspondence:
             settings,
             (self.preset.repair or WITHOUT_REPAIR).scores,
         )
-        return extend_to_unreferenced(self.mesh_x, expected)
+        return extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, expected)
 
     def _embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
         """Return the embeddings of X and Y in the last stage.
 
-        The match of a vertex of X is the nearest vertex of Y in these embeddings. An unreferenced vertex of X
-        has the same embedding as the nearest referenced vertex.
+        The match of a vertex of X is the nearest vertex of Y in these embeddings. A vertex that was not
+        matched, because it is unreferenced or was trimmed, has the embedding of the nearest matched vertex.
         """
         with self._precision():
             padded_x, padded_y = map(np.asarray, compiled(_embeddings)(*self._last_stage()))
-        queries, database = padded_x[: len(self.mesh_x.vertices)], padded_y[: len(self.mesh_y.vertices)]
-        return extend_to_unreferenced(self.mesh_x, queries), database
+        return (
+            extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, padded_x[: len(self.mesh_x.vertices)]),
+            extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, padded_y[: len(self.mesh_y.vertices)]),
+        )
 
     def _last_stage(self) -> tuple[Refiner, Problem, State]:
         """Return the refiner, the problem with padded spectra, and the state of the last stage."""

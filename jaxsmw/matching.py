@@ -30,16 +30,17 @@ from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.correspondence import Correspondence
 from jaxsmw.errors import check_choice
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh, MeshLike, extend_to_unreferenced
+from jaxsmw.geometry.mesh import Mesh, MeshLike
 from jaxsmw.initial_maps import check_initial_map
 from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.preparation import PreparedPair, prepare, program_size
 from jaxsmw.presets import Preset, PresetName, choose_preset
 from jaxsmw.repair.chirality import Decision, Hands
 from jaxsmw.repair.outcome import Outcome
-from jaxsmw.repair.rounds import finish, refine_in_stages
+from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.repair.settings import WITHOUT_REPAIR, ExpectedErrorSettings, RepairSettings
+from jaxsmw.repair.trimming import complete
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.stage import Stage
@@ -288,7 +289,7 @@ def match_prepared(
         start, outcome = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
     begin = time.perf_counter()
     with one_blas_thread():
-        outcome = finish(
+        start, outcome = complete(
             start, preset.judged_stages, preset.final_stages, preset.repair, outcome, history=history
         )
         jax.block_until_ready(outcome.refinements[-1])
@@ -349,13 +350,11 @@ def _correspondence(
         )
         raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
     spectrum_x, spectrum_y = preset.stages[-1].view(
-        prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial
+        prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial and not prepared.trimmed
     )
     return Correspondence(
         pair=pair,
-        pointwise_map=extend_to_unreferenced(
-            prepared.pair.mesh_x, np.asarray(last.pointwise_map).astype(np.int64)
-        ),
+        pointwise_map=np.asarray(last.pointwise_map).astype(np.int64),
         initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
         init=prepared.init if isinstance(prepared.init, str) else None,
         preset=preset,

@@ -58,6 +58,8 @@ class PreparedPair:
     - `sampled`: the `SampledPair` with the vertices at which descriptors are compared; None if `init` is not
       a name and no descriptors were requested.
     - `seconds`: a dictionary from the name of each step of the preparation to its wall time in seconds.
+    - `trimmed`: whether the larger shape of a partial pair was trimmed; see `jaxsmw.repair.trimming`. The
+      spectra of such a pair have equal numbers of eigenvectors.
     """
 
     pair: Pair
@@ -68,6 +70,7 @@ class PreparedPair:
     samples: Samples | None = None
     sampled: SampledPair | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    trimmed: bool = False
 
     def started_from(self, init: InitialMap) -> PreparedPair:
         """Return the prepared pair with another initial map.
@@ -124,7 +127,7 @@ class PreparedPair:
 
         See `Stage.view`.
         """
-        return stage.view(*self.padded, partial=self.pair.partial)
+        return stage.view(*self.padded, partial=self.pair.partial and not self.trimmed)
 
 
 def prepare(

@@ -369,12 +369,27 @@ def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -
 
     **Returns:** One row per vertex of X (m, ...). The rows of referenced vertices are unchanged.
     """
-    referenced = mesh_x.referenced_vertices
-    if referenced.all():
-        return matches
-    _, nearest = KDTree(mesh_x.vertices[referenced]).query(mesh_x.vertices[~referenced])
-    extended = matches.copy()
-    extended[~referenced] = matches[referenced][nearest]
+    return extend_from(mesh_x.referenced_vertices, mesh_x, matches)
+
+
+def extend_from(
+    known: Bool[np.ndarray, " n"], mesh: Mesh, values: Shaped[np.ndarray, "n ..."]
+) -> Shaped[np.ndarray, "n ..."]:
+    """For each vertex with an unknown value, copy the value of the nearest vertex with a known value.
+
+    **Arguments:**
+
+    - `known`: a mask (n,) of the vertices with known values, True for at least one vertex.
+    - `mesh`: a mesh with n vertices.
+    - `values`: an array (n, ...) with one row of values per vertex.
+
+    **Returns:** One row per vertex (n, ...). The known rows are unchanged.
+    """
+    if known.all():
+        return values
+    _, nearest = KDTree(mesh.vertices[known]).query(mesh.vertices[~known])
+    extended = values.copy()
+    extended[~known] = values[known][nearest]
     return extended
 
 

@@ -266,6 +266,8 @@ class RepairSettings:
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
     aligned_preference: float = 0.9
     cut_shortcuts: bool = True
+    trims: int = 1
+    trimmed_area: float = 1.05
     alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
 

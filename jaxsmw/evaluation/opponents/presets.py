@@ -18,7 +18,8 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.evaluation.opponents.base import Method, MethodInput
 from jaxsmw.preparation import prepare
 from jaxsmw.presets import PRESETS, PresetName
-from jaxsmw.repair.rounds import finish, refine_in_stages
+from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.repair.trimming import complete
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.stage import Stage
 
@@ -100,7 +101,7 @@ class Chosen(Method):
             with recomputing():
                 prepared = prepared.with_crease_eigenvectors(preset.number_of_crease_eigenvectors)
         outcome = refine_in_stages(prepared, preset.judged_stages, preset.repair)
-        outcome = finish(prepared, preset.judged_stages, preset.final_stages, preset.repair, outcome)
+        _, outcome = complete(prepared, preset.judged_stages, preset.final_stages, preset.repair, outcome)
         return outcome.pointwise_map, outcome.refinements[-1].result
 
 

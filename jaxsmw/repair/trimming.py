@@ -1,0 +1,160 @@
+"""Trims the larger shape of a partial pair to the region that the smaller shape covers, and matches again."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int64
+
+from jaxsmw.core.refiner import Problem, reverse_map
+from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
+from jaxsmw.geometry.scans import in_small_components
+from jaxsmw.pair import Pair, paired_spectra
+from jaxsmw.preparation import PreparedPair, prepare
+from jaxsmw.repair.outcome import Outcome
+from jaxsmw.repair.overlap import detours
+from jaxsmw.repair.rounds import finish, refine_in_stages
+from jaxsmw.repair.settings import RepairSettings
+from jaxsmw.runtime.compilation import compiled
+from jaxsmw.stage import Stage
+
+logger = logging.getLogger("jaxsmw")
+
+
+def trimmed(
+    pair: Pair,
+    pointwise_map: Int64[np.ndarray, " m"],
+    reverse: Int64[np.ndarray, " n"],
+    area: float,
+) -> Pair:
+    """Trim the larger shape of a partial pair to the region that the smaller shape covers.
+
+    A vertex of the larger shape probably has a counterpart if its detour is small; see
+    `jaxsmw.repair.overlap.detours`. The vertices with the smallest detours are kept, until their area is
+    `area` times the area of the smaller shape. All faces around them are kept as well, except those of small
+    components.
+
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y (n vertices), a partial pair.
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `reverse`: a map Y -> X (n,), 0-based vertices of X.
+    - `area`: the area of the kept vertices, as a multiple of the smaller area.
+
+    **Returns:** A partial pair, in which all vertices keep their numbers. The result is `pair` itself if the
+    larger area is at most `area` times the smaller area.
+    """
+    area_x, area_y = pair.areas
+    if max(area_x, area_y) <= area * min(area_x, area_y):
+        return pair
+    if area_y > area_x:
+        far = detours(pair.reversed(), reverse, pointwise_map)
+        return replace(pair, mesh_y=_kept(pair.mesh_y, far, area * area_x / area_y))
+    far = detours(pair, pointwise_map, reverse)
+    return replace(pair, mesh_x=_kept(pair.mesh_x, far, area * area_y / area_x))
+
+
+def _kept(mesh: Mesh, far: Float[np.ndarray, " n"], share: float) -> Mesh:
+    """Return the part of a mesh around the vertices with the smallest detours, on a share of the area."""
+    order = np.argsort(far, kind="stable")
+    number = int(np.searchsorted(np.cumsum(mesh.vertex_areas[order]), share * mesh.area)) + 1
+    near = np.zeros(len(far), bool)
+    near[order[:number]] = True
+    kept = near[mesh.faces].any(axis=1)
+    faces = mesh.faces[kept]
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    component = connected_components(edges, len(far))[1][faces[:, 0]]
+    small, _ = in_small_components(component, mesh.face_areas[kept], np.ones(len(faces), bool))
+    dropped = np.ones(len(mesh.faces), bool)
+    dropped[np.flatnonzero(kept)[~small]] = False
+    return replace(
+        mesh,
+        faces=mesh.faces[~dropped],
+        dropped_faces=np.union1d(mesh.dropped_faces, mesh.face_numbers[dropped]),
+    )
+
+
+def complete(
+    prepared: PreparedPair,
+    stages: Sequence[Stage],
+    final_stages: Sequence[Stage],
+    repair: RepairSettings | None,
+    outcome: Outcome,
+    *,
+    history: bool = False,
+) -> tuple[PreparedPair, Outcome]:
+    """Finish the refinement of a pair, and match a partial pair again after trimming its larger shape.
+
+    The eigenfunctions of a part differ from those of the full shape. After trimming, both shapes cover nearly
+    the same region of the body, so their eigenfunctions are similar. The repeated stage and all later stages
+    then run on the trimmed pair. (Table R46)
+
+    **Arguments:** see `jaxsmw.repair.rounds.finish`.
+
+    **Returns:** The prepared pair on which the last stage ran, and its `Outcome`. The prepared pair is
+    `prepared` itself if nothing was trimmed. If all stages succeeded, each unreferenced vertex of X has the
+    match of the nearest referenced vertex. The attribute `suspicious` is copied from the given outcome.
+    """
+    outcome = finish(prepared, stages, final_stages, repair, outcome, history=history)
+    if repair is not None and prepared.pair.partial:
+        repeated = [*stages[repair.stage :], *final_stages]
+        whole, last = prepared.pair, (stages[-1] if not final_stages else final_stages[-1])
+        for _ in range(repair.trims):
+            if not outcome.successful:
+                break
+            pair = trimmed(
+                whole, _extended(prepared, outcome), _reversed(prepared, last, outcome), repair.trimmed_area
+            )
+            if pair is whole:
+                break
+            logger.info("%s: matched again after trimming", whole.name)
+            prepared, outcome = _matched_again(prepared, pair, repeated, outcome, history)
+    if outcome.successful and outcome.refinements:
+        found = prepared.padded_map(_extended(prepared, outcome))
+        last_found = eqx.tree_at(lambda tree: tree.pointwise_map, outcome.refinements[-1], found)
+        outcome = outcome._replace(refinements=[*outcome.refinements[:-1], last_found])
+    return prepared, outcome
+
+
+def _extended(prepared: PreparedPair, outcome: Outcome) -> Int64[np.ndarray, " m"]:
+    """Return the map of an outcome (m,). Unreferenced vertices have the match of the nearest vertex."""
+    return extend_to_unreferenced(prepared.pair.mesh_x, outcome.unpadded_map(prepared.pair))
+
+
+def _reversed(prepared: PreparedPair, last: Stage, outcome: Outcome) -> Int64[np.ndarray, " n"]:
+    """Return the map Y -> X (n,) from the state of the last stage."""
+    problem = Problem(*prepared.view(last), partial=prepared.pair.partial)
+    padded = compiled(reverse_map)(last.refiner, problem, outcome.refinements[-1].state)
+    found = np.asarray(padded)[: len(prepared.pair.mesh_y.vertices)].astype(np.int64)
+    return extend_to_unreferenced(prepared.pair.mesh_y, found)
+
+
+def _matched_again(
+    prepared: PreparedPair, pair: Pair, stages: Sequence[Stage], outcome: Outcome, history: bool
+) -> tuple[PreparedPair, Outcome]:
+    """Run stages on a trimmed pair from the map of an outcome."""
+    stages = [stage.fitted(pair.fewest_vertices()) for stage in stages]
+    nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
+    number = max(stage.number_of_eigenvectors for stage in stages)
+    # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit. Equal
+    # numbers of eigenvectors let all trimmed pairs of similar sizes share compiled programs.
+    spectra = paired_spectra(replace(pair, partial=False, scale=1.0), number)
+    start = prepare(
+        pair,
+        number_of_eigenvectors=number,
+        number_of_descriptors=max(stage.number_of_descriptors for stage in stages),
+        number_of_crease_eigenvectors=max(stage.number_of_crease_eigenvectors for stage in stages),
+        number_of_samples=max(stage.number_of_samples or 0 for stage in stages),
+        init=nearest[_extended(prepared, outcome)],
+        spectra=tuple(one.scale(area) for one, area in zip(spectra, pair.areas, strict=True)),
+    )
+    start = replace(start, trimmed=True)
+    again = refine_in_stages(start, stages, history=history)
+    if not again.successful:
+        return prepared, outcome
+    found = replace(start, init=prepared.init, seconds=prepared.seconds)
+    return found, again._replace(suspicious=outcome.suspicious)
