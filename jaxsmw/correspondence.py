@@ -56,7 +56,8 @@ class Correspondence:
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. They contain the k_X and k_Y
       eigenvectors that the last stage uses. Two full shapes are each scaled to area 1. The shapes of a
       partial pair are scaled by one common factor, so that the larger shape has area 1. If a mesh was cut
-      before it was matched (`jaxsmw.geometry.cut_shortcuts`), the spectrum belongs to the cut mesh.
+      before it was matched (`jaxsmw.geometry.cut_shortcuts`), or was trimmed (`jaxsmw.repair.trimming`), the
+      spectrum belongs to the cut or trimmed mesh. The mask of the spectrum is False for trimmed vertices.
     - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.

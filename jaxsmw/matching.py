@@ -179,6 +179,8 @@ def match(
         number_of_crease_eigenvectors=chosen.number_of_crease_eigenvectors,
         number_of_samples=chosen.number_of_samples,
         init=first_init,
+        laplacian=laplacian,
+        eigensolver=eigensolver,
         descriptors_required=not adapts,
         spectra=(spectra[0].reflect(), spectra[1]) if decision.mirrored else spectra,
     )

@@ -58,6 +58,7 @@ class PreparedPair:
     - `sampled`: the `SampledPair` with the vertices at which descriptors are compared; None if `init` is not
       a name and no descriptors were requested.
     - `seconds`: a dictionary from the name of each step of the preparation to its wall time in seconds.
+    - `laplacian`, `eigensolver`: the arguments of `prepare`.
     - `trimmed`: whether the larger shape of a partial pair was trimmed; see `jaxsmw.repair.trimming`. The
       spectra of such a pair have equal numbers of eigenvectors.
     """
@@ -70,6 +71,8 @@ class PreparedPair:
     samples: Samples | None = None
     sampled: SampledPair | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    laplacian: Laplacian = "auto"
+    eigensolver: Eigensolver = "auto"
     trimmed: bool = False
 
     def started_from(self, init: InitialMap) -> PreparedPair:
@@ -202,7 +205,9 @@ def prepare(
                 lambda mesh: farthest_point_samples(mesh, number_of_samples), *pair.meshes
             )
             samples = jax.device_put(samples_x), jax.device_put(samples_y)
-    prepared = PreparedPair(pair, *spectra, init, start, samples, sampled, seconds)
+    prepared = PreparedPair(
+        pair, *spectra, init, start, samples, sampled, seconds, laplacian=laplacian, eigensolver=eigensolver
+    )
     if number_of_crease_eigenvectors:
         return prepared.with_crease_eigenvectors(number_of_crease_eigenvectors)
     return prepared

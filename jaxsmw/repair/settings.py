@@ -239,6 +239,10 @@ class RepairSettings:
       computed without `ExpectedErrorSettings.area_weight`, and before further passes.
     - `cut_shortcuts` (Table R41): whether a mesh is cut before it is matched, where its surface is fused with
       another part of itself, for example a hand with a hip. See `jaxsmw.geometry.cut_shortcuts`.
+    - `trims` (Table R46): the number of times that the larger shape of a partial pair is trimmed to the
+      region of the smaller shape and matched again, at least 0.
+    - `trimmed_area` (Table R46): a positive number. The larger shape is trimmed to this multiple of the
+      smaller area. The faces at the boundary of the kept region add to this area.
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 
@@ -272,7 +276,7 @@ class RepairSettings:
     scores: ScoreSettings = ScoreSettings()
 
     def __post_init__(self) -> None:
-        for name in ("stage", "final_stages", "rounds", "finalists", "passes"):
+        for name in ("stage", "final_stages", "rounds", "finalists", "passes", "trims"):
             check_whole_number(name, getattr(self, name), 0)
         for name in ("suspicious_area", "negligible_area", "excessive_area"):
             check_number(name, getattr(self, name), most=1.0)
@@ -286,7 +290,7 @@ class RepairSettings:
             "aligned_preference",
         ):
             check_number(name, getattr(self, name))
-        for name in ("suspicious", "compared", "doubtful"):
+        for name in ("suspicious", "compared", "doubtful", "trimmed_area"):
             check_number(name, getattr(self, name), positive=True)
         if not isinstance(self.cut_shortcuts, bool):
             raise InputError(f"cut_shortcuts is {self.cut_shortcuts!r}: give True or False.")

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from jaxsmw.core.refiner import Problem, reverse_map
+from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
 from jaxsmw.geometry.scans import in_small_components
 from jaxsmw.pair import Pair, paired_spectra
@@ -90,8 +91,8 @@ def complete(
     """Finish the refinement of a pair, and match a partial pair again after trimming its larger shape.
 
     The eigenfunctions of a part differ from those of the full shape. After trimming, both shapes cover nearly
-    the same region of the body, so their eigenfunctions are similar. The repeated stage and all later stages
-    then run on the trimmed pair. (Table R46)
+    the same region of the body, so their eigenfunctions are similar. The repeated stage and all later stages,
+    including the final stages, then run on the trimmed pair. (Table R46)
 
     **Arguments:** see `jaxsmw.repair.rounds.finish`.
 
@@ -99,25 +100,26 @@ def complete(
     `prepared` itself if nothing was trimmed. If all stages succeeded, each unreferenced vertex of X has the
     match of the nearest referenced vertex. The attribute `suspicious` is copied from the given outcome.
     """
-    outcome = finish(prepared, stages, final_stages, repair, outcome, history=history)
-    if repair is not None and prepared.pair.partial:
-        repeated = [*stages[repair.stage :], *final_stages]
-        whole, last = prepared.pair, (stages[-1] if not final_stages else final_stages[-1])
+    start, whole = prepared, prepared.pair
+    if repair is not None and whole.partial and outcome.successful:
+        last, repeated = stages[-1], [*stages[repair.stage :], *final_stages]
         for _ in range(repair.trims):
-            if not outcome.successful:
-                break
-            pair = trimmed(
-                whole, _extended(prepared, outcome), _reversed(prepared, last, outcome), repair.trimmed_area
-            )
+            reverse = _reversed(prepared, last, outcome)
+            pair = trimmed(whole, _extended(prepared, outcome), reverse, repair.trimmed_area)
             if pair is whole:
                 break
-            logger.info("%s: matched again after trimming", whole.name)
-            prepared, outcome = _matched_again(prepared, pair, repeated, outcome, history)
-    if outcome.successful and outcome.refinements:
-        found = prepared.padded_map(_extended(prepared, outcome))
-        last_found = eqx.tree_at(lambda tree: tree.pointwise_map, outcome.refinements[-1], found)
-        outcome = outcome._replace(refinements=[*outcome.refinements[:-1], last_found])
-    return prepared, outcome
+            again = _matched_again(prepared, pair, repeated, outcome, history)
+            if again is None:
+                break
+            (prepared, outcome), last = again, repeated[-1]
+    if prepared is start:
+        outcome = finish(prepared, stages, final_stages, repair, outcome, history=history)
+    if not outcome.successful:
+        return prepared, outcome
+    found = prepared.padded_map(_extended(prepared, outcome))
+    *before, end = outcome.refinements
+    end = eqx.tree_at(lambda tree: tree.pointwise_map, end, found)
+    return prepared, outcome._replace(refinements=[*before, end])
 
 
 def _extended(prepared: PreparedPair, outcome: Outcome) -> Int64[np.ndarray, " m"]:
@@ -135,26 +137,40 @@ def _reversed(prepared: PreparedPair, last: Stage, outcome: Outcome) -> Int64[np
 
 def _matched_again(
     prepared: PreparedPair, pair: Pair, stages: Sequence[Stage], outcome: Outcome, history: bool
-) -> tuple[PreparedPair, Outcome]:
-    """Run stages on a trimmed pair from the map of an outcome."""
+) -> tuple[PreparedPair, Outcome] | None:
+    """Run stages on a trimmed pair from the map of an outcome. Return None after a failure."""
+    logger.info("%s: the larger shape is trimmed and matched again ...", pair.name)
     stages = [stage.fitted(pair.fewest_vertices()) for stage in stages]
     nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
     number = max(stage.number_of_eigenvectors for stage in stages)
     # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit. Equal
     # numbers of eigenvectors let all trimmed pairs of similar sizes share compiled programs.
-    spectra = paired_spectra(replace(pair, partial=False, scale=1.0), number)
-    start = prepare(
-        pair,
-        number_of_eigenvectors=number,
-        number_of_descriptors=max(stage.number_of_descriptors for stage in stages),
-        number_of_crease_eigenvectors=max(stage.number_of_crease_eigenvectors for stage in stages),
-        number_of_samples=max(stage.number_of_samples or 0 for stage in stages),
-        init=nearest[_extended(prepared, outcome)],
-        spectra=tuple(one.scale(area) for one, area in zip(spectra, pair.areas, strict=True)),
-    )
-    start = replace(start, trimmed=True)
+    try:
+        spectra = paired_spectra(
+            replace(pair, partial=False, scale=1.0),
+            number,
+            laplacian=prepared.laplacian,
+            eigensolver=prepared.eigensolver,
+        )
+        start = prepare(
+            pair,
+            number_of_eigenvectors=number,
+            number_of_descriptors=max(stage.number_of_descriptors for stage in stages),
+            number_of_crease_eigenvectors=max(stage.number_of_crease_eigenvectors for stage in stages),
+            number_of_samples=max(stage.number_of_samples or 0 for stage in stages),
+            init=nearest[_extended(prepared, outcome)],
+            descriptors_required=True,
+            spectra=tuple(one.scale(area) for one, area in zip(spectra, pair.areas, strict=True)),
+        )
+    except InputError as error:  # the kept region can be too small or too coarse
+        logger.info("the map is kept as it was before trimming: %s", error)
+        return None
+    start = replace(start, init=prepared.init, seconds=prepared.seconds, trimmed=True)
     again = refine_in_stages(start, stages, history=history)
     if not again.successful:
-        return prepared, outcome
-    found = replace(start, init=prepared.init, seconds=prepared.seconds)
-    return found, again._replace(suspicious=outcome.suspicious)
+        return None
+    return start, again._replace(
+        refinements=[*outcome.refinements, *again.refinements],
+        initial_map=outcome.initial_map,
+        suspicious=outcome.suspicious,
+    )

@@ -1,0 +1,179 @@
+"""The larger shape of a partial pair is trimmed, and the pair is matched again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from jaxsmw import creature_pair, geodesic_error, make_mesh, match, read_mesh
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.registration import Registration
+from jaxsmw.errors import InputError
+from jaxsmw.evaluation.datasets import open_data_set
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.pair import Pair
+from jaxsmw.presets import PRESETS, Preset
+from jaxsmw.repair.settings import RepairSettings
+from jaxsmw.repair.trimming import trimmed
+from jaxsmw.stage import Stage
+
+TRIMMED = Preset(
+    (
+        Stage(FeatureRegression((10, 20, 30)), number_of_descriptors=20),
+        Stage(Registration((30, 60))),
+        Stage(Registration((60, 60))),
+    ),
+    RepairSettings(stage=0, final_stages=1, suspicious=10.0, suspicious_area=1.0),
+)
+WHOLE = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=0))
+
+
+@pytest.fixture(scope="module")
+def pose():
+    """Two poses of a body with different triangulations, and the true map of the vertices of the first."""
+    found = creature_pair(vertices=1500)
+    return found.source, found.target, found.truth.nearest_corners(found.target)
+
+
+@pytest.fixture(scope="module")
+def part(pose):
+    """The front of the body in the first pose. All vertices keep their numbers."""
+    whole = pose[0]
+    front = whole.vertices[:, 2] > np.quantile(whole.vertices[:, 2], 0.4)
+    return make_mesh(whole.vertices, whole.faces[front[whole.faces].all(axis=1)], name="front")
+
+
+def nearest(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    used = np.flatnonzero(mesh.referenced_vertices)
+    return used[KDTree(mesh.vertices[used]).query(points)[1]]
+
+
+def rough(mesh: Mesh, true: np.ndarray) -> np.ndarray:
+    """An initial map with random errors of about a twentieth of the body's size."""
+    noise = 0.05 * mesh.area**0.5 * np.random.default_rng(0).normal(size=(len(true), 3))
+    return nearest(mesh, mesh.vertices[true] + noise)
+
+
+def covered(pose, part) -> np.ndarray:
+    """The vertices of the second pose whose true points are on the part."""
+    _, target, truth = pose
+    back = KDTree(target.vertices[truth]).query(target.vertices)[1]
+    return part.referenced_vertices[back]
+
+
+def mean_error(mesh, found, truth, used):
+    offsets = mesh.vertices[found[used]] - mesh.vertices[truth[used]]
+    return float(np.linalg.norm(offsets, axis=1).mean() / mesh.area**0.5)
+
+
+def test_the_larger_shape_is_trimmed_to_the_region_of_the_smaller_shape(pose, part):
+    whole, _, _ = pose
+    identity = np.arange(len(whole.vertices))
+    pair, back = Pair(part, whole, True), nearest(part, whole.vertices)
+    found = trimmed(pair, identity, back, 1.0)
+    assert found.mesh_x is part and found.partial
+    assert found.mesh_y.vertices is whole.vertices
+    assert 1.0 < found.mesh_y.area / part.area < 1.15
+    assert found.mesh_y.referenced_vertices[part.referenced_vertices].mean() > 0.99
+    # The removed faces are recorded, so that faces keep the numbers of the given mesh.
+    np.testing.assert_array_equal(whole.faces[found.mesh_y.face_numbers], found.mesh_y.faces)
+    other = trimmed(pair.reversed(), back, identity, 1.0)
+    np.testing.assert_array_equal(other.mesh_x.faces, found.mesh_y.faces)
+    assert other.mesh_y is part
+    assert trimmed(pair, identity, back, whole.area / part.area) is pair
+
+
+def test_small_pieces_of_the_trimmed_shape_are_left_out(pose, part):
+    """A few wrong matches far away do not keep faces there."""
+    whole, _, _ = pose
+    identity = np.arange(len(whole.vertices))
+    back = nearest(part, whole.vertices)
+    far = int(np.argmin(whole.vertices[:, 2]))
+    back[far] = far  # the map and the reverse map agree on this vertex, which is not on the part
+    kept = trimmed(Pair(part, whole, True), identity, back, 1.0).mesh_y.referenced_vertices
+    assert not kept[far] and kept.any()
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_a_trimmed_pair_is_matched_better(pose, part, reverse):
+    """The map of the part is more accurate after trimming. The part may also be the target."""
+    _, target, truth = pose
+    mask = covered(pose, part)
+    if reverse:
+        back = nearest(part, part.vertices[KDTree(target.vertices[truth]).query(target.vertices)[1]])
+        source, goal, true, used = target, part, back, mask
+    else:
+        source, goal, true, used = part, target, truth, part.referenced_vertices
+    init = rough(goal, true)
+    before, after = (match(source, goal, partial=True, preset=one, init=init) for one in (WHOLE, TRIMMED))
+    errors = [mean_error(goal, found.pointwise_map, true, used) for found in (before, after)]
+    # The vertices of a full source that belong to the boundary of the part have no exact truth.
+    assert errors[1] < (1.1 if reverse else 0.95) * errors[0]
+    # Equal numbers of eigenvectors belong to the trimmed pair.
+    k_x, k_y = after.functional_map.shape
+    assert k_x == k_y == 60 and min(before.functional_map.shape) < 60
+    assert after.pair.meshes == (source, goal)
+    for spectrum, mesh in ((after.spectrum_x, source), (after.spectrum_y, goal)):
+        assert not (np.asarray(spectrum.mask) & ~mesh.referenced_vertices).any()
+
+
+def test_all_vertices_have_matches_after_trimming(pose, part):
+    """Vertices that were trimmed have the matches of their nearest neighbours that were not trimmed."""
+    _, target, truth = pose
+    found = match(part, target, partial=True, preset=TRIMMED, init=rough(target, truth))
+    kept = np.asarray(found.spectrum_y.mask)
+    assert 0.3 < kept.mean() < 0.8
+    reverse = found.reverse_map()
+    used = np.flatnonzero(kept)
+    near = used[KDTree(target.vertices[used]).query(target.vertices)[1]]
+    np.testing.assert_array_equal(reverse, reverse[near])
+    assert part.referenced_vertices[reverse].all() and kept[found.pointwise_map].all()
+    points = found.surface_points()
+    offsets = points.positions(target) - target.vertices[found.pointwise_map]
+    assert np.linalg.norm(offsets, axis=1).max() < 0.1 * target.area**0.5
+    back = found.reverse_surface_points()
+    assert (back.faces < len(part.faces)).all() and np.isfinite(back.weights).all()
+    assert np.isfinite(found.expected_error()).all()
+    _, mask_y = found.overlap()
+    expected = covered(pose, part)
+    assert (mask_y & expected).sum() > 0.85 * (mask_y | expected).sum()
+
+
+def test_full_shapes_and_parts_of_similar_area_are_not_trimmed(pose, part):
+    source, target, truth = pose
+    same = nearest(part, part.vertices)
+    pairs = ((source, target, False, truth), (source, target, True, truth), (part, part, True, same))
+    for *meshes, partial, init in pairs:
+        found = match(*meshes, partial=partial, preset=TRIMMED, init=init, mirror="no")
+        assert np.asarray(found.spectrum_y.mask).sum() == meshes[1].referenced_vertices.sum()
+
+
+def test_a_scaled_part_has_the_same_map(pose, part):
+    _, target, truth = pose
+    init = rough(target, truth)
+    small = make_mesh(part.vertices / 8, part.faces, name="front")
+    found = match(part, target, partial=True, preset=TRIMMED, init=init)
+    scaled = match(small, target, partial=True, scale=8.0, preset=TRIMMED, init=init)
+    assert np.mean(found.pointwise_map == scaled.pointwise_map) > 0.99
+
+
+@pytest.mark.parametrize("wrong", [{"trims": -1}, {"trimmed_area": 0.0}])
+def test_wrong_settings_of_trimming_are_refused(wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        RepairSettings(**wrong)
+
+
+@pytest.mark.slow
+def test_trimming_lowers_the_error_of_a_real_part(shared):
+    data = open_data_set(shared / "data" / "shrec16_partial")
+    pair = next(one for one in data.pairs if one.names == ("cuts_michael_shape_3", "michael"))
+    meshes = [read_mesh(file) for file in pair.meshes]
+    truth = pair.ground_truth(*meshes)
+    accurate = PRESETS["accurate"]
+    errors = []
+    for trims in (0, 1):
+        preset = replace(accurate, repair=replace(accurate.repair, trims=trims))
+        found = match(*meshes, partial=True, preset=preset)
+        errors.append(geodesic_error(meshes[1], found.pointwise_map, truth, number_of_samples=300).mean)
+    assert errors[1] < 0.9 * errors[0] and errors[1] < 0.0125
