@@ -140,18 +140,19 @@ def _matched_again(
 ) -> tuple[PreparedPair, Outcome] | None:
     """Run stages on a trimmed pair from the map of an outcome. Return None after a failure."""
     logger.info("%s: the larger shape is trimmed and matched again ...", pair.name)
-    stages = [stage.fitted(pair.fewest_vertices()) for stage in stages]
-    nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
-    number = max(stage.number_of_eigenvectors for stage in stages)
-    # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit. Equal
-    # numbers of eigenvectors let all trimmed pairs of similar sizes share compiled programs.
     try:
-        spectra = paired_spectra(
+        stages = [stage.fitted(pair.fewest_vertices()) for stage in stages]
+        number = max(stage.number_of_eigenvectors for stage in stages)
+        # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit.
+        # Equal numbers of eigenvectors let all trimmed pairs of similar sizes share compiled programs.
+        of_x, of_y = paired_spectra(
             replace(pair, partial=False, scale=1.0),
             number,
             laplacian=prepared.laplacian,
             eigensolver=prepared.eigensolver,
         )
+        area_x, area_y = pair.areas
+        nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
         start = prepare(
             pair,
             number_of_eigenvectors=number,
@@ -159,8 +160,10 @@ def _matched_again(
             number_of_crease_eigenvectors=max(stage.number_of_crease_eigenvectors for stage in stages),
             number_of_samples=max(stage.number_of_samples or 0 for stage in stages),
             init=nearest[_extended(prepared, outcome)],
+            laplacian=prepared.laplacian,
+            eigensolver=prepared.eigensolver,
             descriptors_required=True,
-            spectra=tuple(one.scale(area) for one, area in zip(spectra, pair.areas, strict=True)),
+            spectra=(of_x.scale(area_x), of_y.scale(area_y)),
         )
     except InputError as error:  # the kept region can be too small or too coarse
         logger.info("the map is kept as it was before trimming: %s", error)
