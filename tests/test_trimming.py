@@ -13,7 +13,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import open_data_set
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.pair import Pair
-from jaxsmw.presets import PRESETS, Preset
+from jaxsmw.presets import Preset
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.repair.trimming import trimmed
 from jaxsmw.stage import Stage
@@ -170,10 +170,7 @@ def test_trimming_lowers_the_error_of_a_real_part(shared):
     pair = next(one for one in data.pairs if one.names == ("cuts_michael_shape_3", "michael"))
     meshes = [read_mesh(file) for file in pair.meshes]
     truth = pair.ground_truth(*meshes)
-    accurate = PRESETS["accurate"]
-    errors = []
-    for trims in (0, 1):
-        preset = replace(accurate, repair=replace(accurate.repair, trims=trims))
-        found = match(*meshes, partial=True, preset=preset)
-        errors.append(geodesic_error(meshes[1], found.pointwise_map, truth, number_of_samples=300).mean)
-    assert errors[1] < 0.9 * errors[0] and errors[1] < 0.0125
+    found = match(*meshes, partial=True)
+    # Without trimming, the error is 0.013.
+    assert geodesic_error(meshes[1], found.pointwise_map, truth, number_of_samples=300).mean < 0.0122
+    assert np.asarray(found.spectrum_y.mask).mean() < 0.8
