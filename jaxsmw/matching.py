@@ -40,7 +40,7 @@ from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.repair.settings import WITHOUT_REPAIR, ExpectedErrorSettings, RepairSettings
-from jaxsmw.repair.trimming import complete
+from jaxsmw.repair.trimming import complete, trimmed_stage
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.stage import Stage
@@ -261,7 +261,8 @@ def match_prepared(
     if starts[0].spectrum_x.descriptors is None:
         preset = preset.without_descriptors()
     with _step("refinement", seconds), one_blas_thread():
-        wait(compiling)
+        if not starts[0].pair.partial:
+            wait(compiling)
         outcomes = [
             refine_in_stages(
                 start,
@@ -290,6 +291,7 @@ def match_prepared(
             from_shot, from_aligned = (_inconsistency(found(*one, judged)) for one in candidates)
         start, outcome = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
     begin = time.perf_counter()
+    wait(compiling)  # for a partial pair, only the program that runs after trimming is compiled in advance
     with one_blas_thread():
         start, outcome = complete(
             start, preset.judged_stages, preset.final_stages, preset.repair, outcome, history=history
@@ -320,16 +322,21 @@ def _add_seconds(prepared: PreparedPair, seconds: dict[str, float]) -> None:
 
 
 def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
-    """Compile the programs of all stages in the background.
+    """Compile in the background the programs of all stages, or of the trimmed stage of a partial pair.
 
-    Nothing is compiled for partial pairs, because their numbers of eigenvectors are not known yet. If a mesh
-    has too few vertices for the preset, nothing is compiled, because `paired_spectra` then raises an error.
+    The other programs of a partial pair are not compiled, because its numbers of eigenvectors are not known
+    yet. If a mesh has too few vertices for the preset, nothing is compiled, because `paired_spectra` then
+    raises an error.
     """
-    if pair.partial or preset.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
+    if preset.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
         return []
-    sizes = program_size(pair.mesh_x), program_size(pair.mesh_y)
     # The last stage is compiled first, because its compilation takes the longest time.
-    return [stage.compile_ahead(*sizes, history=history) for stage in reversed(preset.stages)]
+    stages = [*reversed(preset.stages)]
+    if pair.partial:
+        trimmed = trimmed_stage(pair, preset.stages, preset.repair)
+        stages = [] if trimmed is None else [trimmed]
+    sizes = program_size(pair.mesh_x), program_size(pair.mesh_y)
+    return [stage.compile_ahead(*sizes, partial=pair.partial, history=history) for stage in stages]
 
 
 def _correspondence(

@@ -253,12 +253,18 @@ class Stage:
         settings = {**options, **self.settings, "partial": partial, "history": history}
         return compiled(refine)(*arrays, **settings)
 
-    def compile_ahead(self, number_x: int, number_y: int, *, history: bool = False) -> Future[object]:
-        """Compile in the background the program that `run` needs for two full shapes.
+    def compile_ahead(
+        self, number_x: int, number_y: int, *, partial: bool = False, history: bool = False
+    ) -> Future[object]:
+        """Compile in the background the program that `run` needs for two shapes.
+
+        Both shapes must have as many eigenvectors as the stage. The shapes of a partial pair have equal
+        numbers of eigenvectors only after trimming; see `jaxsmw.repair.trimming`.
 
         **Arguments:**
 
         - `number_x`, `number_y`: the numbers of vertices of X and of Y, including padding.
+        - `partial`: whether one of the shapes is a partial shape.
         - `history`: whether the program records a `History`; see `jaxsmw.refine`.
 
         **Returns:** A future that is done when the program is compiled.
@@ -271,7 +277,7 @@ class Stage:
                 samples = (jnp.zeros(self.number_of_samples, int),) * 2
             return self._arguments(*self.view(x, y), jnp.zeros(number_x, jnp.int32), samples)
 
-        return compile_ahead(refine, arguments, **self.settings, partial=False, history=history)
+        return compile_ahead(refine, arguments, **self.settings, partial=partial, history=history)
 
     def _outline(self, number_of_vertices: int) -> Spectrum:
         """Return a spectrum of zeros for the compilation of the program."""

@@ -107,6 +107,20 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     chrome.quit()
 
 
+@pytest.fixture
+def compilations() -> Iterator[list[str]]:
+    """The names of all programs that any thread compiles during a test."""
+    names: list[str] = []
+
+    def listen(event: str, duration: float, **details: str) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            names.append(details["fun_name"])
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield names
+    jax.monitoring.unregister_event_duration_listener(listen)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def one_thread_each() -> Iterator[None]:
     """Limit each pytest-xdist worker, and the commands that it starts, to one thread.

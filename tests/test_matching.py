@@ -156,20 +156,6 @@ def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samp
     assert "XLA compilation of" in caplog.text and "jit(refine)" not in caplog.text
 
 
-@pytest.fixture
-def compilations():
-    """The names of all programs that any thread compiles during a test."""
-    names: list[str] = []
-
-    def listen(event: str, duration: float, **details: str) -> None:
-        if event == "/jax/core/compile/backend_compile_duration":
-            names.append(details["fun_name"])
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield names
-    jax.monitoring.unregister_event_duration_listener(listen)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "programs"),

@@ -235,15 +235,18 @@ class _Runner:
 
     def coarse(self, levels: tuple[int, ...]) -> _Runner:
         """Return a runner whose last stage has the given levels. A refiner without levels is not changed."""
-        *before, (view, stage) = self.steps
-        if stage.refiner.levels:
-            stage = _with_levels(stage, levels)
-            view = self.prepared.view(stage)
-        return replace(self, steps=[*before, (view, stage)])
+        *before, (_, last) = self.steps
+        coarse = with_coarse_levels(last, levels)
+        return replace(self, steps=[*before, (self.prepared.view(coarse), coarse)])
 
 
-def _with_levels(stage: Stage, levels: tuple[int, ...]) -> Stage:
-    """Return the stage with other levels. No level exceeds the number of eigenvectors of the stage."""
+def with_coarse_levels(stage: Stage, levels: tuple[int, ...]) -> Stage:
+    """Return the stage with other levels. No level exceeds the number of eigenvectors of the stage.
+
+    A stage whose refiner has no levels is not changed.
+    """
+    if not stage.refiner.levels:
+        return stage
     return stage.with_levels(tuple(min(level, stage.number_of_eigenvectors) for level in levels))
 
 

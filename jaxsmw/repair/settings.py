@@ -240,9 +240,11 @@ class RepairSettings:
     - `cut_shortcuts` (Table R41): whether a mesh is cut before it is matched, where its surface is fused with
       another part of itself, for example a hand with a hip. See `jaxsmw.geometry.cut_shortcuts`.
     - `trims` (Table R46): the number of times that the larger shape of a partial pair is trimmed to the
-      region of the smaller shape and matched again, at least 0.
+      region of the smaller shape and matched again by the last stage, at least 0.
     - `trimmed_area` (Table R46): a positive number. The larger shape is trimmed to this multiple of the
       smaller area. The faces at the boundary of the kept region add to this area.
+    - `trimmed_levels` (Table R46): the levels of the last stage on a trimmed pair. If the refiner of this
+      stage has no levels, the stage is not changed.
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 
@@ -270,8 +272,9 @@ class RepairSettings:
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
     aligned_preference: float = 0.9
     cut_shortcuts: bool = True
-    trims: int = 1
+    trims: int = 2
     trimmed_area: float = 1.05
+    trimmed_levels: tuple[int, ...] = (10, 30, 80, 200)
     alternatives: AlternativeSettings = AlternativeSettings()
     scores: ScoreSettings = ScoreSettings()
 

@@ -18,7 +18,7 @@ from jaxsmw.pair import Pair, paired_spectra
 from jaxsmw.preparation import PreparedPair, prepare
 from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.overlap import detours
-from jaxsmw.repair.rounds import finish, refine_in_stages
+from jaxsmw.repair.rounds import finish, refine_in_stages, with_coarse_levels
 from jaxsmw.repair.settings import RepairSettings
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.stage import Stage
@@ -46,12 +46,9 @@ def trimmed(
     - `reverse`: a map Y -> X (n,), 0-based vertices of X.
     - `area`: the area of the kept vertices, as a multiple of the smaller area.
 
-    **Returns:** A partial pair, in which all vertices keep their numbers. The result is `pair` itself if the
-    larger area is at most `area` times the smaller area.
+    **Returns:** A partial pair, in which all vertices keep their numbers.
     """
     area_x, area_y = pair.areas
-    if max(area_x, area_y) <= area * min(area_x, area_y):
-        return pair
     if area_y > area_x:
         far = detours(pair.reversed(), reverse, pointwise_map)
         return replace(pair, mesh_y=_kept(pair.mesh_y, far, area * area_x / area_y))
@@ -79,6 +76,19 @@ def _kept(mesh: Mesh, far: Float[np.ndarray, " n"], share: float) -> Mesh:
     )
 
 
+def trimmed_stage(pair: Pair, stages: Sequence[Stage], repair: RepairSettings | None) -> Stage | None:
+    """Return the stage that runs after trimming: the last stage, with `repair.trimmed_levels`.
+
+    **Returns:** The stage, or None if the pair is not trimmed. A pair is trimmed only if it is a partial pair
+    and the larger area is more than `repair.trimmed_area` times the smaller area.
+    """
+    if repair is None or repair.trims == 0 or not pair.partial:
+        return None
+    if max(pair.areas) <= repair.trimmed_area * min(pair.areas):
+        return None
+    return with_coarse_levels(stages[-1], repair.trimmed_levels)
+
+
 def complete(
     prepared: PreparedPair,
     stages: Sequence[Stage],
@@ -91,8 +101,8 @@ def complete(
     """Finish the refinement of a pair, and match a partial pair again after trimming its larger shape.
 
     The eigenfunctions of a part differ from those of the full shape. After trimming, both shapes cover nearly
-    the same region of the body, so their eigenfunctions are similar. The repeated stage and all later stages,
-    including the final stages, then run on the trimmed pair. (Table R46)
+    the same region of the body, so their eigenfunctions are similar. The last of all stages then runs on the
+    trimmed pair, with `repair.trimmed_levels`. The final stages run only if nothing was trimmed. (Table R46)
 
     **Arguments:** see `jaxsmw.repair.rounds.finish`.
 
@@ -100,18 +110,16 @@ def complete(
     `prepared` itself if nothing was trimmed. If all stages succeeded, each unreferenced vertex of X has the
     match of the nearest referenced vertex. The attribute `suspicious` is copied from the given outcome.
     """
-    start, whole = prepared, prepared.pair
-    if repair is not None and whole.partial and outcome.successful:
-        last, repeated = stages[-1], [*stages[repair.stage :], *final_stages]
+    start, last = prepared, stages[-1]
+    following = trimmed_stage(prepared.pair, [*stages, *final_stages], repair)
+    if repair is not None and following is not None and outcome.successful:
         for _ in range(repair.trims):
             reverse = _reversed(prepared, last, outcome)
-            pair = trimmed(whole, _extended(prepared, outcome), reverse, repair.trimmed_area)
-            if pair is whole:
-                break
-            again = _matched_again(prepared, pair, repeated, outcome, history)
+            pair = trimmed(start.pair, _extended(prepared, outcome), reverse, repair.trimmed_area)
+            again = _matched_again(prepared, pair, following, outcome, history)
             if again is None:
                 break
-            (prepared, outcome), last = again, repeated[-1]
+            (prepared, outcome), last = again, following
     if prepared is start:
         outcome = finish(prepared, stages, final_stages, repair, outcome, history=history)
     if not outcome.successful:
@@ -136,18 +144,17 @@ def _reversed(prepared: PreparedPair, last: Stage, outcome: Outcome) -> Int64[np
 
 
 def _matched_again(
-    prepared: PreparedPair, pair: Pair, stages: Sequence[Stage], outcome: Outcome, history: bool
+    prepared: PreparedPair, pair: Pair, stage: Stage, outcome: Outcome, history: bool
 ) -> tuple[PreparedPair, Outcome] | None:
-    """Run stages on a trimmed pair from the map of an outcome. Return None after a failure."""
+    """Run a stage on a trimmed pair from the map of an outcome. Return None after a failure."""
     logger.info("%s: the larger shape is trimmed and matched again ...", pair.name)
     try:
-        stages = [stage.fitted(pair.fewest_vertices()) for stage in stages]
-        number = max(stage.number_of_eigenvectors for stage in stages)
+        stage = stage.fitted(pair.fewest_vertices())
         # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit.
-        # Equal numbers of eigenvectors let all trimmed pairs of similar sizes share compiled programs.
+        # Equal numbers of eigenvectors let all trimmed pairs of similar sizes share a compiled program.
         of_x, of_y = paired_spectra(
             replace(pair, partial=False, scale=1.0),
-            number,
+            stage.number_of_eigenvectors,
             laplacian=prepared.laplacian,
             eigensolver=prepared.eigensolver,
         )
@@ -155,10 +162,10 @@ def _matched_again(
         nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
         start = prepare(
             pair,
-            number_of_eigenvectors=number,
-            number_of_descriptors=max(stage.number_of_descriptors for stage in stages),
-            number_of_crease_eigenvectors=max(stage.number_of_crease_eigenvectors for stage in stages),
-            number_of_samples=max(stage.number_of_samples or 0 for stage in stages),
+            number_of_eigenvectors=stage.number_of_eigenvectors,
+            number_of_descriptors=stage.number_of_descriptors,
+            number_of_crease_eigenvectors=stage.number_of_crease_eigenvectors,
+            number_of_samples=stage.number_of_samples or 0,
             init=nearest[_extended(prepared, outcome)],
             laplacian=prepared.laplacian,
             eigensolver=prepared.eigensolver,
@@ -169,7 +176,7 @@ def _matched_again(
         logger.info("the map is kept as it was before trimming: %s", error)
         return None
     start = replace(start, init=prepared.init, seconds=prepared.seconds, trimmed=True)
-    again = refine_in_stages(start, stages, history=history)
+    again = refine_in_stages(start, [stage], history=history)
     if not again.successful:
         return None
     return start, again._replace(
