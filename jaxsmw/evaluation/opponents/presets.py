@@ -60,8 +60,9 @@ class Refined(Method):
 class Chosen(Method):
     """A method that refines the initial map with one of `jaxsmw.PRESETS`, exactly as `jaxsmw.match` does.
 
-    No other method uses crease eigenvectors. They are therefore computed as a part of the method, anew for
-    each pair, and their time counts.
+    No other method uses crease eigenvectors or trims shapes. Crease eigenvectors, and the spectra and
+    descriptors of trimmed pairs, are therefore computed as a part of the method, anew for each pair, and their
+    time counts.
 
     **Attributes:**
 
@@ -101,7 +102,8 @@ class Chosen(Method):
             with recomputing():
                 prepared = prepared.with_crease_eigenvectors(preset.number_of_crease_eigenvectors)
         outcome = refine_in_stages(prepared, preset.judged_stages, preset.repair)
-        _, outcome = complete(prepared, preset.judged_stages, preset.final_stages, preset.repair, outcome)
+        with recomputing():
+            _, outcome = complete(prepared, preset.judged_stages, preset.final_stages, preset.repair, outcome)
         return outcome.pointwise_map, outcome.refinements[-1].result
 
 
