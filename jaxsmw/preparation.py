@@ -201,13 +201,16 @@ def prepare(
     samples = None
     if number_of_samples:
         with timed("samples", seconds):
-            samples_x, samples_y = side_by_side(
-                lambda mesh: farthest_point_samples(mesh, number_of_samples), *pair.meshes
-            )
-            samples = jax.device_put(samples_x), jax.device_put(samples_y)
+            samples = paired_samples(pair, number_of_samples)
     prepared = PreparedPair(
         pair, *spectra, init, start, samples, sampled, seconds, laplacian=laplacian, eigensolver=eigensolver
     )
     if number_of_crease_eigenvectors:
         return prepared.with_crease_eigenvectors(number_of_crease_eigenvectors)
     return prepared
+
+
+def paired_samples(pair: Pair, number: int) -> Samples:
+    """Return samples of X and of Y, a pair of arrays (s,) of 0-based vertices in farthest-point order."""
+    of_x, of_y = side_by_side(lambda mesh: farthest_point_samples(mesh, number), *pair.meshes)
+    return jax.device_put(of_x), jax.device_put(of_y)

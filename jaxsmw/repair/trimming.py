@@ -15,7 +15,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
 from jaxsmw.geometry.scans import in_small_components
 from jaxsmw.pair import Pair, paired_spectra
-from jaxsmw.preparation import PreparedPair, prepare
+from jaxsmw.preparation import PreparedPair, paired_samples
 from jaxsmw.repair.outcome import Outcome
 from jaxsmw.repair.overlap import detours
 from jaxsmw.repair.rounds import finish, refine_in_stages, with_coarse_levels
@@ -150,32 +150,10 @@ def _matched_again(
     logger.info("%s: the larger shape is trimmed and matched again ...", pair.name)
     try:
         stage = stage.fitted(pair.fewest_vertices())
-        # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit.
-        # Equal numbers of eigenvectors let all trimmed pairs of similar sizes share a compiled program.
-        of_x, of_y = paired_spectra(
-            replace(pair, partial=False, scale=1.0),
-            stage.number_of_eigenvectors,
-            laplacian=prepared.laplacian,
-            eigensolver=prepared.eigensolver,
-        )
-        area_x, area_y = pair.areas
-        nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
-        start = prepare(
-            pair,
-            number_of_eigenvectors=stage.number_of_eigenvectors,
-            number_of_descriptors=stage.number_of_descriptors,
-            number_of_crease_eigenvectors=stage.number_of_crease_eigenvectors,
-            number_of_samples=stage.number_of_samples or 0,
-            init=nearest[_extended(prepared, outcome)],
-            laplacian=prepared.laplacian,
-            eigensolver=prepared.eigensolver,
-            descriptors_required=True,
-            spectra=(of_x.scale(area_x), of_y.scale(area_y)),
-        )
+        start = _prepared_again(prepared, pair, stage, outcome)
     except InputError as error:  # the kept region can be too small or too coarse
         logger.info("the map is kept as it was before trimming: %s", error)
         return None
-    start = replace(start, init=prepared.init, seconds=prepared.seconds, trimmed=True)
     again = refine_in_stages(start, [stage], history=history)
     if not again.successful:
         return None
@@ -183,4 +161,43 @@ def _matched_again(
         refinements=[*outcome.refinements, *again.refinements],
         initial_map=outcome.initial_map,
         suspicious=outcome.suspicious,
+    )
+
+
+def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage, outcome: Outcome) -> PreparedPair:
+    """Compute the spectra and the samples of a trimmed pair, which starts from the map of an outcome.
+
+    Descriptors and crease eigenvectors are not computed again, because this takes long and does not lower the
+    mean error. (Table R46)
+
+    **Raises:** `InputError` if a spectrum or the samples cannot be computed.
+    """
+    # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit.
+    # Equal numbers of eigenvectors let all trimmed pairs of similar sizes share a compiled program.
+    spectra = paired_spectra(
+        replace(pair, partial=False, scale=1.0),
+        stage.number_of_eigenvectors,
+        laplacian=prepared.laplacian,
+        eigensolver=prepared.eigensolver,
+    )
+    of_x, of_y = (
+        spectrum.scale(area)
+        .with_descriptors(before.descriptors)
+        .with_crease_eigenvectors(before.crease_eigenvectors)
+        for spectrum, area, before in zip(
+            spectra, pair.areas, (prepared.spectrum_x, prepared.spectrum_y), strict=True
+        )
+    )
+    samples = None
+    if stage.number_of_samples is not None:
+        samples = paired_samples(pair, stage.number_of_samples)
+    nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
+    return replace(
+        prepared,
+        pair=pair,
+        spectrum_x=of_x,
+        spectrum_y=of_y,
+        initial_map=nearest[_extended(prepared, outcome)],
+        samples=samples,
+        trimmed=True,
     )
