@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from jaxsmw.core.refiner import Problem, reverse_map
+from jaxsmw.descriptors import describe
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
 from jaxsmw.geometry.scans import in_small_components
@@ -165,12 +167,9 @@ def _matched_again(
 
 
 def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage, outcome: Outcome) -> PreparedPair:
-    """Compute the spectra and the samples of a trimmed pair, which starts from the map of an outcome.
+    """Compute spectra, descriptors and samples of a trimmed pair, which starts from the map of an outcome.
 
-    Descriptors and crease eigenvectors are not computed again, because this takes long and does not lower the
-    mean error. (Table R46)
-
-    **Raises:** `InputError` if a spectrum or the samples cannot be computed.
+    **Raises:** `InputError` if they cannot be computed.
     """
     # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit.
     # Equal numbers of eigenvectors let all trimmed pairs of similar sizes share a compiled program.
@@ -180,14 +179,18 @@ def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage, outcome: O
         laplacian=prepared.laplacian,
         eigensolver=prepared.eigensolver,
     )
+    # The first trim changes the descriptors near the new boundary. Later trims hardly change them.
+    before = (prepared.spectrum_x, prepared.spectrum_y)
     of_x, of_y = (
         spectrum.scale(area)
-        .with_descriptors(before.descriptors)
-        .with_crease_eigenvectors(before.crease_eigenvectors)
-        for spectrum, area, before in zip(
-            spectra, pair.areas, (prepared.spectrum_x, prepared.spectrum_y), strict=True
-        )
+        .with_descriptors(old.descriptors)
+        .with_crease_eigenvectors(old.crease_eigenvectors)
+        for spectrum, area, old in zip(spectra, pair.areas, before, strict=True)
     )
+    if stage.number_of_descriptors and not prepared.trimmed:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the given meshes have already caused the same warnings
+            of_x, of_y = describe(pair, of_x, of_y, stage.number_of_descriptors)
     samples = None
     if stage.number_of_samples is not None:
         samples = paired_samples(pair, stage.number_of_samples)

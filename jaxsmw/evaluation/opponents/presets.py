@@ -60,8 +60,9 @@ class Refined(Method):
 class Chosen(Method):
     """A method that refines the initial map with one of `jaxsmw.PRESETS`, exactly as `jaxsmw.match` does.
 
-    No other method uses crease eigenvectors or trims shapes. Crease eigenvectors, and the spectra of trimmed
-    pairs, are therefore computed as a part of the method, anew for each pair, and their time counts.
+    No other method uses crease eigenvectors or trims shapes. Crease eigenvectors, and the spectra and
+    descriptors of trimmed pairs, are therefore computed as a part of the method. They are computed anew for
+    each pair, and their time counts.
 
     **Attributes:**
 
