@@ -241,6 +241,9 @@ class RepairSettings:
       another part of itself, for example a hand with a hip. See `jaxsmw.geometry.cut_shortcuts`.
     - `trims` (Table R46): the number of times that the larger shape of a partial pair is trimmed to the
       region of the smaller shape and matched again by the last stage, at least 0.
+    - `trimmed_from` (Table R46): a positive number. A pair is trimmed if the larger area is at least this
+      multiple of the smaller area. If the areas of two partial shapes are more similar, each shape often
+      lacks a part of the other shape.
     - `trimmed_area` (Table R46): a positive number. The larger shape is trimmed to this multiple of the
       smaller area. The faces at the boundary of the kept region add to this area.
     - `trimmed_levels` (Table R46): the levels of the last stage on a trimmed pair. If the refiner of this
@@ -273,6 +276,7 @@ class RepairSettings:
     aligned_preference: float = 0.9
     cut_shortcuts: bool = True
     trims: int = 2
+    trimmed_from: float = 1.25
     trimmed_area: float = 1.05
     trimmed_levels: tuple[int, ...] = (10, 30, 80, 200)
     alternatives: AlternativeSettings = AlternativeSettings()
@@ -293,7 +297,7 @@ class RepairSettings:
             "aligned_preference",
         ):
             check_number(name, getattr(self, name))
-        for name in ("suspicious", "compared", "doubtful", "trimmed_area"):
+        for name in ("suspicious", "compared", "doubtful", "trimmed_from", "trimmed_area"):
             check_number(name, getattr(self, name), positive=True)
         if not isinstance(self.cut_shortcuts, bool):
             raise InputError(f"cut_shortcuts is {self.cut_shortcuts!r}: give True or False.")

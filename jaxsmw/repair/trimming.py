@@ -82,11 +82,11 @@ def trimmed_stage(pair: Pair, stages: Sequence[Stage], repair: RepairSettings | 
     """Return the stage that runs after trimming: the last stage, with `repair.trimmed_levels`.
 
     **Returns:** The stage, or None if the pair is not trimmed. A pair is trimmed only if it is a partial pair
-    and the larger area is more than `repair.trimmed_area` times the smaller area.
+    and the larger area is at least `repair.trimmed_from` times the smaller area.
     """
     if repair is None or repair.trims == 0 or not pair.partial:
         return None
-    if max(pair.areas) <= repair.trimmed_area * min(pair.areas):
+    if max(pair.areas) < repair.trimmed_from * min(pair.areas):
         return None
     return with_coarse_levels(stages[-1], repair.trimmed_levels)
 
