@@ -149,7 +149,7 @@ def _matched_again(
     prepared: PreparedPair, pair: Pair, stage: Stage, outcome: Outcome, history: bool
 ) -> tuple[PreparedPair, Outcome] | None:
     """Run a stage on a trimmed pair from the map of an outcome. Return None after a failure."""
-    logger.info("%s: the larger shape is trimmed and matched again ...", pair.name)
+    logger.info("the larger shape is trimmed and matched again ...")
     try:
         stage = stage.fitted(pair.fewest_vertices())
         start = _prepared_again(prepared, pair, stage, outcome)
