@@ -204,6 +204,7 @@ def paired_spectra(
     *,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
+    common_limit: bool = True,
 ) -> tuple[Spectrum, Spectrum]:
     """Compute the spectra of the two meshes of a pair in comparable units.
 
@@ -223,10 +224,11 @@ def paired_spectra(
       degenerate triangles or edges with more than two faces, else `"cotangent"`.
     - `eigensolver`: `"exact"`, or `"approximate"`, which takes less time on large meshes. `"auto"` chooses
       `"approximate"` for both meshes if one mesh has at least 50 000 referenced vertices, else `"exact"`.
+    - `common_limit`: whether the spectra of a partial pair are cut at the common limit.
 
     **Returns:** Two spectra, each a `Spectrum` with positions and normals, in `Pair.units_of_length`. The
     spectrum of X has m vertices and k_X eigenvectors. The spectrum of Y has n vertices and k_Y eigenvectors.
-    For two full shapes, k_X = k_Y = k.
+    For two full shapes, and without the common limit, k_X = k_Y = k.
 
     **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if all
     eigenvalues of a mesh are zero. For a partial pair, `InputError` is also raised if the area of one mesh is
@@ -250,9 +252,9 @@ def paired_spectra(
         check_eigenvalues(mesh, spectrum)
     if not pair.partial:
         return spectrum_x, spectrum_y
-    return common_range(
-        *(s.scale(area) for s, area in zip((spectrum_x, spectrum_y), pair.areas, strict=True))
-    )
+    area_x, area_y = pair.areas
+    spectrum_x, spectrum_y = spectrum_x.scale(area_x), spectrum_y.scale(area_y)
+    return common_range(spectrum_x, spectrum_y) if common_limit else (spectrum_x, spectrum_y)
 
 
 def check_eigenvalues(mesh: Mesh, spectrum: Spectrum) -> None:

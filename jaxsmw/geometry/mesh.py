@@ -149,6 +149,11 @@ class Mesh:
         longest = igl.squared_edge_lengths(self.vertices, self.faces).max(axis=1)
         return 2 * self.face_areas <= DEGENERATE_HEIGHT * longest
 
+    def without_faces(self, removed: Bool[np.ndarray, " f"]) -> Mesh:
+        """Return the mesh without the faces of a mask (f,). Vertices keep their numbers."""
+        dropped = np.union1d(self.dropped_faces, self.face_numbers[removed])
+        return replace(self, faces=self.faces[~removed], dropped_faces=dropped)
+
     @cached_property
     def edges(self) -> Int64[np.ndarray, "e 2"]:
         """The edges (e, 2) in lexicographic order. The lower vertex index of each edge is first."""

@@ -82,8 +82,7 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
     at_gap = np.isin(component[mesh.faces[kept, 0]], component[mesh.faces[removed]])
     small, _ = in_small_components(component[mesh.faces[kept, 0]], mesh.face_areas[kept], at_gap)
     removed[kept] = small & at_gap
-    dropped = np.union1d(mesh.dropped_faces, mesh.face_numbers[removed])
-    return replace(mesh, faces=mesh.faces[~removed], dropped_faces=dropped)
+    return mesh.without_faces(removed)
 
 
 def points_on_uncut(points: SurfacePoints, cut: Mesh, mesh: Mesh) -> SurfacePoints:

@@ -64,18 +64,10 @@ def _kept(mesh: Mesh, far: Float[np.ndarray, " n"], share: float) -> Mesh:
     number = int(np.searchsorted(np.cumsum(mesh.vertex_areas[order]), share * mesh.area)) + 1
     near = np.zeros(len(far), bool)
     near[order[:number]] = True
-    kept = near[mesh.faces].any(axis=1)
-    faces = mesh.faces[kept]
-    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
-    component = connected_components(edges, len(far))[1][faces[:, 0]]
-    small, _ = in_small_components(component, mesh.face_areas[kept], np.ones(len(faces), bool))
-    dropped = np.ones(len(mesh.faces), bool)
-    dropped[np.flatnonzero(kept)[~small]] = False
-    return replace(
-        mesh,
-        faces=mesh.faces[~dropped],
-        dropped_faces=np.union1d(mesh.dropped_faces, mesh.face_numbers[dropped]),
-    )
+    kept = mesh.without_faces(~near[mesh.faces].any(axis=1))
+    component = connected_components(kept.edges, len(far))[1][kept.faces[:, 0]]
+    small, _ = in_small_components(component, kept.face_areas, np.ones(len(kept.faces), bool))
+    return kept.without_faces(small)
 
 
 def trimmed_stage(pair: Pair, stages: Sequence[Stage], repair: RepairSettings | None) -> Stage | None:
@@ -174,18 +166,17 @@ def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage, outcome: O
     # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit.
     # Equal numbers of eigenvectors let all trimmed pairs of similar sizes share a compiled program.
     spectra = paired_spectra(
-        replace(pair, partial=False, scale=1.0),
+        pair,
         stage.number_of_eigenvectors,
         laplacian=prepared.laplacian,
         eigensolver=prepared.eigensolver,
+        common_limit=False,
     )
     # The first trim changes the descriptors near the new boundary. Later trims hardly change them.
     before = (prepared.spectrum_x, prepared.spectrum_y)
     of_x, of_y = (
-        spectrum.scale(area)
-        .with_descriptors(old.descriptors)
-        .with_crease_eigenvectors(old.crease_eigenvectors)
-        for spectrum, area, old in zip(spectra, pair.areas, before, strict=True)
+        spectrum.with_descriptors(old.descriptors).with_crease_eigenvectors(old.crease_eigenvectors)
+        for spectrum, old in zip(spectra, before, strict=True)
     )
     if stage.number_of_descriptors and not prepared.trimmed:
         with warnings.catch_warnings():
