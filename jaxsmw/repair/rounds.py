@@ -49,8 +49,9 @@ def refine_in_stages(
        If the second-best outcome of step 1 has faults, this outcome is repaired as well. The outcome with the
        best score is used.
 
-    If the map of two near-isometric full shapes still looks wrong, both steps run a second time. The
-    alternatives are then refined with crease eigenvectors as well (Table R45). The better outcome is kept.
+    Both steps run without crease eigenvectors, because creases mislead the refinement of some maps (Table
+    R47). If the map of two near-isometric full shapes still looks wrong, both steps run a second time, with
+    crease eigenvectors (Table R45). The better outcome is kept.
 
     Some wrong maps look right. For two full shapes with the initial map `"shot"`, alternatives are therefore
     computed if the distortion of the outcome is at least `compared`. Only alternatives that differ from the
@@ -95,12 +96,13 @@ def refine_in_stages(
         logger.info("the map is compared with alternative maps (distortion %.3f)", best.distortion)
     else:
         return best
+    creaseless = runner.without_creases()
     if not computes_alternatives:
-        repairer = _Repairer(runner, judge, repair)
+        repairer = _Repairer(creaseless, judge, repair)
         return repairer.repaired([best], map(prepared.padded_map, alternatives or ()))
     proxies = Alternatives(prepared, repair)
     judge = replace(judge, measure_deformation=proxies.deformation)
-    repairer, usual = _Repairer(runner, judge, repair), best.unpadded_map(prepared.pair)
+    repairer, usual = _Repairer(creaseless, judge, repair), best.unpadded_map(prepared.pair)
     found = proxies.best(usual, only_better=not best.suspicious)
     best = repairer.repaired([judge.measured(best)], map(prepared.padded_map, found))
     tries_again = best.suspicious and proxies.has_creases and not prepared.pair.partial
@@ -109,7 +111,7 @@ def refine_in_stages(
         logger.info("further alternative maps are computed with crease eigenvectors ...")
         maps = [prepared.padded_map(one) for one in proxies.best(usual, creased=True)]
         if maps:
-            best = min(best, repairer.repaired([], maps), key=judge.score)
+            best = min(best, _Repairer(runner, judge, repair).repaired([], maps), key=judge.score)
     return best
 
 
@@ -123,8 +125,8 @@ def refine_further(
 ) -> Outcome:
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
-    In each pass, the repeated stage and all later stages run again. `RepairSettings` explains how many passes
-    run, and which passes are coarse. If repair did not find a map that looks right, the passes also run from
+    In each pass, the repeated stage and all later stages run again, without crease eigenvectors (Table R47).
+    `RepairSettings` explains how many passes run, and which passes are coarse. If repair did not find a map that looks right, the passes also run from
     the `rivals` of the outcome. A rival replaces the map if its score after the passes is better by more than
     `repair.rival_margin`.
 
@@ -149,6 +151,7 @@ def refine_further(
     aligned = isinstance(prepared.init, str) and prepared.init == "aligned" and not prepared.pair.partial
     if change < repair.non_isometric and not aligned:
         return outcome
+    runner = runner.without_creases()
     runners = [runner] * repair.passes
     if change >= repair.coarse_from or aligned:
         runners = [*map(runner.coarse, repair.coarse_levels), runner]
@@ -232,6 +235,19 @@ class _Runner:
             history=self.history,
         )
         return before._replace(refinements=[*before.refinements, found])
+
+    def without_creases(self) -> _Runner:
+        """Return a runner of the same stages, in which all crease eigenvectors are zero.
+
+        Zeros instead of no crease eigenvectors keep the sizes of arrays, so no further program is compiled.
+        """
+
+        def zeroed(spectrum: Spectrum) -> Spectrum:
+            creases = spectrum.crease_eigenvectors
+            return spectrum.with_crease_eigenvectors(None if creases is None else jnp.zeros_like(creases))
+
+        steps = [((zeroed(x), zeroed(y)), stage) for (x, y), stage in self.steps]
+        return replace(self, steps=steps)
 
     def coarse(self, levels: tuple[int, ...]) -> _Runner:
         """Return a runner whose last stage has the given levels. A refiner without levels is not changed."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -126,7 +127,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         if previous is None:
             # Y is not deformed yet, so the first reverse map uses only the deformation of X.
             forward = Deformation.along(x, all_y, pointwise_map, active_x)
-            reverse_map = nearest_vertices(y.points, forward.points(all_x), all_x.mask, patches)
+            reverse_map = nearest_vertices(y.points, _deformed((forward, all_x))[0], all_x.mask, patches)
         else:
             targets, queries = _product_space(all_x, y, previous, previous.descriptor_weight)
             reverse_map = nearest_vertices(queries, targets, all_x.mask, patches)
@@ -310,17 +311,6 @@ class Deformation(NamedTuple):
             surface.heat[:, None] * coefficients(averaged),
         )
 
-    def points(self, surface: _Surface) -> Float[Array, "s d"]:
-        """Return the weighted positions, normals and eigenfunctions of the deformed vertices, (s, d)."""
-        low = product(surface.eigenvectors, jnp.concatenate([self.own, self.matched, self.moments], axis=1))
-        own, matched, moments = low[:, :3], low[:, 3:-24], low[:, -24:]
-        rotations = _rotations(moments, surface)
-        details = surface.positions - own
-        positions, normals = (
-            jnp.sum(rotations * vectors[:, None, :], axis=2) for vectors in (details, surface.normals)
-        )
-        return jnp.concatenate([matched[:, :3] + positions, _NORMALS * normals, matched[:, 6:]], axis=1)
-
 
 class Registered(CoarseToFineState):
     """The state of `Registration`.
@@ -344,10 +334,31 @@ def _product_space(
     The points of two vertices x and y are close together if the deformed x is close to y on Y, and the
     deformed y is close to x on X.
     """
+    deformed_x, deformed_y = _deformed((state.forward, x), (state.backward, y))
     return (
-        jnp.concatenate([state.forward.points(x), x.points, weight * x.descriptors], axis=1),
-        jnp.concatenate([y.points, state.backward.points(y), weight * y.descriptors], axis=1),
+        jnp.concatenate([deformed_x, x.points, weight * x.descriptors], axis=1),
+        jnp.concatenate([y.points, deformed_y, weight * y.descriptors], axis=1),
     )
+
+
+def _deformed(*given: tuple[Deformation, _Surface]) -> list[Float[Array, "_ d"]]:
+    """Return the weighted positions, normals and eigenfunctions (s, d) of the vertices after deformation.
+
+    The list has one entry for each deformation and its surface.
+    """
+    surfaces = [surface for _, surface in given]
+    low = [product(surface.eigenvectors, jnp.concatenate(deformed, axis=1)) for deformed, surface in given]
+    rotations = _rotations([values[:, -24:] for values in low], surfaces)
+    points = []
+    for values, surface, turned in zip(low, surfaces, rotations, strict=True):
+        own, matched = values[:, :3], values[:, 3:-24]
+        details = surface.positions - own
+        positions, normals = (
+            jnp.sum(turned * vectors[:, None, :], axis=2) for vectors in (details, surface.normals)
+        )
+        columns = [matched[:, :3] + positions, _NORMALS * normals, matched[:, 6:]]
+        points.append(jnp.concatenate(columns, axis=1))
+    return points
 
 
 def _without_missing_parts(
@@ -371,20 +382,33 @@ def _without_missing_parts(
     return x.reweighted(weights_x), y.reweighted(weights_y)
 
 
-def _rotations(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array, "s 3 3"]:
+def _rotations(
+    moments: Sequence[Float[Array, "_ 24"]], surfaces: Sequence[_Surface]
+) -> list[Float[Array, "_ 3 3"]]:
     """Return the rotations that best align the neighbourhoods of vertices with those of their matches.
 
-    If one surface is a mirror image of the other, all rotations include a reflection.
+    If one surface is a mirror image of the other, all rotations include a reflection. The list has one entry
+    (s, 3, 3) for each surface. The rotations of all surfaces are computed together, because the compilation
+    of `_nearest_rotations` takes long.
     """
-    own, matched = moments[:, :3], moments[:, 3:6]
-    products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
-    # The moments are averages, weighted by the heat kernel around each vertex. In each direction of the
-    # tangent plane, the weighted variance of positions is twice the heat time. After the division by
-    # `2 * surface.time`, the variance is 1, like the squared length of a unit normal.
-    covariance = (products - own[:, :, None] * matched[:, None, :]) / (2 * surface.time) + normals
-    mirrored = jnp.sum(surface.weights * jnp.linalg.det(covariance)) < 0
-    sign = jnp.where(mirrored, -1, 1).astype(covariance.dtype)
-    return sign * _nearest_rotations(sign * covariance)
+
+    def covariance(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array, "s 3 3"]:
+        own, matched = moments[:, :3], moments[:, 3:6]
+        products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
+        # The moments are averages, weighted by the heat kernel around each vertex. In each direction of the
+        # tangent plane, the weighted variance of positions is twice the heat time. After the division by
+        # `2 * surface.time`, the variance is 1, like the squared length of a unit normal.
+        return (products - own[:, :, None] * matched[:, None, :]) / (2 * surface.time) + normals
+
+    covariances = list(map(covariance, moments, surfaces))
+    signs = []
+    for surface, values in zip(surfaces, covariances, strict=True):
+        mirrored = jnp.sum(surface.weights * jnp.linalg.det(values)) < 0
+        signs.append(jnp.where(mirrored, -1, 1).astype(values.dtype))
+    signed = [sign * values for sign, values in zip(signs, covariances, strict=True)]
+    ends = np.cumsum([len(values) for values in signed])[:-1]
+    found = jnp.split(_nearest_rotations(jnp.concatenate(signed)), ends)
+    return [sign * rotations for sign, rotations in zip(signs, found, strict=True)]
 
 
 def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 3"]:
