@@ -49,9 +49,8 @@ def refine_in_stages(
        If the second-best outcome of step 1 has faults, this outcome is repaired as well. The outcome with the
        best score is used.
 
-    Both steps run without crease eigenvectors, because creases mislead the refinement of some maps (Table
-    R47). If the map of two near-isometric full shapes still looks wrong, both steps run a second time, with
-    crease eigenvectors (Table R45). The better outcome is kept.
+    If the map of two near-isometric full shapes still looks wrong, both steps run a second time. The
+    alternatives are then refined with crease eigenvectors as well (Table R45). The better outcome is kept.
 
     Some wrong maps look right. For two full shapes with the initial map `"shot"`, alternatives are therefore
     computed if the distortion of the outcome is at least `compared`. Only alternatives that differ from the
@@ -96,13 +95,12 @@ def refine_in_stages(
         logger.info("the map is compared with alternative maps (distortion %.3f)", best.distortion)
     else:
         return best
-    creaseless = runner.without_creases()
     if not computes_alternatives:
-        repairer = _Repairer(creaseless, judge, repair)
+        repairer = _Repairer(runner, judge, repair)
         return repairer.repaired([best], map(prepared.padded_map, alternatives or ()))
     proxies = Alternatives(prepared, repair)
     judge = replace(judge, measure_deformation=proxies.deformation)
-    repairer, usual = _Repairer(creaseless, judge, repair), best.unpadded_map(prepared.pair)
+    repairer, usual = _Repairer(runner, judge, repair), best.unpadded_map(prepared.pair)
     found = proxies.best(usual, only_better=not best.suspicious)
     best = repairer.repaired([judge.measured(best)], map(prepared.padded_map, found))
     tries_again = best.suspicious and proxies.has_creases and not prepared.pair.partial
@@ -111,7 +109,7 @@ def refine_in_stages(
         logger.info("further alternative maps are computed with crease eigenvectors ...")
         maps = [prepared.padded_map(one) for one in proxies.best(usual, creased=True)]
         if maps:
-            best = min(best, _Repairer(runner, judge, repair).repaired([], maps), key=judge.score)
+            best = min(best, repairer.repaired([], maps), key=judge.score)
     return best
 
 
@@ -125,7 +123,7 @@ def refine_further(
 ) -> Outcome:
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
-    In each pass, the repeated stage and all later stages run again, without crease eigenvectors (Table R47).
+    In each pass, the repeated stage and all later stages run again, without crease eigenvectors (entry R47).
     `RepairSettings` explains how many passes run, and which passes are coarse. If repair did not find a map that looks right, the passes also run from
     the `rivals` of the outcome. A rival replaces the map if its score after the passes is better by more than
     `repair.rival_margin`.
