@@ -124,9 +124,9 @@ def refine_further(
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
     In each pass, the repeated stage and all later stages run again, without crease eigenvectors (entry R47).
-    `RepairSettings` explains how many passes run, and which passes are coarse. If repair did not find a map that looks right, the passes also run from
-    the `rivals` of the outcome. A rival replaces the map if its score after the passes is better by more than
-    `repair.rival_margin`.
+    `RepairSettings` explains how many passes run, and which passes are coarse. If repair did not find a map
+    that looks right, the passes also run from the `rivals` of the outcome. A rival replaces the map if its
+    score after the passes is better by more than `repair.rival_margin`.
 
     **Arguments:**
 
