@@ -19,7 +19,7 @@ from jaxsmw.pair import Pair
 from jaxsmw.preparation import prepare
 from jaxsmw.presets import PRESETS
 from jaxsmw.repair.alternatives import Alternatives
-from jaxsmw.repair.outcome import Judge
+from jaxsmw.repair.outcome import Judge, Outcome
 from jaxsmw.repair.proxies import Proxy, deformation, distance_error, map_difference
 from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.settings import AlternativeSettings
@@ -154,6 +154,20 @@ def test_only_better_maps_that_differ_from_the_known_map_are_tried(pair):
     upside_down = truth[np.argsort(np.argsort(-mesh_x.vertices[:, 1]))]
     better = next(found.best(upside_down, only_better=True))
     assert mean_error(mesh_y, better, truth) < 0.08
+
+
+def test_outcomes_with_nearly_the_same_map_are_no_rivals(pair):
+    mesh_x, mesh_y, truth = pair
+    upside_down = truth[np.argsort(np.argsort(-mesh_x.vertices[:, 1]))]
+    slightly_different = truth.copy()
+    slightly_different[:10] = upside_down[:10]
+    start = prepared(mesh_x, mesh_y)
+    right, similar, wrong, again = (
+        Outcome([], start.padded_map(one)) for one in (truth, slightly_different, upside_down, upside_down)
+    )
+    found = Alternatives(start, REPAIR).different(right, [similar, wrong, again])
+    assert len(found) == 1 and found[0] is wrong
+    assert Alternatives(start, REPAIR).different(right, [similar]) == ()
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from dataclasses import fields, replace
 from functools import partial, partialmethod
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
@@ -158,6 +159,26 @@ def test_passes_do_not_clear_the_suspicion(body, identity):
         assert found.suspicious == suspicious and len(found.refinements) == 1 and found.distortion < 10
 
 
+def test_passes_run_without_crease_eigenvectors(body):
+    """Crease eigenvectors change the map of a stage, but not the result of a pass."""
+    mesh, spectrum = body
+    stage = Stage(FeatureRegression((10,)), number_of_crease_eigenvectors=5)
+    random = np.random.default_rng(0).normal(size=(len(mesh.vertices), 5))
+    noise = np.random.default_rng(1).normal(scale=0.3, size=mesh.vertices.shape)
+    start = KDTree(mesh.vertices).query(mesh.vertices + noise)[1]
+    settings = replace(REPAIR, non_isometric=0.0, passes=1, pass_tolerance=100.0)
+    first, after = [], []
+    for creases in (jnp.asarray(random), jnp.zeros_like(random)):
+        creased = spectrum.with_crease_eigenvectors(creases)
+        prepared = PreparedPair(Pair(mesh, mesh), creased, creased, start, start)
+        once = refine_in_stages(prepared, [stage], None)
+        first.append(once.unpadded_map(prepared.pair))
+        once = once._replace(refinements=[], initial_map=prepared.padded_map(start))
+        after.append(refine_further(prepared, [stage], settings, once).unpadded_map(prepared.pair))
+    assert np.any(first[0] != first[1])
+    np.testing.assert_array_equal(*after)
+
+
 def test_passes_that_worsen_the_score_are_undone(body, monkeypatch):
     mesh, spectrum = body
     noise = np.random.default_rng(0).normal(scale=0.3, size=mesh.vertices.shape)
@@ -191,18 +212,22 @@ def test_a_rival_replaces_the_map_if_its_score_is_better_after_the_passes(body, 
         found = refine_further(prepared, [STAGE], chosen, first._replace(suspicious=True, rivals=(rival,)))
         np.testing.assert_array_equal(np.asarray(found.pointwise_map)[: len(identity)], expected)
         assert found.suspicious
+        # If the map looks right, so does its rival, and the better score decides.
+        found = refine_further(prepared, [STAGE], chosen, first._replace(suspicious=False, rivals=(rival,)))
+        np.testing.assert_array_equal(np.asarray(found.pointwise_map)[: len(identity)], identity)
+        assert not found.suspicious
 
 
-def test_rivals_are_kept_only_for_maps_that_look_wrong(body, mirrored, identity):
-    always_wrong = replace(REPAIR, suspicious=1.0, suspicious_area=1.0, doubtful=1.0, rounds=0)
-    for settings, margin, number in ((always_wrong, 100.0, 1), (always_wrong, 0.0, 0), (REPAIR, 100.0, 0)):
+def test_rivals_of_a_map_that_looks_right_look_right_as_well(body, mirrored, identity):
+    settings = replace(REPAIR, suspicious=1.0, suspicious_area=1.0, doubtful=1.0, rounds=0)
+    for doubtful, margin, number in ((1.0, 100.0, 1), (1.0, 0.0, 0), (1.1, 100.0, 0), (100.0, 100.0, 1)):
         _, found = outcome(
             body,
             mirrored,
-            replace(settings, rival_margin=margin, non_isometric=10.0),
+            replace(settings, doubtful=doubtful, rival_margin=margin, non_isometric=10.0),
             alternatives=[identity],
         )
-        assert len(found.rivals) == number
+        assert len(found.rivals) == number and found.suspicious == (doubtful == 1)
 
 
 def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity):

@@ -120,6 +120,20 @@ class Alternatives:
         radius = self.settings.alternatives.patch_radius
         return deformation(self.x, self.y, self._reduced(pointwise_map), radius)
 
+    def different(self, outcome: Outcome, others: Sequence[Outcome]) -> tuple[Outcome, ...]:
+        """Return the other outcomes whose maps differ from the map of the given outcome and from each other.
+
+        Two maps differ if they differ on at least the first share of `AlternativeSettings.different_areas`.
+        """
+        kept = [outcome]
+        for other in others:
+            reduced = self._reduced(other.unpadded_map(self.pair))
+            known = (self._reduced(one.unpadded_map(self.pair)) for one in kept)
+            least = self.settings.alternatives.different_areas[0]
+            if all(self._difference(reduced, one) >= least for one in known):
+                kept.append(other)
+        return tuple(kept[1:])
+
     def best(
         self, known: Int64[np.ndarray, " m"], *, only_better: bool = False, creased: bool = False
     ) -> Iterator[Int64[np.ndarray, " m"]]:

@@ -33,8 +33,8 @@ class Outcome(NamedTuple):
     - `distortion`: `jaxsmw.repair.scores.distortion` of the final map, or None if it was not computed yet.
     - `deformation`: `jaxsmw.repair.proxies.deformation` of the final map; 0 if it was not computed.
     - `suspicious`: whether limbs may still be swapped, or the body may be upside down.
-    - `rivals`: other outcomes with nearly the same score. Rivals are kept only if the map still looks wrong
-      after repair.
+    - `rivals`: other outcomes of repair with nearly the same score. If the map looks right, its rivals look
+      right as well.
     """
 
     refinements: list[Refinement]

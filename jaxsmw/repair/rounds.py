@@ -110,7 +110,7 @@ def refine_in_stages(
         maps = [prepared.padded_map(one) for one in proxies.best(usual, creased=True)]
         if maps:
             best = min(best, repairer.repaired([], maps), key=judge.score)
-    return best
+    return best._replace(rivals=proxies.different(best, best.rivals))
 
 
 def refine_further(
@@ -124,9 +124,9 @@ def refine_further(
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
     In each pass, the repeated stage and all later stages run again, without crease eigenvectors (entry R47).
-    `RepairSettings` explains how many passes run, and which passes are coarse. If repair did not find a map
-    that looks right, the passes also run from the `rivals` of the outcome. A rival replaces the map if its
-    score after the passes is better by more than `repair.rival_margin`.
+    `RepairSettings` explains how many passes run, and which passes are coarse. The passes also run from the
+    `rivals` of the outcome. A rival replaces the map if its score after the passes is better. If the map is
+    suspicious, the score must be better by more than `repair.rival_margin`.
 
     **Arguments:**
 
@@ -165,7 +165,8 @@ def refine_further(
     after = passed(outcome)
     # After the passes, scores distinguish right maps from wrong maps better than before. (Entry R36)
     best_rival = min(map(passed, outcome.rivals), key=judge.score, default=after)
-    if judge.score(best_rival) < judge.score(after) - repair.rival_margin:
+    if judge.score(best_rival) < judge.score(after) - repair.rival_margin * outcome.suspicious:
+        logger.info("another map has a better score after further passes")
         after = best_rival
     # Coarse passes worsen some maps of shapes with topological noise.
     if not judge.score(after) <= judge.score(outcome._replace(deformation=0.0)) + repair.pass_tolerance:
@@ -293,10 +294,11 @@ class _Repairer:
             # The second-best map is repaired as well, because a right map with faults can have a worse score
             # than a wrong map without faults.
             best, *others = sorted(map(self._without_faults, (best, *others[:1])), key=self.judge.score)
-        best = best._replace(suspicious=not self.judge.looks_right(best))
-        if best.suspicious:
-            limit = self.judge.score(best) + self.settings.rival_margin
-            best = best._replace(rivals=tuple(one for one in others if self.judge.score(one) <= limit))
+        wrong = not self.judge.looks_right(best)
+        limit = self.judge.score(best) + self.settings.rival_margin
+        close = (one for one in others if self.judge.score(one) <= limit)
+        rivals = tuple(one for one in close if wrong or self.judge.looks_right(one))
+        best = best._replace(suspicious=wrong, rivals=rivals)
         left = "; limbs may still be swapped" if best.suspicious else ""
         logger.info("the best of %d maps has distortion %.2f%s", len(outcomes), best.distortion, left)
         return best

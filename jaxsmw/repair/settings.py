@@ -223,9 +223,10 @@ class RepairSettings:
       converge more slowly than maps between poses of one body.
     - `pass_tolerance` (Table R40): a number of at least 0. If all passes together increase the score without
       the deformation by more than this value, the map before the passes is kept.
-    - `rival_margin` (entry R36): a number of at least 0. If the map still looks wrong after repair, an
-      outcome whose score is worse by at most this value is a rival. The passes also run from the rival. The
-      rival replaces the map if its score after the passes is better by more than this value.
+    - `rival_margin` (entries R36 and R48): a number of at least 0. An outcome of repair whose score is worse
+      by at most this value is a rival of the map. If the map looks right, only outcomes that look right are
+      rivals. The passes also run from each rival. The rival replaces the map if its score after the passes is
+      better. If the map still looks wrong after repair, the score must be better by more than this value.
     - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
       value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
       effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
