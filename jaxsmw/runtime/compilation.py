@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
+from jax import ShapeDtypeStruct
 from jaxtyping import PyTree
+
+from jaxsmw.runtime.traced_programs import UndescribedError, describe, rebuild, traced
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -61,16 +65,94 @@ def _known(option: str, value: str | bool) -> bool:
 def compiled(function: Function) -> Function:
     """Return the function compiled with `compiler_options`, for calls from Python.
 
+    If JAX stores compiled programs on disk, the traced programs are stored as well
+    (`jaxsmw.runtime.traced_programs`). A later process then neither traces nor compiles the function.
+
     Do not call the compiled function inside another compiled function. If `compiled` is called again with the
     same function, it returns the same compiled function.
     """
-    return _compiled(function, jax.default_backend())
+    return _compiled(function, jax.default_backend())  # type: ignore[return-value]
 
 
 @cache
-def _compiled(function: Function, backend: str) -> Function:
-    # The type annotations of Equinox do not declare that Equinox passes unknown options on to JAX.
-    return eqx.filter_jit(function, compiler_options=_options_for(backend))  # type: ignore[call-overload]
+def _compiled(function: Callable, backend: str) -> _CompiledFunction:
+    return _CompiledFunction(function, backend)
+
+
+class _CompiledFunction:
+    """A function with its compiled programs, one for each combination of sizes and settings."""
+
+    def __init__(self, function: Callable, backend: str):
+        self._function, self._backend = function, backend
+        # The type annotations of Equinox do not declare that Equinox passes unknown options on to JAX.
+        self._jitted: Any = eqx.filter_jit(function, compiler_options=_options_for(backend))  # type: ignore[call-overload]
+        self._programs: dict[Hashable, Future[tuple[Callable, Any]]] = {}
+        self._lock = Lock()
+
+    def __call__(self, *positional: PyTree, **named: PyTree) -> PyTree:
+        """Call the function, and compile it first if needed."""
+        program, arrays = self._stored_program(positional, named)
+        if program is None:
+            return self._jitted(*positional, **named)
+        run, structure = program
+        return rebuild(structure, run(*arrays))
+
+    def compile(self, positional: tuple[PyTree, ...], named: Mapping[str, PyTree]) -> None:
+        """Compile the program for given arguments. Later calls with such arguments find it."""
+        program, _ = self._stored_program(positional, named)
+        if program is None:
+            self._jitted.lower(*positional, **named).compile()
+
+    def _stored_program(
+        self, positional: tuple[PyTree, ...], named: Mapping[str, PyTree]
+    ) -> tuple[tuple[Callable, Any] | None, list[Any]]:
+        """Return a program that takes arrays and the structure of its result, and the arrays.
+
+        The program is None if it cannot be stored on disk.
+        """
+        settings: Any = jax.config  # JAX declares no types for its settings
+        stores = settings.jax_enable_compilation_cache and settings.jax_compilation_cache_dir
+        if self._backend != "cpu" or not stores:
+            return None, []
+        try:
+            structure, arrays = describe((positional, dict(named)))
+        except UndescribedError:
+            return None, []
+        if not all(map(_is_plain, arrays)):
+            return None, []
+        shapes = [ShapeDtypeStruct(a.shape, jax.dtypes.canonicalize_dtype(a.dtype)) for a in arrays]
+        key = str(structure), tuple((s.shape, s.dtype) for s in shapes), jax.config.read("jax_enable_x64")
+        with self._lock:
+            first = key not in self._programs
+            future = self._programs.setdefault(key, Future())
+        if first:
+            try:
+                future.set_result(self._loaded(structure, shapes))
+            except (UndescribedError, ValueError) as error:
+                future.set_exception(error)
+            except BaseException as error:
+                del self._programs[key]  # the next call tries again
+                future.set_exception(error)
+        try:
+            return future.result(), arrays
+        except (UndescribedError, ValueError):
+            # JAX raises `ValueError` for operations that it cannot store. If the function itself raised the
+            # error, it raises the error again when it is traced without being stored.
+            return None, []
+
+    def _loaded(self, structure: Any, shapes: list[ShapeDtypeStruct]) -> tuple[Callable, Any]:
+        program = traced(self._function, structure, shapes)
+        function = jax.jit(program.exported.call, compiler_options=_options_for(self._backend))
+        return function.lower(*shapes).compile(), program.structure
+
+
+def _is_plain(array: jax.Array | np.ndarray) -> bool:
+    """Return whether an array is a NumPy array, or is on the first device and has a type of its own."""
+    if isinstance(array, np.ndarray):
+        return True
+    if isinstance(array, jax.core.Tracer) or array.weak_type:
+        return False
+    return array.devices() == {jax.local_devices()[0]}
 
 
 def compile_ahead(
@@ -94,17 +176,17 @@ def compile_ahead(
     future stores the exception. A later call of `compiled(function)` with the same arguments raises the
     exception again.
     """
-    program: Any = compiled(function)  # the annotations of Equinox do not declare `lower`
+    program = _compiled(function, jax.default_backend())
     x64 = jax.config.read("jax_enable_x64")
 
-    def compile_now() -> object:
+    def compile_now() -> Any:
         with jax.enable_x64(x64):  # threads do not inherit this setting
             shapes = jax.eval_shape(arguments)
             # Equinox traces only arrays. An array that is broadcast from one element takes almost no memory.
             positional, named = jax.tree.map(
                 lambda shape: np.broadcast_to(np.zeros((), shape.dtype), shape.shape), shapes
             )
-            return program.lower(*positional, **named, **settings).compile()
+            program.compile(positional, {**named, **settings})
 
     executor = ThreadPoolExecutor(1)
     future = executor.submit(compile_now)
@@ -127,4 +209,5 @@ def release_programs() -> None:
     except (OSError, ValueError):
         return
     if used > _LARGEST_SHARE * available:
+        _compiled.cache_clear()
         jax.clear_caches()
