@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
@@ -37,15 +37,30 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
             f"{mesh.name}: cannot choose {number_of_samples} samples from {len(referenced)} referenced "
             f"vertices: choose a number from 1 to {len(referenced)}."
         )
-    positions = mesh.vertices[referenced]
+    # Each coordinate is one contiguous row, and all arrays are reused, which makes the loop several times
+    # faster.
+    positions = np.ascontiguousarray(mesh.vertices[referenced].T)
+    offsets, squares, nearest = np.empty_like(positions), *np.empty((2, len(referenced)))
     chosen = np.empty(number_of_samples, dtype=np.int64)
-    chosen[0] = np.argmax(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))
-    squared_distance = np.full(len(referenced), np.inf)
+    chosen[0] = np.argmax(_squares_from(positions, positions.mean(axis=1), offsets, squares))
+    nearest.fill(np.inf)
     for index in range(1, number_of_samples):
-        offsets = positions - positions[chosen[index - 1]]
-        squared_distance = np.minimum(squared_distance, np.einsum("ud,ud->u", offsets, offsets))
-        chosen[index] = np.argmax(squared_distance)
+        _squares_from(positions, positions[:, chosen[index - 1]], offsets, squares)
+        np.minimum(nearest, squares, out=nearest)
+        chosen[index] = np.argmax(nearest)
     return referenced[chosen]
+
+
+def _squares_from(
+    positions: Float64[np.ndarray, "3 n"],
+    point: Float64[np.ndarray, " 3"],
+    offsets: Float64[np.ndarray, "3 n"],
+    squares: Float64[np.ndarray, " n"],
+) -> Float64[np.ndarray, " n"]:
+    """Return the squared distances from a point. The arrays `offsets` and `squares` are overwritten."""
+    np.subtract(positions, point[:, None], out=offsets)
+    np.multiply(offsets, offsets, out=offsets)
+    return np.add.reduce(offsets, axis=0, out=squares)
 
 
 class SurfaceSamples(NamedTuple):

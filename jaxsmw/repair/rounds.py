@@ -123,8 +123,8 @@ def refine_further(
 ) -> Outcome:
     """Refine the map between non-isometric shapes further, because such maps converge slowly.
 
-    In each pass, the repeated stage and all later stages run again, without crease eigenvectors (entry R47).
-    `RepairSettings` explains how many passes run, and which passes are coarse. The passes also run from the
+    In each pass, the repeated stage and all later stages run again. `RepairSettings` explains how many passes
+    run, which passes are coarse, and which passes use crease eigenvectors. The passes also run from the
     `rivals` of the outcome. A rival replaces the map if its score after the passes is better. If the map is
     suspicious, the score must be better by more than `repair.rival_margin`.
 
@@ -149,7 +149,8 @@ def refine_further(
     aligned = isinstance(prepared.init, str) and prepared.init == "aligned" and not prepared.pair.partial
     if change < repair.non_isometric and not aligned:
         return outcome
-    runner = runner.without_creases()
+    if change >= repair.without_creases_from:
+        runner = runner.without_creases()
     runners = [runner] * repair.passes
     if change >= repair.coarse_from or aligned:
         runners = [*map(runner.coarse, repair.coarse_levels), runner]

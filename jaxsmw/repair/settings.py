@@ -227,6 +227,8 @@ class RepairSettings:
       by at most this value is a rival of the map. If the map looks right, only outcomes that look right are
       rivals. The passes also run from each rival. The rival replaces the map if its score after the passes is
       better. If the map still looks wrong after repair, the score must be better by more than this value.
+    - `without_creases_from` (entry R47): a number of at least 0. If the area-based shape difference is at
+      least this value, the passes do not use crease eigenvectors.
     - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
       value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
       effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
@@ -272,6 +274,7 @@ class RepairSettings:
     passes: int = 2
     pass_tolerance: float = 0.35
     rival_margin: float = 0.35
+    without_creases_from: float = 0.18
     coarse_from: float = 0.3
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
     aligned_preference: float = 0.9
@@ -294,6 +297,7 @@ class RepairSettings:
             "non_isometric",
             "pass_tolerance",
             "rival_margin",
+            "without_creases_from",
             "coarse_from",
             "aligned_preference",
         ):
