@@ -14,6 +14,7 @@ from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration, _nearest_rotations
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
+from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum
@@ -238,6 +239,26 @@ def test_samples_are_queries_and_all_vertices_are_targets(pair):
     samples = [jnp.asarray(generator.choice(len(truth), 300, replace=False)) for _ in "xy"]
     found = refine(x, y, initial_map, refiner=Registration((20,)), samples=(samples[0], samples[1]))
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.95
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("refiner", [Registration((20, 30)), FeatureRegression((20, 30))])
+def test_both_maps_of_a_state_are_recovered_together(pair, refiner, sampled):
+    x, y, initial_map, truth, _ = pair
+    samples = (jnp.arange(0, len(truth), 3), jnp.arange(0, len(truth), 4)) if sampled else None
+    prepared = refiner.prepare(Problem(x, y, samples))
+    start = initial_map[samples[0]] if sampled else initial_map
+    state, _ = refiner.update(prepared, start, None)
+    state, _ = refiner.update(prepared, refiner.recover(prepared, state), state)
+    found, completed = refiner.recover_both(prepared, state)
+    np.testing.assert_array_equal(found, refiner.recover(prepared, state))
+    assert state.reverse_map is None
+    if isinstance(refiner, Registration):
+        everywhere = refiner.recover_reverse(refiner.prepare(Problem(x, y)), state)
+        expected = everywhere[samples[1]] if sampled else everywhere
+    else:
+        expected = nearest_neighbor(*state.backward.embeddings(prepared.y, prepared.all_x))
+    np.testing.assert_array_equal(completed.reverse_map, expected)
 
 
 def test_a_partial_shape_keeps_its_size(pair):

@@ -166,9 +166,7 @@ def test_passes_use_crease_eigenvectors_only_for_similar_shapes(body, limit, use
     random = np.random.default_rng(0).normal(size=(len(mesh.vertices), 5))
     noise = np.random.default_rng(1).normal(scale=0.3, size=mesh.vertices.shape)
     start = KDTree(mesh.vertices).query(mesh.vertices + noise)[1]
-    settings = replace(
-        REPAIR, non_isometric=0.0, passes=1, pass_tolerance=100.0, without_creases_from=limit
-    )
+    settings = replace(REPAIR, non_isometric=0.0, passes=1, pass_tolerance=100.0, without_creases_from=limit)
     first, after = [], []
     for creases in (jnp.asarray(random), jnp.zeros_like(random)):
         creased = spectrum.with_crease_eigenvectors(creases)

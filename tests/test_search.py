@@ -8,7 +8,9 @@ from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 
 from jaxsmw.core.search import (
+    SearchProblem,
     make_patches,
+    nearest_in_both,
     nearest_neighbor,
     nearest_neighbor_in_patches,
     search_in_patches,
@@ -44,6 +46,25 @@ def check_against_brute_force(search, m, n, d, *, draws):
 )
 def test_equals_brute_force(m, n, d):
     check_against_brute_force(nearest_neighbor, m, n, d, draws=10)
+
+
+@pytest.mark.parametrize(
+    "sizes", [((30, 200, 4), (150, 90, 7)), ((64, 64, 3), (64, 64, 3)), ((1, 5, 2), (300, 2, 1))]
+)
+def test_two_searches_in_one_loop_equal_two_searches(sizes):
+    """The numbers of queries, of rows and of dimensions can differ."""
+    generator = np.random.default_rng(0)
+    problems = [
+        SearchProblem(
+            jnp.asarray(generator.normal(size=(m, d))),
+            jnp.asarray(generator.normal(size=(n, d))),
+            jnp.arange(n) % 3 != 1,
+        )
+        for m, n, d in sizes
+    ]
+    for one, found in zip(problems, nearest_in_both(*problems), strict=True):
+        distances = cdist(one.queries, one.database) + np.where(one.database_mask, 0, np.inf)
+        np.testing.assert_array_equal(found, np.argmin(distances, axis=1))
 
 
 def test_ties_go_to_the_lowest_index():

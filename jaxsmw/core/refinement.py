@@ -184,8 +184,8 @@ def refine(
             refined = jnp.full(pointwise_map.shape, -1, jnp.int32).at[samples[0]].set(refined)
     else:
         progress, records = lax.scan(loop.step, progress, jnp.zeros(iterations - 1, bool))
-        refined, _, objective = loop.search(in_full, progress.state, pointwise_map)
-        records = records.completed(progress.energy, objective)
+        refined = refiner.recover(in_full, progress.state)
+        records = records.completed(progress.energy, loop.objective(in_full, progress.state, refined))
     if samples is not None and not starts_on_samples:
         records = records.without_first_change()
     result = diagnose(spectrum_x, spectrum_y, pointwise_map, progress.result, used)
@@ -299,25 +299,25 @@ class _Loop:
         """Return whether the loop has finished its last iteration."""
         return progress.finished
 
-    def search(
-        self, prepared: Prepared, state: State, before: Int32[Array, " s"]
-    ) -> tuple[Int32[Array, " s"], Float[Array, ""], Float[Array, ""]]:
-        """Recover the pointwise map from a state.
-
-        Return the map, the share of changed matches, and the objective. `before` is the previous map.
-        """
-        after = self.refiner.recover(prepared, state)
-        mask = prepared.spectrum_x.mask
-        changed = jnp.sum((after != before) & mask) / jnp.sum(mask)
-        objective = self.refiner.objective(prepared, state, after) if self.history else self._undefined
-        return after, changed.astype(self._undefined.dtype), objective
+    def objective(
+        self, prepared: Prepared, state: State, pointwise_map: Int32[Array, " s"]
+    ) -> Float[Array, ""]:
+        """Return the objective of the map that was recovered from a state; NaN without a history."""
+        return self.refiner.objective(prepared, state, pointwise_map) if self.history else self._undefined
 
     def _iterate(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, _Record]:
-        after, changed, objective = self.search(self.prepared, progress.state, progress.pointwise_map)
-        record = _Record(changed, progress.energy, objective, after if self.keeps_maps else None)
+        after, previous = self.refiner.recover_both(self.prepared, progress.state)
+        mask = self.prepared.spectrum_x.mask
+        changed = jnp.sum((after != progress.pointwise_map) & mask) / jnp.sum(mask)
+        record = _Record(
+            changed.astype(self._undefined.dtype),
+            progress.energy,
+            self.objective(self.prepared, progress.state, after),
+            after if self.keeps_maps else None,
+        )
 
         def update() -> tuple[State, RESULTS, Array, Array]:
-            state, result = self.refiner.update(self.prepared, after, progress.state)
+            state, result = self.refiner.update(self.prepared, after, previous)
             result = where(progress.result == RESULTS.successful, checked(state, result), progress.result)
             return state, result, self._energy(self.prepared, state, after), progress.iterations + 1
 

@@ -94,8 +94,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     refiner defines both half-steps of an iteration: `update` computes a state from a pointwise map, and
     `recover` computes a pointwise map from a state. The state contains the functional map. `jaxsmw.refine`
     calls `prepare` once for all vertices and, if there are samples, once more for the samples. Then it calls
-    `update` and `recover` in each iteration. JAX traces all methods, so Python code in the methods must not
-    branch on the values of arrays.
+    `update` and `recover_both` in each iteration. JAX traces all methods, so Python code in the methods must
+    not branch on the values of arrays.
 
     A subclass is an equinox module. In the shapes of arrays, m is the number of vertices of X to be matched,
     and n is the number of vertices of Y.
@@ -114,8 +114,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     - `energy(prepared, state, pointwise_map)`: returns the quantity that the method minimises, as a scalar
       array in any unit. `jaxsmw.refine` stores this quantity in `History.energy`.
 
-    **Methods that a subclass can override:** `embeddings`, `objective` and `is_settled`, and the properties
-    `levels`, `convention` and `matches_samples_with_all`.
+    **Methods that a subclass can override:** `recover_both`, `embeddings`, `objective` and `is_settled`, and
+    the properties `levels`, `convention` and `matches_samples_with_all`.
     """
 
     @abc.abstractmethod
@@ -137,7 +137,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
 
         - `prepared`: the result of `prepare`.
         - `pointwise_map`: T: X -> Y (m,), one 0-based vertex of Y per vertex of `prepared.spectrum_x`.
-        - `previous`: the state from which the pointwise map was recovered; None in the first iteration.
+        - `previous`: the state from which the pointwise map was recovered, as `recover_both` returns it; None
+          in the first iteration.
         """
 
     @abc.abstractmethod
@@ -147,6 +148,15 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         The map contains one 0-based vertex of Y per vertex of `prepared.spectrum_x`. The map must be a valid
         argument `pointwise_map` of `update`.
         """
+
+    def recover_both(self, prepared: PreparedT, state: StateT) -> tuple[Int32[Array, " m"], StateT]:
+        """Recover the pointwise map X -> Y (m,), and add to the state what `update` needs besides this map.
+
+        `jaxsmw.refine` passes the returned state to `update` as `previous`, and then discards it. By default,
+        the method returns the result of `recover` and the state without changes. If `update` also uses a
+        reverse map, both maps can be computed here by one call of `jaxsmw.core.search.nearest_in_both`.
+        """
+        return self.recover(prepared, state), state
 
     @abc.abstractmethod
     def recover_reverse(self, prepared: PreparedT, state: StateT) -> Int32[Array, " n"]:

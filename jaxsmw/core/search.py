@@ -87,6 +87,46 @@ def nearest_neighbor(
     return in_blocks(search, queries, BLOCK)
 
 
+class SearchProblem(NamedTuple):
+    """The arguments of one `nearest_neighbor` search.
+
+    **Attributes:**
+
+    - `queries`, `database`: query points (m, d) and database points (n, d).
+    - `database_mask`: a Boolean array (n,), False for rows that are never chosen.
+    """
+
+    queries: Float[Array, "m d"]
+    database: Float[Array, "n d"]
+    database_mask: Bool[Array, " n"]
+
+
+def nearest_in_both(
+    first: SearchProblem, second: SearchProblem
+) -> tuple[Int32[Array, " m_1"], Int32[Array, " m_2"]]:
+    """Return the results of two exhaustive searches, (m_1,) and (m_2,); see `nearest_neighbor`.
+
+    JAX compiles the search only once, because both searches are iterations of one loop. A search takes longer
+    to compile than most other parts of a refinement. The sizes and the dimensions of the searches may differ.
+    """
+    searches = (first, second)
+    m, n = (max(len(one[field]) for one in searches) for field in (0, 1))
+    d = max(one.queries.shape[1] for one in searches)
+
+    def padded(rows: Array, number: int) -> Array:
+        columns = ((0, d - rows.shape[1]),) if rows.ndim == 2 else ()
+        return jnp.pad(rows, ((0, number - len(rows)), *columns))
+
+    stacked = SearchProblem(
+        *(
+            jnp.stack([padded(one[field], number) for one in searches])
+            for field, number in enumerate((m, n, n))
+        )
+    )
+    found = lax.map(lambda one: nearest_neighbor(one[0], one[1], database_mask=one[2]), stacked)
+    return found[0, : len(first.queries)], found[1, : len(second.queries)]
+
+
 def in_blocks(
     search: Callable[[Float[Array, "block d"]], Shaped[Array, "block ..."]],
     queries: Float[Array, "m d"],

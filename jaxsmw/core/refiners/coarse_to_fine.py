@@ -30,9 +30,12 @@ class CoarseToFineState(State):
     **Attributes:**
 
     - `iteration`: the number of the iteration, counted from 0.
+    - `reverse_map`: the reverse map Y -> X, for each vertex of Y to be matched, as `recover_both` computes
+      it; else None.
     """
 
     iteration: Int32[Array, ""]
+    reverse_map: Int32[Array, " n"] | None = eqx.field(default=None, kw_only=True)
 
 
 class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
@@ -99,6 +102,16 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
             return jnp.arange(size, dtype=jnp.int32) < -(-level * size // largest)
 
         return active(sizes[0]), active(sizes[1])
+
+    def reverse_map(self, prepared: PreparedT, state: StateT) -> Int32[Array, " n"]:
+        """Return the `reverse_map` (n,) of a state, and compute it if the state lacks it."""
+        completed: State = state
+        assert isinstance(completed, CoarseToFineState)
+        if completed.reverse_map is not None:
+            return completed.reverse_map
+        _, completed = self.recover_both(prepared, state)
+        assert isinstance(completed, CoarseToFineState) and completed.reverse_map is not None
+        return completed.reverse_map
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
         """Return whether this iteration and all later iterations use all eigenvectors."""

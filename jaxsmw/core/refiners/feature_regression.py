@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from jaxsmw.core.refiners.coarse_to_fine import (
     partial_matching_weights,
 )
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import Patches, nearest_neighbor, nearest_vertices
+from jaxsmw.core.search import Patches, SearchProblem, nearest_in_both, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
 # _RIDGE is the ridge of the regression, and _LEAST_RESIDUAL is added to the variances of the residuals.
@@ -98,7 +99,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
             moments = _Moments.along(x.values, all_y.values[pointwise_map], x.weights)
         else:
             iteration = previous.iteration + 1
-            reverse_map = previous.backward.search(y, all_x)
+            reverse_map = self.reverse_map(prepared, previous)
             weights_x, weights_y = x.weights, y.weights
             if prepared.partial:
                 residuals_x = previous.forward.residuals(x, all_y, pointwise_map)
@@ -118,9 +119,25 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def recover(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " m"]:
         """Return, for each vertex of X, the nearest vertex of Y in the Mahalanobis distance, (m,)."""
         if prepared.patches is None:
-            return state.forward.search(prepared.x, prepared.all_y)
+            return nearest_vertices(*state.forward.search(prepared.x, prepared.all_y), None)
         queries, database = self._eigenvector_embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
+
+    def recover_both(
+        self, prepared: PreparedFeatures, state: Regression
+    ) -> tuple[Int32[Array, " m"], Regression]:
+        """Return the result of `recover` (m,), and the state with the `reverse_map` of Y's vertices.
+
+        Distances of the reverse map are computed by the prediction of the features of Y.
+        """
+        backward = state.backward.search(prepared.y, prepared.all_x)
+        if prepared.patches is None:
+            forward = state.forward.search(prepared.x, prepared.all_y)
+            found, reverse_map = nearest_in_both(forward, backward)
+        else:
+            found = self.recover(prepared, state)
+            reverse_map = nearest_vertices(*backward, None)
+        return found, replace(state, reverse_map=reverse_map)
 
     def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
         """Return, for each vertex of Y, the nearest vertex of X, (n,).
@@ -230,9 +247,9 @@ class Prediction(NamedTuple):
         """Return the points of the query vertices (m, d_out) and of the target vertices (n, d_out)."""
         return product(queries.values, self.queries), product(targets.values, self.database)
 
-    def search(self, queries: _Features, targets: _Features) -> Int32[Array, " m"]:
-        """Return, for each query vertex, the nearest target vertex, (m,)."""
-        return nearest_neighbor(*self.embeddings(queries, targets), database_mask=targets.mask)
+    def search(self, queries: _Features, targets: _Features) -> SearchProblem:
+        """Return the search of the nearest target vertex for each query vertex."""
+        return SearchProblem(*self.embeddings(queries, targets), targets.mask)
 
     def residuals(
         self, queries: _Features, targets: _Features, matches: Int[Array, " m"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Float64, Int, Int32
 from jaxsmw.core.functional_map import dual_eigenvectors
 from jaxsmw.core.pointwise_map import chosen_patches
 from jaxsmw.core.products import product
-from jaxsmw.core.refiner import Prepared, Problem
+from jaxsmw.core.refiner import Prepared, Problem, Samples
 from jaxsmw.core.refiners.coarse_to_fine import (
     CoarseToFine,
     CoarseToFineState,
@@ -24,7 +25,7 @@ from jaxsmw.core.refiners.coarse_to_fine import (
     partial_matching_weights,
 )
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import Patches, nearest_vertices
+from jaxsmw.core.search import Patches, SearchProblem, nearest_in_both, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 
 # Positions have weight 1, in units of the square root of the area. _NORMALS is the weight of unit normals.
@@ -111,7 +112,16 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
             x = all_x.sample(spectrum_x, problem.samples[0])
             y = all_y.sample(spectrum_y, problem.samples[1])
         return PreparedSurfaces(
-            spectrum_x, spectrum_y, x, y, all_x, all_y, patches, reverse_patches, problem.partial
+            spectrum_x,
+            spectrum_y,
+            x,
+            y,
+            all_x,
+            all_y,
+            problem.samples,
+            patches,
+            reverse_patches,
+            problem.partial,
         )
 
     def update(
@@ -126,15 +136,16 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         weight = _DESCRIPTORS / level**_FALLING
         if previous is None:
             # Y is not deformed yet, so the first reverse map uses only the deformation of X.
-            forward = Deformation.along(x, all_y, pointwise_map, active_x)
+            (forward,) = _deformations(_Matched(x, all_y, pointwise_map, active_x))
             reverse_map = nearest_vertices(y.points, _deformed((forward, all_x))[0], all_x.mask, patches)
+            (backward,) = _deformations(_Matched(y, all_x, reverse_map, active_y))
         else:
-            targets, queries = _product_space(all_x, y, previous, previous.descriptor_weight)
-            reverse_map = nearest_vertices(queries, targets, all_x.mask, patches)
+            reverse_map = self.reverse_map(prepared, previous)
             if prepared.partial:
                 x, y = _without_missing_parts(prepared, previous, pointwise_map, reverse_map)
-            forward = Deformation.along(x, all_y, pointwise_map, active_x)
-        backward = Deformation.along(y, all_x, reverse_map, active_y)
+            forward, backward = _deformations(
+                _Matched(x, all_y, pointwise_map, active_x), _Matched(y, all_x, reverse_map, active_y)
+            )
         functional_map = product(x.dual.T, all_y.eigenvectors[pointwise_map])
         state = Registered(functional_map, iteration, forward, backward, weight)
         return state, RESULTS.successful  # type: ignore[return-value]
@@ -143,6 +154,26 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         """Return, for each vertex of X, the nearest vertex of Y in the `embeddings`, (m,)."""
         queries, database = self.embeddings(prepared, state)
         return nearest_vertices(queries, database, prepared.all_y.mask, prepared.patches)
+
+    def recover_both(
+        self, prepared: PreparedSurfaces, state: Registered
+    ) -> tuple[Int32[Array, " m"], Registered]:
+        """Return the result of `recover` (m,), and the state with the `reverse_map` of Y's vertices."""
+        points_x, points_y = _product_space(prepared.all_x, prepared.all_y, state, state.descriptor_weight)
+        queries_x, queries_y = points_x, points_y
+        if prepared.samples is not None:
+            queries_x, queries_y = (
+                points[rows] for points, rows in zip((points_x, points_y), prepared.samples, strict=True)
+            )
+        mask_x, mask_y = prepared.all_x.mask, prepared.all_y.mask
+        if prepared.patches is None:
+            found, reverse_map = nearest_in_both(
+                SearchProblem(queries_x, points_y, mask_y), SearchProblem(queries_y, points_x, mask_x)
+            )
+        else:
+            found = nearest_vertices(queries_x, points_y, mask_y, prepared.patches)
+            reverse_map = nearest_vertices(queries_y, points_x, mask_x, prepared.reverse_patches)
+        return found, replace(state, reverse_map=reverse_map)
 
     def recover_reverse(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " n"]:
         """Return, for each vertex of Y, the nearest vertex of X in the `embeddings`, (n,)."""
@@ -241,6 +272,7 @@ class PreparedSurfaces(Prepared):
 
     - `x`, `y`: the vertices to be matched, which are the samples or all vertices.
     - `all_x`, `all_y`: all vertices. Positions are in units of the square root of the area.
+    - `samples`: the samples of X and of Y; None if all vertices are matched.
     - `patches`: the pair of `Patches` for searches among the vertices of Y; None if these searches are
       exhaustive.
     - `reverse_patches`: the pair of `Patches` for searches among the vertices of X; None if these searches
@@ -252,6 +284,7 @@ class PreparedSurfaces(Prepared):
     y: _Surface
     all_x: _Surface
     all_y: _Surface
+    samples: Samples | None
     patches: tuple[Patches, Patches] | None
     reverse_patches: tuple[Patches, Patches] | None
     partial: bool = eqx.field(static=True)
@@ -277,39 +310,48 @@ class Deformation(NamedTuple):
     matched: Float[Array, "k_x d"]
     moments: Float[Array, "k_x 24"]
 
-    @classmethod
-    def along(
-        cls,
-        surface: _Surface,
-        other: _Surface,
-        matches: Int[Array, " s"],
-        active: Bool[Array, " k_x"],
-    ) -> Deformation:
-        """Compute the deformation of one surface onto another surface from given matches.
 
-        **Arguments:**
+class _Matched(NamedTuple):
+    """A surface, all vertices of the other surface, and the matches from which a deformation follows.
 
-        - `surface`: the vertices to be matched.
-        - `other`: all vertices of the other surface.
-        - `matches`: one 0-based vertex of `other` for each vertex of `surface` (s,).
-        - `active`: a Boolean array (k_x,), True for the eigenvectors that the iteration uses.
-        """
+    `matches` contains one 0-based vertex of `other` for each vertex of `surface` (s,). The Boolean array
+    `active` (k,) is True for the eigenvectors that the iteration uses.
+    """
 
-        def products(own: Float[Array, "s 3"], matched: Float[Array, "s 3"]) -> Float[Array, "s 9"]:
-            return (own[:, :, None] * matched[:, None, :]).reshape(-1, 9)
+    surface: _Surface
+    other: _Surface
+    matches: Int[Array, " s"]
+    active: Bool[Array, " k"]
 
-        own, matched = surface.positions, other.positions[matches]
-        normals = products(surface.normals, other.normals[matches])
-        averaged = jnp.concatenate([own, matched, products(own, matched), normals], axis=1)
 
-        def coefficients(values: Float[Array, "s d"]) -> Float[Array, "k_x d"]:
-            return product(surface.dual.T, values)
+def _deformations(*given: _Matched) -> list[Deformation]:
+    """Compute the deformation of each surface onto its other surface.
 
-        return cls(
-            jnp.where(active[:, None], coefficients(own), 0),
-            jnp.where(active[:, None], coefficients(other.points[matches]), 0),
-            surface.heat[:, None] * coefficients(averaged),
-        )
+    The rows of all surfaces form one array, because two arrays would take twice as long to compile.
+    """
+
+    def products(own: Float[Array, "s 3"], matched: Float[Array, "s 3"]) -> Float[Array, "s 9"]:
+        return (own[:, :, None] * matched[:, None, :]).reshape(-1, 9)
+
+    own = jnp.concatenate([one.surface.positions for one in given])
+    normals = jnp.concatenate([one.surface.normals for one in given])
+    points = jnp.concatenate([one.other.points[one.matches] for one in given])
+    other_normals = jnp.concatenate([one.other.normals[one.matches] for one in given])
+    columns = [own, points, products(own, points[:, :3]), products(normals, other_normals)]
+    found, end = [], 3 + points.shape[1]
+    for rows, (surface, _, _, active) in zip(
+        _split(jnp.concatenate(columns, axis=1), [one.surface for one in given]), given, strict=True
+    ):
+        coefficients = product(surface.dual.T, rows)
+        used = jnp.where(active[:, None], coefficients[:, :end], 0)
+        moments = jnp.concatenate([coefficients[:, :6], coefficients[:, end:]], axis=1)
+        found.append(Deformation(used[:, :3], used[:, 3:], surface.heat[:, None] * moments))
+    return found
+
+
+def _split(rows: Float[Array, "r ..."], surfaces: Sequence[_Surface]) -> list[Float[Array, "_ ..."]]:
+    """Divide an array that contains the rows of several surfaces, one surface after the other."""
+    return jnp.split(rows, np.cumsum([len(surface.weights) for surface in surfaces])[:-1])
 
 
 class Registered(CoarseToFineState):
@@ -344,21 +386,22 @@ def _product_space(
 def _deformed(*given: tuple[Deformation, _Surface]) -> list[Float[Array, "_ d"]]:
     """Return the weighted positions, normals and eigenfunctions (s, d) of the vertices after deformation.
 
-    The list has one entry for each deformation and its surface.
+    The list has one entry for each deformation and its surface. The rows of all surfaces form one array, as
+    in `_deformations`.
     """
     surfaces = [surface for _, surface in given]
-    low = [product(surface.eigenvectors, jnp.concatenate(deformed, axis=1)) for deformed, surface in given]
-    rotations = _rotations([values[:, -24:] for values in low], surfaces)
-    points = []
-    for values, surface, turned in zip(low, surfaces, rotations, strict=True):
-        own, matched = values[:, :3], values[:, 3:-24]
-        details = surface.positions - own
-        positions, normals = (
-            jnp.sum(turned * vectors[:, None, :], axis=2) for vectors in (details, surface.normals)
-        )
-        columns = [matched[:, :3] + positions, _NORMALS * normals, matched[:, 6:]]
-        points.append(jnp.concatenate(columns, axis=1))
-    return points
+    low = jnp.concatenate(
+        [product(surface.eigenvectors, jnp.concatenate(deformed, axis=1)) for deformed, surface in given]
+    )
+    own, matched = low[:, :3], low[:, 3:-24]
+    turned = _rotations(low[:, -24:], surfaces)
+    details = jnp.concatenate([surface.positions for surface in surfaces]) - own
+    positions, normals = (
+        jnp.sum(turned * vectors[:, None, :], axis=2)
+        for vectors in (details, jnp.concatenate([surface.normals for surface in surfaces]))
+    )
+    columns = [matched[:, :3] + positions, _NORMALS * normals, matched[:, 6:]]
+    return _split(jnp.concatenate(columns, axis=1), surfaces)
 
 
 def _without_missing_parts(
@@ -382,33 +425,27 @@ def _without_missing_parts(
     return x.reweighted(weights_x), y.reweighted(weights_y)
 
 
-def _rotations(
-    moments: Sequence[Float[Array, "_ 24"]], surfaces: Sequence[_Surface]
-) -> list[Float[Array, "_ 3 3"]]:
+def _rotations(moments: Float[Array, "r 24"], surfaces: Sequence[_Surface]) -> Float[Array, "r 3 3"]:
     """Return the rotations that best align the neighbourhoods of vertices with those of their matches.
 
-    If one surface is a mirror image of the other, all rotations include a reflection. The list has one entry
-    (s, 3, 3) for each surface. The rotations of all surfaces are computed together, because the compilation
-    of `_nearest_rotations` takes long.
+    If one surface is a mirror image of the other, all rotations include a reflection. `moments` contains the
+    rows of all surfaces, one surface after the other.
     """
-
-    def covariance(moments: Float[Array, "s 24"], surface: _Surface) -> Float[Array, "s 3 3"]:
-        own, matched = moments[:, :3], moments[:, 3:6]
-        products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
-        # The moments are averages, weighted by the heat kernel around each vertex. In each direction of the
-        # tangent plane, the weighted variance of positions is twice the heat time. After the division by
-        # `2 * surface.time`, the variance is 1, like the squared length of a unit normal.
-        return (products - own[:, :, None] * matched[:, None, :]) / (2 * surface.time) + normals
-
-    covariances = list(map(covariance, moments, surfaces))
-    signs = []
-    for surface, values in zip(surfaces, covariances, strict=True):
-        mirrored = jnp.sum(surface.weights * jnp.linalg.det(values)) < 0
-        signs.append(jnp.where(mirrored, -1, 1).astype(values.dtype))
-    signed = [sign * values for sign, values in zip(signs, covariances, strict=True)]
-    ends = np.cumsum([len(values) for values in signed])[:-1]
-    found = jnp.split(_nearest_rotations(jnp.concatenate(signed)), ends)
-    return [sign * rotations for sign, rotations in zip(signs, found, strict=True)]
+    own, matched = moments[:, :3], moments[:, 3:6]
+    products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
+    # The moments are averages, weighted by the heat kernel around each vertex. In each direction of the
+    # tangent plane, the weighted variance of positions is twice the heat time. After the division by twice
+    # the heat time, the variance is 1, like the squared length of a unit normal.
+    times = jnp.concatenate([jnp.broadcast_to(one.time, one.weights.shape) for one in surfaces])
+    variances = (products - own[:, :, None] * matched[:, None, :]) / (2 * times[:, None, None])
+    covariances = variances + normals
+    weights = jnp.concatenate([surface.weights for surface in surfaces])
+    signs = [
+        jnp.where(jnp.sum(rows) < 0, -jnp.ones_like(rows), jnp.ones_like(rows))
+        for rows in _split(weights * jnp.linalg.det(covariances), surfaces)
+    ]
+    sign = jnp.concatenate(signs)[:, None, None]
+    return sign * _nearest_rotations(sign * covariances)
 
 
 def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 3"]:
