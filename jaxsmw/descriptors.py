@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
@@ -326,10 +327,12 @@ class PrincipalAxes(NamedTuple):
             covariance = covariance + centered.T @ (weight[:, None] * centered)
         # On a busy machine, waiting threads make this decomposition up to 50 times slower.
         with one_blas_thread():
-            variances, directions = np.linalg.eigh(np.asarray(covariance, np.float64))
-        first = slice(None, -number - 1, -1)
-        scale = np.sqrt(np.maximum(variances[first], np.finfo(np.float64).tiny))
-        return cls(np.asarray(mean), directions[:, first] / scale)
+            size = len(mean)
+            variances, directions = scipy.linalg.eigh(
+                np.asarray(covariance, np.float64), subset_by_index=[size - number, size - 1]
+            )
+        scale = np.sqrt(np.maximum(variances[::-1], np.finfo(np.float64).tiny))
+        return cls(np.asarray(mean), directions[:, ::-1] / scale)
 
     def components(self, values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d"]:
         """Return the principal components of rows (n, c), in the type of the rows."""

@@ -14,10 +14,11 @@ import pytest
 from command_line import SMALL
 from synthetic import sphere_mesh
 
+from jaxsmw.cli.run import run_command
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import write_mesh
-from jaxsmw.runtime.cache import cache_compiled_programs, cached
+from jaxsmw.runtime.cache import cache_compiled_programs, cache_contents, cached, clear_cache
 
 INPUT = np.arange(6.0).reshape(2, 3)
 RESULT = {"values": np.array([0.1, np.nan, -0.0]), "count": np.array(3), "none": np.empty((0, 2), np.int32)}
@@ -249,6 +250,75 @@ def test_commands_cache_compiled_programs(tmp_path):
     (programs,) = cache.glob("programs-*")
     assert len(list(programs.iterdir())) > 5
     assert len(compiled(str(cache))) > 5
+
+
+@pytest.fixture
+def filled(directory):
+    """A cache with two entries, a temporary file, a compiled program and files of the user."""
+    cached("test", [1], Computation())
+    cached("test", [2], Computation())
+    cached("crease-eigenvectors", [2], Computation({"values": np.zeros(5000)}))
+    (directory / f".{'a' * 32}.npz").write_bytes(b"x" * 10)
+    programs = directory / f"programs-{'0' * 16}"
+    programs.mkdir()
+    for name in ("jit_f-0-cache", "jit_f-0-atime", ".lockfile"):
+        (programs / name).write_bytes(b"x" * 100)
+    (directory / "notes.npz").write_bytes(b"mine")
+    (directory / f"test-{'b' * 64}.npz").symlink_to(directory / "notes.npz")
+    return directory
+
+
+def test_the_cache_lists_its_contents_by_size(filled):
+    found = {content.kind: content.files for content in cache_contents()}
+    assert next(iter(found)) == "crease-eigenvectors"
+    assert found == {"crease-eigenvectors": 1, "test": 2, "compiled programs": 2, "temporary files": 1}
+    sizes = {content.kind: content.size for content in cache_contents()}
+    assert sizes["compiled programs"] == 200 and sizes["temporary files"] == 10
+
+
+def test_clearing_the_cache_keeps_other_files(filled):
+    clear_cache()
+    assert cache_contents() == []
+    left = {path.relative_to(filled).as_posix() for path in filled.rglob("*") if not path.is_dir()}
+    assert left == {"notes.npz", f"test-{'b' * 64}.npz", f"programs-{'0' * 16}/.lockfile"}
+    assert (filled / "notes.npz").read_bytes() == b"mine"
+    compute = Computation()
+    assert_same(cached("test", [1], compute))
+    assert compute.runs == 1
+
+
+@pytest.mark.parametrize("setting", ["", "off"])
+def test_a_disabled_or_missing_cache_is_empty(setting, monkeypatch, tmp_path):
+    for place in (setting, str(tmp_path / "missing")):
+        monkeypatch.setenv("JAXSMW_CACHE", place)
+        assert cache_contents() == []
+        clear_cache()
+    assert not (tmp_path / "missing").exists()
+
+
+def test_a_cache_that_is_no_directory_is_refused(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("x")
+    monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path / "file"))
+    for function in (cache_contents, clear_cache):
+        with pytest.raises(InputError, match="cannot be read"):
+            function()
+
+
+def test_the_command_shows_and_clears_the_cache(filled, capsys):
+    assert run_command(["cache"]) == 0
+    shown = capsys.readouterr().out
+    assert str(filled) in shown and "4 GiB" in shown
+    for line in ("test:               2 files, 0.0 MiB", "total:              6 files, 0.0 MiB"):
+        assert line in shown.splitlines()
+    assert run_command(["cache", "--clear"]) == 0
+    assert "is cleared: 6 files" in capsys.readouterr().out
+    assert cache_contents() == []
+
+
+def test_the_command_says_that_the_cache_is_disabled(monkeypatch, capsys):
+    monkeypatch.setenv("JAXSMW_CACHE", "off")
+    assert run_command(["cache"]) == 0
+    assert "disabled" in capsys.readouterr().out
 
 
 def test_the_users_compilation_cache_is_respected(monkeypatch, tmp_path):

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from jaxsmw.cli import benchmark, collection, demo, evaluate, match, render, spectrum, transfer
+from jaxsmw.cli import benchmark, cache, collection, demo, evaluate, match, render, spectrum, transfer
 from jaxsmw.cli.arguments import add_quiet, shortened
 from jaxsmw.cli.console import say, show
 
@@ -22,6 +22,7 @@ _COMMANDS = {
     "benchmark": benchmark,
     "spectrum": spectrum,
     "render": render,
+    "cache": cache,
 }
 
 

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import platformdirs
@@ -30,7 +31,10 @@ _FORMAT = 4
 
 # This pattern matches the names of entries, and the names of temporary files that a killed process left
 # behind.
-_OWN_FILES = re.compile(r"([a-z-]+-[0-9a-f]{64}|\.[0-9a-f]{32})\.npz")
+_OWN_FILES = re.compile(r"(?:([a-z-]+)-[0-9a-f]{64}|\.[0-9a-f]{32})\.npz")
+# JAX stores compiled programs in one subdirectory for each type of processor.
+_PROGRAMS = re.compile(r"programs-[0-9a-f]{16}")
+_PROGRAM_FILES = ("-cache", "-atime")
 
 
 def cached(
@@ -186,6 +190,91 @@ def cache_compiled_programs() -> None:
     }
     if settings.keys().isdisjoint(os.environ):
         os.environ.update(settings)
+
+
+class Content(NamedTuple):
+    """The files of one kind in the cache.
+
+    **Attributes:**
+
+    - `kind`: the kind of the entries, as passed to `cached`; `"compiled programs"` for the programs of JAX,
+      or `"temporary files"` for files that a killed process left behind.
+    - `files`: the number of files.
+    - `size`: the total size in bytes.
+    """
+
+    kind: str
+    files: int
+    size: int
+
+
+def cache_directory() -> Path | None:
+    """Return the directory of the cache, or None if the cache is disabled."""
+    return _place()
+
+
+def cache_limit() -> int:
+    """Return the largest total size of the entries in bytes, without compiled programs.
+
+    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
+    """
+    return int(_limit())
+
+
+def cache_contents() -> list[Content]:
+    """Return the contents of the cache, sorted by size. The list is empty if the cache is disabled.
+
+    **Raises:** `InputError` if the directory cannot be read.
+    """
+    sizes: dict[str, list[int]] = {}
+    for kind, path in _own_files():
+        with suppress(FileNotFoundError):  # another process may remove files
+            sizes.setdefault(kind, []).append(path.stat().st_size)
+    found = [Content(kind, len(each), sum(each)) for kind, each in sizes.items()]
+    return sorted(found, key=lambda content: -content.size)
+
+
+def clear_cache() -> None:
+    """Remove all entries and all compiled programs. Other files in the directory are kept.
+
+    Commands that run at the same time compute removed entries again.
+
+    **Raises:** `InputError` if a file cannot be removed.
+    """
+    for _, path in _own_files():
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{path}: the file cannot be removed ({error.strerror}): make its directory writable."
+            ) from error
+
+
+def _own_files() -> Iterator[tuple[str, Path]]:
+    """Yield the kind and the path of each file in the cache; see `Content`.
+
+    **Raises:** `InputError` if the directory cannot be read.
+    """
+    place = _place()
+    if place is None:
+        return
+    try:
+        for path in sorted(place.iterdir()):
+            if path.is_symlink():
+                continue
+            if (name := _OWN_FILES.fullmatch(path.name)) and path.is_file():
+                yield name[1] or "temporary files", path
+            elif _PROGRAMS.fullmatch(path.name) and path.is_dir():
+                for program in sorted(path.iterdir()):
+                    if program.name.endswith(_PROGRAM_FILES):
+                        yield "compiled programs", program
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise InputError(
+            f"{place}: the cache cannot be read ({error.strerror}): make it readable, or set JAXSMW_CACHE to "
+            "another directory."
+        ) from error
 
 
 def _place() -> Path | None:
