@@ -241,6 +241,13 @@ def test_samples_are_queries_and_all_vertices_are_targets(pair):
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.95
 
 
+def test_the_shapes_can_have_different_numbers_of_eigenvectors(pair):
+    """With fewer than 50 eigenvectors, the shapes also have different numbers of smooth coordinates."""
+    x, y, initial_map, truth, _ = pair
+    found = refine(x.truncate(30), y.truncate(20), initial_map, refiner=Registration((15, 30)), iterations=2)
+    assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.9
+
+
 @pytest.mark.parametrize("sampled", [False, True])
 @pytest.mark.parametrize("refiner", [Registration((20, 30)), FeatureRegression((20, 30))])
 def test_both_maps_of_a_state_are_recovered_together(pair, refiner, sampled):

@@ -327,25 +327,27 @@ class _Matched(NamedTuple):
 def _deformations(*given: _Matched) -> list[Deformation]:
     """Compute the deformation of each surface onto its other surface.
 
-    The rows of all surfaces form one array, because two arrays would take twice as long to compile.
+    Most rows of all surfaces form one array, because two arrays would take twice as long to compile.
     """
 
     def products(own: Float[Array, "s 3"], matched: Float[Array, "s 3"]) -> Float[Array, "s 9"]:
         return (own[:, :, None] * matched[:, None, :]).reshape(-1, 9)
 
-    own = jnp.concatenate([one.surface.positions for one in given])
-    normals = jnp.concatenate([one.surface.normals for one in given])
-    points = jnp.concatenate([one.other.points[one.matches] for one in given])
-    other_normals = jnp.concatenate([one.other.normals[one.matches] for one in given])
-    columns = [own, points, products(own, points[:, :3]), products(normals, other_normals)]
-    found, end = [], 3 + points.shape[1]
-    for rows, (surface, _, _, active) in zip(
-        _split(jnp.concatenate(columns, axis=1), [one.surface for one in given]), given, strict=True
-    ):
-        coefficients = product(surface.dual.T, rows)
-        used = jnp.where(active[:, None], coefficients[:, :end], 0)
-        moments = jnp.concatenate([coefficients[:, :6], coefficients[:, end:]], axis=1)
-        found.append(Deformation(used[:, :3], used[:, 3:], surface.heat[:, None] * moments))
+    surfaces = [one.surface for one in given]
+    points = [one.other.points[one.matches] for one in given]
+    own = jnp.concatenate([surface.positions for surface in surfaces])
+    matched = jnp.concatenate([rows[:, :3] for rows in points])
+    normals = jnp.concatenate([surface.normals for surface in surfaces])
+    matched_normals = jnp.concatenate([one.other.normals[one.matches] for one in given])
+    averaged = jnp.concatenate(
+        [own, matched, products(own, matched), products(normals, matched_normals)], axis=1
+    )
+    found = []
+    for one, rows, of_matches in zip(given, _split(averaged, surfaces), points, strict=True):
+        coefficients = product(one.surface.dual.T, jnp.concatenate([rows, of_matches], axis=1))
+        active = jnp.where(one.active[:, None], coefficients, 0)
+        moments = one.surface.heat[:, None] * coefficients[:, :24]
+        found.append(Deformation(active[:, :3], active[:, 24:], moments))
     return found
 
 
@@ -386,22 +388,26 @@ def _product_space(
 def _deformed(*given: tuple[Deformation, _Surface]) -> list[Float[Array, "_ d"]]:
     """Return the weighted positions, normals and eigenfunctions (s, d) of the vertices after deformation.
 
-    The list has one entry for each deformation and its surface. The rows of all surfaces form one array, as
+    The list has one entry for each deformation and its surface. Most rows of all surfaces form one array, as
     in `_deformations`.
     """
     surfaces = [surface for _, surface in given]
-    low = jnp.concatenate(
-        [product(surface.eigenvectors, jnp.concatenate(deformed, axis=1)) for deformed, surface in given]
-    )
-    own, matched = low[:, :3], low[:, 3:-24]
-    turned = _rotations(low[:, -24:], surfaces)
-    details = jnp.concatenate([surface.positions for surface in surfaces]) - own
-    positions, normals = (
-        jnp.sum(turned * vectors[:, None, :], axis=2)
-        for vectors in (details, jnp.concatenate([surface.normals for surface in surfaces]))
-    )
-    columns = [matched[:, :3] + positions, _NORMALS * normals, matched[:, 6:]]
-    return _split(jnp.concatenate(columns, axis=1), surfaces)
+    low = [product(surface.eigenvectors, jnp.concatenate(deformed, axis=1)) for deformed, surface in given]
+
+    def together(columns: slice) -> Float[Array, "r c"]:
+        return jnp.concatenate([rows[:, columns] for rows in low])
+
+    rotations = _rotations(together(slice(-24, None)), surfaces)
+    details = jnp.concatenate([surface.positions for surface in surfaces]) - together(slice(3))
+    normals = jnp.concatenate([surface.normals for surface in surfaces])
+    details, normals = (jnp.sum(rotations * vectors[:, None, :], axis=2) for vectors in (details, normals))
+    turned = jnp.concatenate([together(slice(3, 6)) + details, _NORMALS * normals], axis=1)
+    # Each row of `low` contains the own position, the position, normal and eigenfunctions of the match, and
+    # the moments.
+    return [
+        jnp.concatenate([rows, smooth[:, 9:-24]], axis=1)
+        for rows, smooth in zip(_split(turned, surfaces), low, strict=True)
+    ]
 
 
 def _without_missing_parts(
