@@ -308,7 +308,7 @@ def test_the_command_shows_and_clears_the_cache(filled, capsys):
     assert run_command(["cache"]) == 0
     shown = capsys.readouterr().out
     assert str(filled) in shown and "4 GiB" in shown
-    for line in ("test:               2 files, 0.0 MiB", "total:              6 files, 0.0 MiB"):
+    for line in ("test:                2 files, 0.0 MiB", "total:               6 files, 0.0 MiB"):
         assert line in shown.splitlines()
     assert run_command(["cache", "--clear"]) == 0
     assert "is cleared: 6 files" in capsys.readouterr().out

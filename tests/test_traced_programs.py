@@ -87,12 +87,12 @@ def test_a_stored_program_is_not_traced_again_and_returns_the_same(
 ):
     jax.config.update("jax_enable_compilation_cache", False)
     expected = compiled(refine)(*arguments, refiner=refiner, **options)
-    assert not list(directory.glob("program-*.npz"))
+    assert not list(directory.glob("traced-program-*.npz"))
     jax.config.update("jax_enable_compilation_cache", True)
     start_anew()
     traces.clear()
     first = compiled(refine)(*arguments, refiner=refiner, **options)
-    assert traces and len(list(directory.glob("program-*.npz"))) == 1
+    assert traces and len(list(directory.glob("traced-program-*.npz"))) == 1
     traces.clear()
     assert_same(compiled(refine)(*arguments, refiner=refiner, **options), first)
     start_anew()
@@ -114,7 +114,7 @@ def test_a_program_that_was_stored_ahead_is_used(directory, traces, arguments):
 def test_one_program_is_stored_if_many_threads_ask_for_it(directory, traces, arguments):
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda _: compiled(refine)(*arguments, iterations=1), range(4)))
-    assert len(traces) == 1 and len(list(directory.glob("program-*.npz"))) == 1
+    assert len(traces) == 1 and len(list(directory.glob("traced-program-*.npz"))) == 1
     for one in found[1:]:
         assert_same(one, found[0])
 
@@ -134,7 +134,7 @@ def test_everything_that_changes_a_program_is_a_part_of_its_key(directory, argum
     ]
 
     def stored() -> int:
-        return len(list(directory.glob("program-*.npz")))
+        return len(list(directory.glob("traced-program-*.npz")))
 
     for number, (positional, named) in enumerate(calls, 1):
         compiled(refine)(*positional, **named)
@@ -156,23 +156,23 @@ def test_code_of_users_is_never_stored(directory, traces, arguments):
     for _ in range(2):
         found = compiled(refine)(*arguments, refiner=UsersRefiner(), iterations=1)
         assert found.result == RESULTS.successful
-    assert traces == ["UsersRefiner"] and not list(directory.glob("program-*.npz"))
+    assert traces == ["UsersRefiner"] and not list(directory.glob("traced-program-*.npz"))
 
     def own(values):
         return 2 * values
 
-    assert float(compiled(own)(jnp.asarray(2.0))) == 4 and not list(directory.glob("program-*.npz"))
+    assert float(compiled(own)(jnp.asarray(2.0))) == 4 and not list(directory.glob("traced-program-*.npz"))
 
 
 def test_nothing_is_stored_without_a_directory_for_compiled_programs(directory, arguments):
     jax.config.update("jax_compilation_cache_dir", None)
     compiled(refine)(*arguments, iterations=1)
-    assert not list(directory.glob("program-*.npz"))
+    assert not list(directory.glob("traced-program-*.npz"))
 
 
 def test_damaged_programs_are_traced_again(directory, traces, arguments):
     expected = compiled(refine)(*arguments, iterations=1)
-    (entry,) = directory.glob("program-*.npz")
+    (entry,) = directory.glob("traced-program-*.npz")
     good = entry.read_bytes()
     for damaged in (good[:-100], good[: len(good) // 2] + b"\xff" * 40 + good[len(good) // 2 + 40 :], b""):
         entry.write_bytes(damaged)
@@ -197,7 +197,7 @@ def test_batches_are_not_affected(directory):
     points = jnp.asarray(np.random.default_rng(0).normal(size=(2, 9, 3)))
     both = jax.vmap(lambda queries: compiled(nearest_neighbor)(queries, points[0]))(points)
     np.testing.assert_array_equal(both[0], np.arange(9))
-    assert not list(directory.glob("program-*.npz"))
+    assert not list(directory.glob("traced-program-*.npz"))
 
 
 def test_descriptions_are_rebuilt(arguments):

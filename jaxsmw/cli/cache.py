@@ -40,12 +40,15 @@ def run(options: argparse.Namespace) -> None:
         clear_cache()
         show(f"{place} is cleared: {_files(contents)}, {_size(contents)} MiB.")
         return
-    show(f"directory:          {place} (set JAXSMW_CACHE to change it)")
-    limit = cache_limit() / 2**30
-    show(f"limit:              {limit:g} GiB without compiled programs (set JAXSMW_CACHE_LIMIT to change it)")
-    for one in contents:
-        show(f"{one.kind + ':':<19} {_files([one])}, {_size([one])} MiB")
-    show(f"total:              {_files(contents)}, {_size(contents)} MiB")
+    limit = f"{cache_limit() / 2**30:g} GiB without compiled programs"
+    lines = {
+        "directory": f"{place} (set JAXSMW_CACHE to change it)",
+        "limit": f"{limit} (set JAXSMW_CACHE_LIMIT to change it)",
+        **{one.kind: f"{_files([one])}, {_size([one])} MiB" for one in contents},
+        "total": f"{_files(contents)}, {_size(contents)} MiB",
+    }
+    for name, text in lines.items():
+        show(f"{name + ':':<20} {text}")
 
 
 def _files(contents: list[Content]) -> str:

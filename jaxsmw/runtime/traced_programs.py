@@ -79,7 +79,7 @@ def traced(function: Callable, structure: Any, shapes: Sequence[jax.ShapeDtypeSt
 
     sizes = [(shape.shape, str(shape.dtype)) for shape in shapes]
     key = json.dumps([_name(function), _environment(), structure, sizes])
-    entry = cached("program", [key], trace)
+    entry = cached("traced-program", [key], trace)
     exported = export.deserialize(bytearray(entry["exported"].tobytes()))
     return TracedProgram(exported, json.loads(str(entry["structure"])))
 
