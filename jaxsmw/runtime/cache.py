@@ -61,7 +61,7 @@ def cached(
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
-    place, limit = _place(), _limit()
+    place, limit = cache_directory(), cache_limit()
     if place is None:
         return compute()
     store = Store(place)
@@ -164,7 +164,7 @@ def cache_compiled_programs() -> None:
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
-    place = _place()
+    place = cache_directory()
     if place is None:
         return
     try:
@@ -182,7 +182,7 @@ def cache_compiled_programs() -> None:
         return  # JAX would issue a warning for each program that it cannot store
     settings = {
         "JAX_COMPILATION_CACHE_DIR": str(directory),
-        "JAX_COMPILATION_CACHE_MAX_SIZE": str(int(min(2**28, _limit()))),
+        "JAX_COMPILATION_CACHE_MAX_SIZE": str(int(min(2**28, cache_limit()))),
         # Small programs are also stored, because many small programs take as long to compile as one large
         # program.
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -206,19 +206,6 @@ class Content(NamedTuple):
     kind: str
     files: int
     size: int
-
-
-def cache_directory() -> Path | None:
-    """Return the directory of the cache, or None if the cache is disabled."""
-    return _place()
-
-
-def cache_limit() -> int:
-    """Return the largest total size of the entries in bytes, without compiled programs.
-
-    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
-    """
-    return int(_limit())
 
 
 def cache_contents() -> list[Content]:
@@ -255,7 +242,7 @@ def _own_files() -> Iterator[tuple[str, Path]]:
 
     **Raises:** `InputError` if the directory cannot be read.
     """
-    place = _place()
+    place = cache_directory()
     if place is None:
         return
     try:
@@ -277,14 +264,17 @@ def _own_files() -> Iterator[tuple[str, Path]]:
         ) from error
 
 
-def _place() -> Path | None:
+def cache_directory() -> Path | None:
     """Return the directory of the cache, or None if the cache is disabled."""
     place = os.environ.get("JAXSMW_CACHE", platformdirs.user_cache_dir("jaxsmw", appauthor=False))
     return None if place in ("", "off") else Path(place)
 
 
-def _limit() -> float:
-    """Return the largest size of the cache in bytes."""
+def cache_limit() -> float:
+    """Return the largest total size of the entries in bytes, without compiled programs.
+
+    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
+    """
     text = os.environ.get("JAXSMW_CACHE_LIMIT", "4")
     try:
         limit = float(text)
