@@ -11,8 +11,10 @@
 - `side_by_side_eigenbases`: the time to compute two eigenbases concurrently, in threads and in processes,
   compared with the time to compute one eigenbasis.
 - `stages`: the times of other computations on the host for one shape, such as SHOT and sampling.
-- `command`: the times of whole commands, from the start of Python until the map is written, with and without
-  cached compiled programs.
+- `command`: wall time and CPU time of whole commands, from the start of Python until the outputs are written,
+  with and without the results of earlier commands. Some commands also run beside busy processes.
+- `later_pairs`: the time of `match` for each of several pairs in one process, after a first pair.
+- `throughput`: the pairs per minute of one process of jaxsmw, and of ten processes of each other library.
 - `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
   are included if they are installed (`jaxsmw[peers]`).
 - `scale`: the time from two mesh files of up to a million vertices to the refined map. The script measures
@@ -42,8 +44,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from functools import cache, partial
+from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
+from itertools import chain, permutations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,7 +78,7 @@ from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.matching import match
 from jaxsmw.pair import Pair
 from jaxsmw.preparation import prepare
-from jaxsmw.presets import PRESETS, PresetName
+from jaxsmw.presets import PresetName
 from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
 from jaxsmw.report.tables import markdown
@@ -106,27 +110,33 @@ class PlainSearch(WaveletPreservation):
 def medians(
     candidates: dict[str, Callable[[], object]],
     repeats: int,
-    clock: Callable[[], float] = time.perf_counter,
+    clock: Callable[[], Any] = time.perf_counter,
     *,
     warm: bool = True,
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Run the candidates alternately, and return the median time of each candidate in seconds.
 
     **Arguments:**
 
     - `candidates`: a dictionary from the name of each candidate to the function to time.
     - `repeats`: the number of timed runs of each candidate.
-    - `clock`: a function that returns the current time in seconds.
+    - `clock`: a function that returns the current time in seconds, or an array of times in seconds.
     - `warm`: whether each candidate first runs once without timing, so that JAX compiles it.
     """
-    seconds: dict[str, list[float]] = {name: [] for name in candidates}
+    seconds: dict[str, list[Any]] = {name: [] for name in candidates}
     for turn in range(repeats + warm):
         for name, candidate in candidates.items():
             start = clock()
             jax.block_until_ready(candidate())
             if turn >= warm:
                 seconds[name].append(clock() - start)
-    return {name: float(np.median(times)) for name, times in seconds.items()}
+    return {name: np.median(times, axis=0).tolist() for name, times in seconds.items()}
+
+
+def wall_and_cpu() -> np.ndarray:
+    """Return the wall time, and the CPU time of this process and its finished child processes, in seconds."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return np.array([time.perf_counter(), time.process_time() + children.ru_utime + children.ru_stime])
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
@@ -334,52 +344,131 @@ def stages(options: argparse.Namespace) -> Iterator[Part]:
         )
 
 
-def command(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the times of whole commands in new processes, for two meshes of 7000 vertices."""
-    pair = creature_pair(vertices=SIZES[0])
-    with tempfile.TemporaryDirectory() as directory:
-        files = [str(Path(directory) / f"{side}.off") for side in ("source", "target")]
-        for file, mesh in zip(files, (pair.source, pair.target), strict=True):
-            write_mesh(Path(file), mesh)
-        output = str(Path(directory) / "map.txt")
-        matching = ["-m", "jaxsmw", "match", *files, "--output", output]
+class Busy:
+    """Processes that keep all cores busy while the context is entered."""
 
-        def started(*arguments: str, cache: Path | None = None) -> Callable[[], object]:
-            environment = {**os.environ, "JAXSMW_CACHE": str(cache or "off")}
+    def __enter__(self) -> None:
+        loop = [sys.executable, "-c", "while True: pass"]
+        self.processes = [subprocess.Popen(loop) for _ in range(os.cpu_count() or 1)]
+
+    def __exit__(self, *_: object) -> None:
+        for process in self.processes:
+            process.kill()
+            process.wait()
+
+
+def command(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the times of whole commands in new processes, for meshes of 5000 vertices."""
+    before, timed = people(options, 2)
+    with tempfile.TemporaryDirectory() as directory:
+        root = Path(directory)
+        files = [[str(root / f"{side}_{number}.off") for side in range(2)] for number in range(2)]
+        for file, mesh in zip(chain(*files), (*before, *timed), strict=True):
+            write_mesh(Path(file), mesh)
+        of_before, of_timed = (["match", *of_pair, "--output", str(root / "map.txt")] for of_pair in files)
+        paper = ["--preset", "paper"]
+
+        def started(*arguments: str, cache: Path | None = None, own: bool = True) -> Callable[[], object]:
+            """Return a function that runs Python with the given arguments.
+
+            Without a cache, the process starts with an empty cache. With `own` False, only programs are kept
+            from earlier commands.
+            """
+
+            def removable() -> list[Path]:
+                entries = cache.glob("*.npz") if cache and not own else ()
+                return [entry for entry in entries if not entry.name.startswith("traced-program-")]
 
             def run() -> None:
-                for entry in cache.glob("*.npz") if cache else ():
-                    entry.unlink()  # compiled programs stay in the cache
-                subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=environment)
+                for entry in removable():
+                    entry.unlink()
+                with tempfile.TemporaryDirectory() as empty:
+                    environment = {**os.environ, "JAXSMW_CACHE": str(cache or empty)}
+                    command = [sys.executable, *arguments]
+                    subprocess.run(command, check=True, capture_output=True, env=environment)
 
             return run
 
-        def both(k: int, meshes: tuple[Mesh, Mesh] = (pair.source, pair.target)) -> object:
-            return [eigenpairs(mesh, k) for mesh in meshes]
+        def beside(run: Callable[[], object]) -> Callable[[], object]:
+            def busy() -> None:
+                with Busy():
+                    run()
 
-        accurate = PRESETS["accurate"].number_of_eigenvectors
+            return busy
 
-        kept = Path(directory) / "kept"
-        started(*matching, cache=kept)()
-        seconds = medians(
-            {
-                "two eigenbases": partial(both, EIGENVECTORS),
-                f"two eigenbases, k = {accurate}": partial(both, accurate),
-                "import jax": started("-c", "import jax"),
-                "import jaxsmw": started("-c", "import jaxsmw"),
-                "jaxsmw --help": started("-m", "jaxsmw", "--help"),
-                "jaxsmw match": started(*matching),
-                "jaxsmw match --preset paper": started(*matching, "--preset", "paper"),
-                "jaxsmw match, compiled before": started(*matching, cache=kept),
-            },
-            3,
-            warm=False,
-        )
+        program = "-m", "jaxsmw"
+        kept, of_others = root / "kept", root / "others"
+        for extra in ([], paper):
+            started(*program, *of_before, *extra, cache=of_others)()
+            started(*program, *of_timed, *extra, cache=kept)()
+        matches = {
+            "first `match`": started(*program, *of_timed),
+            "second `match`, other meshes": started(*program, *of_timed, cache=of_others, own=False),
+            "second `match`, same meshes": started(*program, *of_timed, cache=kept),
+            "first `match --preset paper`": started(*program, *of_timed, *paper),
+            "second `match --preset paper`, same meshes": started(*program, *of_timed, *paper, cache=kept),
+        }
+        others = {
+            "`import jax`": started("-c", "import jax"),
+            "`import jaxsmw`": started("-c", "import jaxsmw"),
+            "`jaxsmw --help`": started(*program, "--help"),
+            "`jaxsmw --version`": started(*program, "--version"),
+            "first `demo`": started(*program, "demo", "--output", str(root / "demo")),
+        }
+        busy = {f"{name}, busy": beside(run) for name, run in matches.items()}
+        found = medians(matches | others | busy, options.repeats, wall_and_cpu, warm=False)
+    rows = [["", "wall seconds", "CPU seconds", "wall seconds beside busy processes", "relative to quiet"]]
+    for name in (*matches, *others):
+        wall, cpu = found[name]
+        row = [name, f"{wall:.2f}", f"{cpu:.2f}", "", ""]
+        if beside_busy := found.get(f"{name}, busy"):
+            row[3:] = f"{beside_busy[0]:.2f}", f"{beside_busy[0] / wall:.2f}"
+        rows.append(row)
+    m, n = (len(mesh.vertices) for mesh in timed)
     yield (
-        "Commands",
-        "Each command runs in a new process without cached spectra.",
-        compared(seconds, "two eigenbases"),
-        {"seconds": seconds},
+        f"Commands, {m} and {n} vertices",
+        "Each command ran in a new process. First commands start with an empty cache. Second commands use "
+        "the results of an earlier command with other or with the same meshes. One busy process ran for each "
+        f"core. Times are medians of {options.repeats} runs.",
+        rows,
+        {"seconds": found},
+    )
+
+
+def people(options: argparse.Namespace, number: int) -> list[tuple[Mesh, Mesh]]:
+    """Return pairs of people of the remeshed FAUST set if `--data` is given, else pairs of creatures.
+
+    The meshes have about 5000 vertices.
+    """
+    if options.data is None:
+        pairs = (creature_pair(vertices=5000, seed=seed) for seed in range(number))
+        return [(pair.source, pair.target) for pair in pairs]
+    names = [(f"tr_reg_{80 + i:03}", f"tr_reg_{90 + i:03}") for i in range(number)]
+    return [tuple(read_mesh(options.data / "off" / f"{name}.off") for name in pair) for pair in names]
+
+
+def later_pairs(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the times to match pairs in one process, from arrays to map, after a first pair."""
+    first, *others = people(options, 1 + options.repeats)
+    rows, measured = [["preset", "wall seconds", "CPU seconds", "shortest", "longest"]], {}
+    for preset in ("accurate", "paper"):
+        match(*first, preset=preset)
+        times = []
+        for pair in others:
+            arrays = [(mesh.vertices, mesh.faces) for mesh in pair]
+            start = wall_and_cpu()
+            match(*(make_mesh(*one) for one in arrays), preset=preset)
+            times.append(wall_and_cpu() - start)
+        wall, cpu = np.median(times, axis=0)
+        walls = [float(time_[0]) for time_ in times]
+        rows.append([preset, *(f"{value:.2f}" for value in (wall, cpu, min(walls), max(walls)))])
+        measured[preset] = np.array(times).tolist()
+    yield (
+        "Later pairs",
+        f"Times from arrays to map of {len(others)} pairs of about 5000 vertices, in one process and without "
+        "a cache, after a first pair. The shortest and the longest time are wall times.",
+        rows,
+        {"seconds": measured},
     )
 
 
@@ -419,11 +508,13 @@ def pair_with_truth(options: argparse.Namespace) -> Truth:
     if options.data is None:
         pair = creature_pair(vertices=SIZES[0])
         return Truth((pair.source, pair.target), np.arange(len(pair.true_map)), pair.true_map)
-    names = "tr_reg_002", "tr_reg_007"
-    x, y = (read_mesh(options.data / "off" / f"{name}.off") for name in names)
-    rows, targets = (
-        np.loadtxt(options.data / "corres" / f"{name}.vts", dtype=np.int64) - 1 for name in names
-    )
+    return truth_of(options.data, "tr_reg_002", "tr_reg_007")
+
+
+def truth_of(data: Path, *names: str) -> Truth:
+    """Return two people of the remeshed FAUST set."""
+    x, y = (read_mesh(data / "off" / f"{name}.off") for name in names)
+    rows, targets = (np.loadtxt(data / "corres" / f"{name}.vts", dtype=np.int64) - 1 for name in names)
     return Truth((x, y), rows, targets)
 
 
@@ -574,6 +665,8 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
         files = [str(Path(directory) / f"{side}.off") for side in range(2)]
         for file, mesh in zip(files, truth.meshes, strict=True):
             write_mesh(Path(file), mesh)
+        # The initial map is computed here, so the times of other libraries do not include its computation.
+        first = prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
         runs: dict[str, Callable[[list[str]], tuple[np.ndarray, float]]] = {
             "ours": ours_from_files,
             "ours, search in patches": partial(ours_from_files, search="patches"),
@@ -582,10 +675,9 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
         if "pyFM" not in missing:
             runs["pyFM, its defaults"] = pyfm_defaults_from_files
             runs["pyFM, its defaults, ZoomOut on to 100"] = partial(pyfm_defaults_from_files, step=5)
-            runs["pyFM, ZoomOut 20 to 100 from our start"] = pyfm_from_files
+            runs["pyFM, ZoomOut 20 to 100 from our start"] = partial(pyfm_from_files, first=first)
         if "geomfum" not in missing:
-            runs["geomfum, ZoomOut 20 to 100 from our start"] = geomfum_from_files
-        our_initial_map(*files)
+            runs["geomfum, ZoomOut 20 to 100 from our start"] = partial(geomfum_from_files, first=first)
         measured: dict[str, dict[str, Any]] = {}
         for turn in range(2 if options.quick else 4):  # the first run of each library includes compilation
             for name, run in runs.items():
@@ -624,6 +716,82 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
     )
 
 
+def throughput(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the pairs per minute and the errors of several libraries, for pairs of ten people.
+
+    jaxsmw matches all pairs in one process, with an empty cache at first. Each other library matches some of
+    the pairs in ten processes, each with one BLAS thread.
+    """
+    if options.data is None:
+        print("\nthroughput: left out, because it needs the option --data.")
+        return
+    names = [f"tr_reg_{number:03}" for number in range(80, 90)]
+    pairs = list(permutations(names, 2))
+    files = {name: str(options.data / "off" / f"{name}.off") for name in names}
+    measured: dict[str, dict[str, Any]] = {}
+
+    def add(name: str, matched: list[tuple[str, str]], maps: list[np.ndarray], seconds: float) -> None:
+        truths = [truth_of(options.data, *pair) for pair in matched]
+        errors = [truth.error(one, truth.meshes[1]) for truth, one in zip(truths, maps, strict=True)]
+        measured[name] = {"pairs": len(matched), "seconds": seconds, "errors": errors}
+
+    with tempfile.TemporaryDirectory() as directory:
+        for preset in ("accurate", "paper"):
+            os.environ["JAXSMW_CACHE"] = str(Path(directory) / preset)
+            start = time.perf_counter()
+            found = [match(*(read_mesh(files[name]) for name in pair), preset=preset) for pair in pairs]
+            taken = time.perf_counter() - start
+            add(f"jaxsmw, {preset}", pairs, [one.pointwise_map for one in found], taken)
+        os.environ["JAXSMW_CACHE"] = "off"
+    starts = dict(zip(pairs, (one.initial_map for one in found), strict=True))
+    for name, library, run, chosen in (
+        ("pyFM, its defaults, ZoomOut on to 100", "pyFM", pyfm_wider_from_files, pairs[::2]),
+        ("pyFM, ZoomOut 20 to 100 from our start", "pyFM", pyfm_from_files, pairs[::2]),
+        ("geomfum, ZoomOut 20 to 100 from our start", "geomfum", geomfum_from_files, pairs[::6]),
+    ):
+        if find_spec(library):
+            arguments = [([files[x], files[y]], starts[x, y]) for x, y in chosen]
+            add(name, chosen, *in_ten_processes(run, arguments, library))
+        else:
+            print(f"\nthroughput: {library} not installed: install with pip install 'jaxsmw[peers]'.")
+    rows = [["", "pairs", "seconds", "pairs per minute", "error x10^-3"]]
+    for name, of in measured.items():
+        rate = 60 * of["pairs"] / of["seconds"]
+        error = np.mean(of["errors"])
+        rows.append([name, str(of["pairs"]), f"{of['seconds']:.0f}", f"{rate:.1f}", f"{error:.1f}"])
+    yield (
+        "Throughput",
+        "Ordered pairs of ten people with about 5000 vertices each. jaxsmw runs in one process, and its "
+        "times include compilation. Each other library runs in ten processes, and its times leave out the start of "
+        "the processes.",
+        rows,
+        {"measured": measured},
+    )
+
+
+def in_ten_processes(
+    run: Callable[..., tuple[np.ndarray, float]], arguments: list[tuple[Any, ...]], library: str
+) -> tuple[list[np.ndarray], float]:
+    """Call a function in ten processes, each with one BLAS thread.
+
+    **Returns:** The first result of each call, and the seconds of all calls together. The seconds leave out
+    the start of the processes and the import of the library.
+    """
+    spawned = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(10, spawned, initializer=import_alone, initargs=(library,)) as pool:
+        list(pool.map(time.sleep, [5] * 10))  # all processes start
+        start = time.perf_counter()
+        calls = [pool.submit(run, *one) for one in arguments]
+        maps = [call.result()[0] for call in calls]
+        return maps, time.perf_counter() - start
+
+
+def import_alone(library: str) -> None:
+    """Import a library, and let BLAS use one thread in this process."""
+    import_module(library)
+    threadpool_limits(1, "blas")
+
+
 def ours_from_files(
     files: list[str], search: Search = "auto", samples: int | None = None
 ) -> tuple[np.ndarray, float]:
@@ -634,15 +802,6 @@ def ours_from_files(
     )
     result = match(*map(read_mesh, files), preset=stage)
     return result.pointwise_map, result.seconds["refinement"]
-
-
-@cache
-def our_initial_map(*files: str) -> np.ndarray:
-    """Return the initial map of `match`.
-
-    The map is cached, so the times of other libraries do not include the computation of the map.
-    """
-    return prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
 
 
 def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarray, float]:
@@ -662,13 +821,17 @@ def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarra
     return np.asarray(found), time.perf_counter() - start
 
 
-def pyfm_from_files(files: list[str]) -> tuple[np.ndarray, float]:
-    """Refine our initial map with `pyFM.refine.zoomout_refine` in steps of 5 eigenvectors."""
+def pyfm_wider_from_files(files: list[str], _: np.ndarray) -> tuple[np.ndarray, float]:
+    """Match as in `pyfm_defaults_from_files`, with ZoomOut to 100 eigenvectors and without an initial map."""
+    return pyfm_defaults_from_files(files, step=5)
+
+
+def pyfm_from_files(files: list[str], first: np.ndarray) -> tuple[np.ndarray, float]:
+    """Refine an initial map with `pyFM.refine.zoomout_refine` in steps of 5 eigenvectors."""
     from pyFM.mesh import TriMesh
     from pyFM.refine import zoomout_refine
     from pyFM.spectral import p2p_to_FM
 
-    first = our_initial_map(*files)
     x, y = (TriMesh.load(file).process(k=EIGENVECTORS) for file in files)
     start = time.perf_counter()
     k = EIGENVECTORS - ZOOMOUT_STEPS * 5
@@ -686,8 +849,8 @@ def pyfm_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     return np.asarray(found), time.perf_counter() - start
 
 
-def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
-    """Refine our initial map with `geomfum.refine.ZoomOut` in steps of 5 eigenvectors.
+def geomfum_from_files(files: list[str], first: np.ndarray) -> tuple[np.ndarray, float]:
+    """Refine an initial map with `geomfum.refine.ZoomOut` in steps of 5 eigenvectors.
 
     The conversion from pointwise to functional maps uses vertex areas. geomfum's default conversion ignores
     vertex areas, and is slower and less accurate.
@@ -697,7 +860,6 @@ def geomfum_from_files(files: list[str]) -> tuple[np.ndarray, float]:
     from geomfum.refine import ZoomOut
     from geomfum.shape import TriangleMesh
 
-    first = our_initial_map(*files)
     find = LaplacianSpectrumFinder(spectrum_size=EIGENVECTORS)
     x, y = (find(TriangleMesh.from_file(file), as_basis=True, recompute=True) for file in files)
     start = time.perf_counter()
@@ -749,7 +911,17 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
 
 PARTS = {
     part.__name__: part
-    for part in (refinement, eigenbasis, side_by_side_eigenbases, stages, command, peers, scale)
+    for part in (
+        refinement,
+        eigenbasis,
+        side_by_side_eigenbases,
+        stages,
+        command,
+        later_pairs,
+        peers,
+        throughput,
+        scale,
+    )
 }
 
 

@@ -173,11 +173,11 @@ def test_search_in_patches_equals_exhaustive_search_on_surfaces(embedding, dtype
 def test_patches_contain_all_points_and_have_equal_sizes(embedding):
     mask = jnp.asarray(np.random.default_rng(0).random(len(embedding)) < 0.9)
     patches = make_patches(embedding, mask, size=40, rank=4)
-    assert patches.rows.shape[1] == -(-2562 // patches.rows.shape[0]) and 28 <= patches.rows.shape[1] <= 57
-    kept = np.asarray(patches.rows)[np.asarray(patches.mask)]
-    np.testing.assert_array_equal(np.sort(kept), np.flatnonzero(mask))
+    rows, masks = (field.reshape(-1, field.shape[2]) for field in (patches.rows, patches.mask))
+    assert rows.shape[1] == -(-2562 // rows.shape[0]) and 28 <= rows.shape[1] <= 57
+    np.testing.assert_array_equal(np.sort(rows[masks]), np.flatnonzero(mask))
     everywhere = jnp.var(embedding[:, :6], axis=0).sum()
-    for rows, valid in zip(patches.rows, patches.mask, strict=True):
+    for rows, valid in zip(rows, masks, strict=True):
         assert not valid.any() or jnp.var(embedding[rows[valid]][:, :6], axis=0).sum() < 0.3 * everywhere
 
 
@@ -209,8 +209,10 @@ def test_most_patches_are_skipped(embedding):
     for scales, most in ((jnp.ones(30), 0.15), (jnp.linspace(1, 0.1, 30), 0.3)):
         ones = jnp.ones(2562, bool)
         queries, database = (make_patches(embedding, ones, size=size, rank=4) for size in (100, 20))
-        _, numbers = search_in_patches(embedding, embedding * scales[None, :], queries, database)
-        assert 0 < numbers.mean() / len(database.rows) < most
+        _, searched = search_in_patches(embedding, embedding * scales[None, :], queries, database)
+        regions, patches, _ = database.rows.shape
+        assert 0 < searched.patches.mean() / (regions * patches) < most
+        assert 0 < searched.regions.mean() / regions < 3 * most
 
 
 @pytest.mark.slow

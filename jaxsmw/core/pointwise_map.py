@@ -138,8 +138,8 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
     make `decode` faster on large shapes. The same patches can be used for all functional maps between X and
     Y.
 
-    A patch of Y contains more vertices if Y is finer: the patch size grows with the square root of Y's number
-    of vertices. With patches of this size, the search time grows as the number of vertices to the power 1.5.
+    A patch of Y contains more vertices if Y is finer: the patch size grows with the cube root of Y's number of
+    vertices.
 
     **Arguments:**
 
@@ -151,7 +151,7 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
     the points of each patch differ most.
     """
     n = spectrum_y.mask.shape[0]
-    size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** 0.5)
+    size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** (1 / 3))
     return (
         make_patches(spectrum_x.eigenvectors, spectrum_x.mask, size=_QUERIES, rank=0),
         make_patches(spectrum_y.eigenvectors, spectrum_y.mask, size=round(size), rank=_RANK),
@@ -180,4 +180,4 @@ _PATCHES_FROM = 15_000
 # Y, the argument `rank` of `make_patches` is _RANK. If Y has _VERTICES_OF_SMALLEST vertices or fewer, a patch
 # of Y has _SMALLEST_PATCH vertices.
 _QUERIES, _RANK = 128, 5
-_SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 40, 5000
+_SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 52, 5000

@@ -33,6 +33,9 @@ _RUN, _PARTS = 8, 16
 _COORDINATES, _POWER_ITERATIONS = 6, 4
 # One step of the search in patches compares a block of queries with _GROUP patches, by one matrix product.
 _GROUP = 4
+# A region contains at most _REGION patches. Its box has at most _REGION_AXES axes, because regions are larger
+# than patches and therefore more curved.
+_REGION, _REGION_AXES = 16, 12
 
 
 def nearest_neighbor(
@@ -188,27 +191,30 @@ class Patches(eqx.Module):
 
     Patches make searches in the spectral embedding of a surface faster. In this embedding, the points of a
     patch differ mainly along a few directions, because patches are small compared to the wavelengths of the
-    eigenfunctions.
+    eigenfunctions. Up to 16 neighbouring patches form a region.
 
     **Attributes:**
 
-    - `rows`: (p, s), int32, the 0-based indices of the s points of each of p patches. The indices are in
-      ascending order, with padding at the end.
-    - `mask`: (p, s), False for padding and for masked points, True for all other points.
-    - `variations`: (p, r, s), the coefficients of r linear combinations of the s points of each patch,
+    - `rows`: (g, c, s), int32, the 0-based indices of the s points of each of the c patches of g regions. The
+      indices of a patch are in ascending order, with padding at the end.
+    - `mask`: (g, c, s), False for padding and for masked points, True for all other points.
+    - `variations`: (g, c, r, s), the coefficients of r linear combinations of the s points of each patch,
       without unit. These combinations are the r directions along which the points of the patch differ most.
+    - `region_variations`: (g, q, c), the coefficients of q linear combinations of the centres of the c
+      patches of each region. These combinations are the q directions along which the centres differ most.
     """
 
-    rows: Int32[Array, "p s"]
-    mask: Bool[Array, "p s"]
-    variations: Float[Array, "p r s"]
+    rows: Int32[Array, "g c s"]
+    mask: Bool[Array, "g c s"]
+    variations: Float[Array, "g c r s"]
+    region_variations: Float[Array, "g q c"]
 
 
 def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: int, rank: int) -> Patches:
     """Divide points into patches of equal size by repeated halving.
 
     The function halves each group of points along the coordinate with the largest variance. Only the first 6
-    coordinates are considered.
+    coordinates are considered. The patches of a region come from one group of an earlier halving.
 
     **Arguments:**
 
@@ -231,11 +237,22 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
     valid = jnp.pad(mask, (0, total - n))[rows]
     # The rows of a patch are sorted, so the first of several equally near candidates has the lowest index.
     # Padding has the highest indices, so it comes last.
-    rows, valid = lax.sort([rows.reshape(-1, width), valid.reshape(-1, width)], dimension=1, num_keys=1)
+    shape = (-1, min(_REGION, 2**levels), width)
+    rows, valid = lax.sort([rows.reshape(shape), valid.reshape(shape)], dimension=2, num_keys=1)
     rows = jnp.minimum(rows, n - 1)
     if rank == 0:
-        return Patches(rows, valid, jnp.zeros((len(rows), 0, width), points.dtype))
-    return Patches(rows, valid, _variations(points[rows], valid, rank))
+        none = jnp.zeros((*rows.shape[:2], 0, width), points.dtype)
+        return Patches(rows, valid, none, none[:, :, :, 0].swapaxes(1, 2))
+
+    def variations(
+        region: tuple[Int32[Array, "c s"], Bool[Array, "c s"]],
+    ) -> tuple[Float[Array, "c r s"], Float[Array, "q c"]]:
+        there, counts = points[region[0]], region[1]
+        centers, _ = _centered(there, counts)
+        of_region = _variations(centers[None], jnp.any(counts, axis=1)[None], _REGION_AXES)[0]
+        return _variations(there, counts, rank), of_region
+
+    return Patches(rows, valid, *lax.map(variations, (rows, valid)))
 
 
 def _halved(
@@ -309,11 +326,14 @@ def nearest_neighbor_in_patches(
     Each patch of the database has a bounding box with r axes through the centre of the patch. The box also
     has a radius: the largest distance from a point of the patch to the space that the axes span. The box
     gives a lower bound on the distances from a query to the points of the patch. Computing this bound takes
-    only r + 1 scalar products. For each query, the patch with the nearest box gives a first candidate. A
-    patch is too far away if the lower bound exceeds the distance to the first candidate. The queries are
-    divided into patches, too. For each patch of queries, the search skips the database patches that are too
-    far away from every query. The bounds allow for rounding errors, so no nearest point is skipped. If the
-    points are spread evenly in all dimensions, the search skips no patch, and `nearest_neighbor` is faster.
+    only r + 1 scalar products. Each region has such a box as well.
+
+    For each query, a point in the region with the nearest box is the first candidate. A patch or a region is
+    too far away if its lower bound exceeds the distance to the first candidate. The queries are divided into
+    patches, too. For each patch of queries, the search skips the regions that are too far away from every
+    query. In the other regions, the search skips the patches that are too far away from every query. The
+    bounds allow for rounding errors, so no nearest point is skipped. If the points are spread evenly in all
+    dimensions, the search skips no patch, and `nearest_neighbor` is faster.
 
     **Arguments:**
 
@@ -328,33 +348,45 @@ def nearest_neighbor_in_patches(
     return found
 
 
+class SearchedNumbers(NamedTuple):
+    """The numbers of regions and patches of the database that a search in patches did not skip.
+
+    **Attributes:**
+
+    - `regions`, `patches`: one number for each of the p patches of queries, (p,).
+    """
+
+    regions: Int32[Array, " p"]
+    patches: Int32[Array, " p"]
+
+
 def search_in_patches(
     queries: Float[Array, "m d"],
     database: Float[Array, "n d"],
     query_patches: Patches,
     database_patches: Patches,
-) -> tuple[Int32[Array, " m"], Int32[Array, " p"]]:
-    """Return the result of `nearest_neighbor_in_patches` (m,), and the numbers of searched patches (p,).
-
-    For each of the p patches of queries, the second array contains the number of database patches that were
-    searched.
-    """
+) -> tuple[Int32[Array, " m"], SearchedNumbers]:
+    """Return the result of `nearest_neighbor_in_patches` (m,), and the `SearchedNumbers`."""
     queries, database = lax.stop_gradient((queries, database))  # indices have no derivatives
-    boxes = _boxes(database, database_patches)
-    tables = _bound_tables(boxes)
+    regions, patches = _boxes(database, database_patches)
     vertices = database_patches.rows.reshape(-1)
 
-    def search(patch: tuple[Array, Array]) -> tuple[Int32[Array, " block"], Int32[Array, ""]]:
+    def search(patch: tuple[Array, Array]) -> tuple[Int32[Array, " block"], SearchedNumbers]:
         block, counts = queries[patch[0]], patch[1]
-        squared, bounds, along = _bounds(tables, block, boxes.counts)
-        reach = _distance_to_promising_patch(boxes, block, squared, along) * (1 + tables.precision)
-        needed = jnp.any((bounds <= reach[None, :]) & counts[None, :], axis=1)
-        rows, masked = _two_best_rows(boxes, block, needed)
-        points = boxes.points.reshape(-1, boxes.points.shape[2])[rows]
-        number = jnp.sum(needed, dtype=jnp.int32)
-        return _nearest(block, points, vertices[rows], masked, database.shape[0]), number
+        squared, bounds = _bounds(regions, block)
+        in_region = _nearest_center(patches, block, _position_of_minimum(squared))
+        reach = _distance_to_candidate(patches, block, in_region)
+        near = _within(bounds, reach, counts)
+        nearest, bounds = _bounds_in_regions(patches, block, near)
+        reach = jnp.minimum(reach, _distance_to_candidate(patches, block, nearest))
+        needed = _within(bounds, reach, counts)
+        rows, masked = _two_best_rows(patches, block, needed)
+        points = patches.points.reshape(-1, block.shape[1])[rows]
+        numbers = (jnp.sum(selected, dtype=jnp.int32) for selected in (near, needed))
+        return _nearest(block, points, vertices[rows], masked, database.shape[0]), SearchedNumbers(*numbers)
 
-    found, numbers = lax.map(search, (query_patches.rows, query_patches.mask))
+    blocks = [field.reshape(-1, field.shape[2]) for field in (query_patches.rows, query_patches.mask)]
+    found, numbers = lax.map(search, tuple(blocks))
     # The indices of padding and of masked queries are set out of range, so the scatter operation ignores
     # them.
     everywhere = jnp.zeros(queries.shape[0], jnp.int32)
@@ -381,112 +413,220 @@ def nearest_vertices(
 
 
 class _Boxes(NamedTuple):
-    """The bounding boxes of all patches.
+    """The bounding boxes of several groups of points.
 
-    The box of a patch has orthonormal `axes` through the `center` of the patch. No point of the patch is
-    farther than `radius` from the box. `local` contains the coordinates of the points along the axes. `low`
-    and `high` are the smallest and the largest of these coordinates along each axis. `counts` is a
-    Boolean array, which is False for patches without points.
+    The box of a group has r orthonormal axes through the centre of the group. No point of the group is
+    farther than `radius` from the box.
+
+    **Attributes:**
+
+    - `directions`: (r + 1, b, d), the first axes of all b groups, then the second axes of all groups, and so
+      on. The last entry contains the centres of the groups. With this order, one matrix product gives all
+      bounds.
+    - `offsets`: (r, b), the coordinates of the centres along the axes.
+    - `center_norms`: (b,), the squared norms of the centres; infinite for groups without points.
+    - `low`, `high`: (r, b), the smallest and the largest coordinate of a point along each axis, relative to
+      the centre.
+    - `radius`: (b,).
     """
 
-    points: Float[Array, "p s d"]
-    half_norms: Float[Array, "p s"]
-    center: Float[Array, "p d"]
-    axes: Float[Array, "p r d"]
-    local: Float[Array, "p s r"]
-    low: Float[Array, "p r"]
-    high: Float[Array, "p r"]
-    radius: Float[Array, " p"]
-    counts: Bool[Array, " p"]
+    directions: Float[Array, "r+1 b d"]
+    offsets: Float[Array, "r b"]
+    center_norms: Float[Array, " b"]
+    low: Float[Array, "r b"]
+    high: Float[Array, "r b"]
+    radius: Float[Array, " b"]
 
 
-def _boxes(database: Float[Array, "n d"], patches: Patches) -> _Boxes:
-    """Return the boxes of all patches of a database."""
-    points = database[patches.rows]
-    half_norms = jnp.where(patches.mask, 0.5 * jnp.sum(points**2, axis=2), jnp.inf)
-    center, deviations = _centered(points, patches.mask)
-    axes = _orthonormal(product(patches.variations, deviations))
+class _PatchBoxes(NamedTuple):
+    """The points and the bounding boxes of the c patches of each of g regions.
+
+    **Attributes:**
+
+    - `points`: (g, c, s, d), the points.
+    - `half_norms`: (g, c, s), half of the squared norms of the points; infinite for masked points.
+    - `local`: (g, c, s, r), the coordinates of the points along the axes of their box, relative to its
+      centre.
+    - `boxes`: the `_Boxes`, each field with an additional first axis for the regions.
+    """
+
+    points: Float[Array, "g c s d"]
+    half_norms: Float[Array, "g c s"]
+    local: Float[Array, "g c s r"]
+    boxes: _Boxes
+
+
+def _boxes(database: Float[Array, "n d"], patches: Patches) -> tuple[_Boxes, _PatchBoxes]:
+    """Return the boxes of all regions and of all patches of a database."""
+
+    def of_region(one: Patches) -> tuple[_Boxes, _PatchBoxes]:
+        points = database[one.rows]
+        half_norms = jnp.where(one.mask, 0.5 * jnp.sum(points**2, axis=2), jnp.inf)
+        centers, deviations = _centered(points, one.mask)
+        boxes, local = _bounding_boxes(centers, product(one.variations, deviations), points, one.mask)
+        (center,), around = _centered(centers[None], jnp.any(one.mask, axis=1)[None])
+        everything, mask = points.reshape(1, -1, points.shape[2]), one.mask.reshape(1, -1)
+        region, _ = _bounding_boxes(
+            center[None], product(one.region_variations[None], around), everything, mask
+        )
+        return region, _PatchBoxes(points, half_norms, local, boxes)
+
+    regions, of_patches = lax.map(of_region, patches)
+
+    def along_boxes(field: Array) -> Array:
+        # Each region has one box, so the axis of the regions replaces the axis of the boxes.
+        return jnp.swapaxes(field, 0, min(field.ndim - 1, 2))[0]
+
+    return jax.tree.map(along_boxes, regions), of_patches
+
+
+def _bounding_boxes(
+    center: Float[Array, "b d"],
+    spanning: Float[Array, "b r d"],
+    points: Float[Array, "b s d"],
+    mask: Bool[Array, "b s"],
+) -> tuple[_Boxes, Float[Array, "b s r"]]:
+    """Return the boxes of b groups of points, and the coordinates of the points along the axes.
+
+    **Arguments:**
+
+    - `center`: the centres of the boxes (b, d).
+    - `spanning`: r vectors for each box (b, r, d), which span the same space as the axes.
+    - `points`, `mask`: the points (b, s, d), and a mask that is False for points to ignore.
+    """
+    axes = _orthonormal(spanning)
+    deviations = jnp.where(mask[..., None], points - center[:, None, :], 0)
     local = product(deviations, jnp.swapaxes(axes, 1, 2))
     beside = deviations - product(local, axes)
-    radius = jnp.sqrt(jnp.max(jnp.sum(beside**2, axis=2), axis=1))
-    low, high = jnp.min(local, axis=1), jnp.max(local, axis=1)
-    return _Boxes(points, half_norms, center, axes, local, low, high, radius, jnp.any(patches.mask, axis=1))
+    radius = jnp.sqrt(jnp.max(jnp.sum(beside**2, axis=2), axis=1)) * (1 + _precision(points))
+    boxes = _Boxes(
+        jnp.concatenate([jnp.swapaxes(axes, 0, 1), center[None]]),
+        jnp.sum(axes * center[:, None, :], axis=2).T,
+        jnp.where(jnp.any(mask, axis=1), jnp.sum(center**2, axis=1), jnp.inf),
+        jnp.min(local, axis=1).T,
+        jnp.max(local, axis=1).T,
+        radius,
+    )
+    return boxes, local
 
 
-class _BoundTables(NamedTuple):
-    """The boxes of all patches, arranged so that one matrix product gives all bounds.
+def _precision(points: Float[Array, "... d"]) -> float:
+    """Return an upper limit on the relative rounding error of a bound.
 
-    `axes` contains the first axes of all patches, then the second axes of all patches, and so on. The last
-    rows of `axes` are the centres of the patches.
+    The computation of a bound contains sums of d products and about 12 further operations.
     """
-
-    axes: Float[Array, "rows d"]
-    offsets: Float[Array, "r p"]
-    center_norms: Float[Array, " p"]
-    low: Float[Array, "r p 1"]
-    high: Float[Array, "r p 1"]
-    radius: Float[Array, " p"]
-    precision: np.floating
-
-
-def _bound_tables(boxes: _Boxes) -> _BoundTables:
-    """Return the tables that `_bounds` needs."""
-    patches, rank, d = boxes.axes.shape
-    axes = jnp.concatenate([jnp.swapaxes(boxes.axes, 0, 1).reshape(rank * patches, d), boxes.center])
-    offsets = jnp.sum(boxes.axes * boxes.center[:, None, :], axis=2).T
-    center_norms = jnp.sum(boxes.center**2, axis=1)
-    low, high = boxes.low.T[..., None], boxes.high.T[..., None]
-    # `precision` is an upper limit on the relative rounding error of a bound. The computation of a bound
-    # contains sums of d products and about 12 further operations.
-    precision = 2 * (d + 12) * jnp.finfo(boxes.points.dtype).eps
-    return _BoundTables(axes, offsets, center_norms, low, high, boxes.radius * (1 + precision), precision)
+    return 2 * (points.shape[-1] + 12) * float(jnp.finfo(points.dtype).eps)
 
 
 def _bounds(
-    tables: _BoundTables, block: Float[Array, "block d"], counts: Bool[Array, " p"]
-) -> tuple[Float[Array, "p block"], Float[Array, "p block"], list[Float[Array, "p block"]]]:
-    """Compute lower bounds on the distances from queries to the points of patches.
+    boxes: _Boxes, block: Float[Array, "block d"]
+) -> tuple[Float[Array, "b block"], Float[Array, "b block"]]:
+    """Return the squared distances from queries to boxes, and lower bounds on the distances to the points.
 
-    **Returns:** Two arrays (p, block) and a list. The first array contains the squared distances from the
-    queries to the boxes around the patches. The second array contains lower bounds on the distances from the
-    queries to the points of the patches. Entry i of the list is an array (p, block), which contains
-    coordinate i of each query relative to the centre of each patch.
+    The bounds are lower bounds on the distances from the queries to the points of each group. For groups
+    without points, distances and bounds are infinite.
     """
-    rank, patches = tables.offsets.shape
-    products = product(tables.axes, block.T)
-    norms = tables.center_norms[:, None] + jnp.sum(block**2, axis=1)[None, :]
-    squared = norms - 2 * products[rank * patches :]
-    along = []
+    rank = len(boxes.offsets)
+    products = product(boxes.directions.reshape(-1, block.shape[1]), block.T)
+    products = products.reshape(rank + 1, -1, len(block))
+    norms = boxes.center_norms[:, None] + jnp.sum(block**2, axis=1)[None, :]
+    squared = norms - 2 * products[rank]
     for i in range(rank):  # A loop, because XLA does not vectorise a sum over the axes.
-        along.append(products[i * patches : (i + 1) * patches] - tables.offsets[i, :, None])
-        outside = along[i] - jnp.clip(along[i], tables.low[i], tables.high[i])
-        squared = squared + (outside**2 - along[i] ** 2)
-    squared = jnp.where(counts[:, None], squared, jnp.inf)
-    bounds = jnp.sqrt(jnp.maximum(squared - tables.precision * norms, 0)) - tables.radius[:, None]
-    return squared, bounds, along
+        along = products[i] - boxes.offsets[i, :, None]
+        outside = along - jnp.clip(along, boxes.low[i, :, None], boxes.high[i, :, None])
+        squared = squared + (outside**2 - along**2)
+    precise = jnp.where(jnp.isinf(norms), jnp.inf, squared - _precision(block) * norms)
+    return squared, jnp.sqrt(jnp.maximum(precise, 0)) - boxes.radius[:, None]
 
 
-def _distance_to_promising_patch(
-    boxes: _Boxes,
-    block: Float[Array, "block d"],
-    squared: Float[Array, "p block"],
-    along: list[Float[Array, "p block"]],
+def _within(
+    bounds: Float[Array, "b block"], reach: Float[Array, " block"], counts: Bool[Array, " block"]
+) -> Bool[Array, " b"]:
+    """Return for each group whether the bound of a query that counts is at most the query's reach."""
+    return jnp.any((bounds <= reach[None, :]) & counts[None, :], axis=1)
+
+
+def _position_of_minimum(values: Float[Array, "b block"]) -> Int[Array, " block"]:
+    """Return the position of the smallest value in each column."""
+    # A minimum, followed by a search for its position, takes a third of the time of argmin.
+    is_smallest = values == -_maximum(-values, 0, _PARTS)[None, :]
+    return _maximum(jnp.where(is_smallest, jnp.arange(len(values))[:, None], 0), 0, _PARTS)
+
+
+def _nearest_center(
+    patches: _PatchBoxes, block: Float[Array, "block d"], region: Int[Array, " block"]
+) -> Int[Array, " block"]:
+    """Return, for each query, the patch of a given region whose centre is nearest."""
+    centers, norms = patches.boxes.directions[region, -1], patches.boxes.center_norms[region]
+    products = jnp.sum(centers * block[:, None, :], axis=2)
+    return region * norms.shape[1] + jnp.argmin(norms - 2 * products, axis=1)
+
+
+def _distance_to_candidate(
+    patches: _PatchBoxes, block: Float[Array, "block d"], patch: Int[Array, " block"]
 ) -> Float[Array, " block"]:
-    """Return the distance from each query to one point of the patch with the nearest box.
+    """Return the distance from each query to one point of a given patch, plus the largest rounding error.
 
-    The query and the points of the patch are projected onto the axes of the box. The chosen point has the
+    The query and the points of the patch are projected onto the axes of its box. The chosen point has the
     nearest projection.
     """
-    patches, each = boxes.points.shape[0], jnp.arange(block.shape[0])
-    # A minimum, followed by a search for its position, takes a third of the time of argmin.
-    smallest = -_maximum(-squared, 0, _PARTS)
-    is_smallest = squared == smallest[None, :]
-    promising = _maximum(jnp.where(is_smallest, jnp.arange(patches)[:, None], 0), 0, _PARTS)
-    there = jnp.stack([axis[promising, each] for axis in along], axis=1)
-    beside = jnp.sum((boxes.local[promising] - there[:, None, :]) ** 2, axis=2)
-    beside = jnp.where(jnp.isinf(boxes.half_norms[promising]), jnp.inf, beside)
-    candidates = boxes.points[promising, jnp.argmin(beside, axis=1)]
-    return jnp.sqrt(jnp.sum((block - candidates) ** 2, axis=1))
+    region, there = jnp.divmod(patch, patches.points.shape[1])
+    directions = patches.boxes.directions[region, :, there]
+    along = jnp.sum(directions[:, :-1] * (block - directions[:, -1])[:, None, :], axis=2)
+    beside = jnp.sum((patches.local[region, there] - along[:, None, :]) ** 2, axis=2)
+    beside = jnp.where(jnp.isinf(patches.half_norms[region, there]), jnp.inf, beside)
+    candidates = patches.points[region, there, jnp.argmin(beside, axis=1)]
+    return jnp.sqrt(jnp.sum((block - candidates) ** 2, axis=1)) * (1 + _precision(block))
+
+
+class _InRegions(NamedTuple):
+    """What is known about p patches after some of the regions were considered.
+
+    **Attributes:**
+
+    - `step`: the number of regions that were considered.
+    - `squared`: the squared distance from each query to the nearest box.
+    - `nearest`: the patch with this box.
+    - `bounds`: the lower bounds of `_bounds` for all patches; infinite for the patches of other regions.
+    """
+
+    step: Int32[Array, ""]
+    squared: Float[Array, " block"]
+    nearest: Int32[Array, " block"]
+    bounds: Float[Array, "p block"]
+
+
+def _bounds_in_regions(
+    patches: _PatchBoxes, block: Float[Array, "block d"], near: Bool[Array, " g"]
+) -> tuple[Int32[Array, " block"], Float[Array, "p block"]]:
+    """Return the patch with the nearest box for each query, and the lower bounds of all patches.
+
+    **Arguments:**
+
+    - `patches`: the p patches of g regions.
+    - `block`: the queries.
+    - `near`: a mask of the regions. The patches of other regions are ignored, and their bounds are infinite.
+    """
+    number = jnp.sum(near, dtype=jnp.int32)
+    listed = jnp.nonzero(near, size=len(near), fill_value=0)[0].astype(jnp.int32)
+    each = patches.points.shape[1]
+
+    def look(known: _InRegions) -> _InRegions:
+        region = listed[known.step]
+        squared, bounds = _bounds(jax.tree.map(lambda field: field[region], patches.boxes), block)
+        smallest = jnp.min(squared, axis=0)
+        position = region * each + _position_of_minimum(squared).astype(jnp.int32)
+        return _InRegions(
+            known.step + 1,
+            jnp.minimum(known.squared, smallest),
+            jnp.where(smallest < known.squared, position, known.nearest),
+            lax.dynamic_update_slice(known.bounds, bounds, (region * each, 0)),
+        )
+
+    infinite = jnp.full((len(near) * each, len(block)), jnp.inf, block.dtype)
+    start = _InRegions(jnp.asarray(0, jnp.int32), infinite[0], jnp.zeros(len(block), jnp.int32), infinite)
+    found = lax.while_loop(lambda known: known.step < number, look, start)
+    return found.nearest, found.bounds
 
 
 class _Found(NamedTuple):
@@ -502,7 +642,7 @@ class _Found(NamedTuple):
 
 
 def _two_best_rows(
-    boxes: _Boxes, block: Float[Array, "block d"], needed: Bool[Array, " p"]
+    patches: _PatchBoxes, block: Float[Array, "block d"], needed: Bool[Array, " p"]
 ) -> tuple[Int32[Array, "2 block"], Bool[Array, "2 block"]]:
     """Find, for each query, the two best candidates in the patches that `needed` selects.
 
@@ -512,15 +652,16 @@ def _two_best_rows(
     **Returns:** The indices of the candidates in the flattened array of all patches' points, and a Boolean
     array that is True for masked or missing candidates.
     """
-    patches, size, d = boxes.points.shape
+    *_, size, d = patches.points.shape
+    all_points, all_half_norms = patches.points.reshape(-1, size, d), patches.half_norms.reshape(-1, size)
     each = jnp.arange(block.shape[0])
-    steps = -(-patches // _GROUP)
-    listed = jnp.nonzero(needed, size=steps * _GROUP, fill_value=patches)[0].astype(jnp.int32)
+    steps = -(-len(needed) // _GROUP)
+    listed = jnp.nonzero(needed, size=steps * _GROUP, fill_value=len(needed))[0].astype(jnp.int32)
 
     def look(state: _Found) -> _Found:
         group = lax.dynamic_slice(listed, (state.step * _GROUP,), (_GROUP,))
-        points = boxes.points.at[group].get(mode="fill", fill_value=0).reshape(_GROUP * size, d)
-        half_norms = boxes.half_norms.at[group].get(mode="fill", fill_value=jnp.inf)
+        points = all_points.at[group].get(mode="fill", fill_value=0).reshape(_GROUP * size, d)
+        half_norms = all_half_norms.at[group].get(mode="fill", fill_value=jnp.inf)
         scores = product(points, block.T).reshape(_GROUP, size, -1) - half_norms[..., None]
         merged = jnp.concatenate([state.scores, jnp.max(scores, axis=1)])
         best = _two_best(merged)
