@@ -762,8 +762,8 @@ def throughput(options: argparse.Namespace) -> Iterator[Part]:
     yield (
         "Throughput",
         "Ordered pairs of ten people with about 5000 vertices each. jaxsmw runs in one process, and its "
-        "times include compilation. Each other library runs in ten processes, and its times leave out the start of "
-        "the processes.",
+        "times include compilation. Each other library runs in ten processes, and its times leave out the "
+        "start of the processes.",
         rows,
         {"measured": measured},
     )

@@ -138,8 +138,8 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
     make `decode` faster on large shapes. The same patches can be used for all functional maps between X and
     Y.
 
-    A patch of Y contains more vertices if Y is finer: the patch size grows with the cube root of Y's number of
-    vertices.
+    A patch of Y contains more vertices if Y is finer: the patch size grows with the cube root of Y's number
+    of vertices.
 
     **Arguments:**
 

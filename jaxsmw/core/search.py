@@ -14,7 +14,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32, Shaped
 
@@ -620,7 +619,7 @@ def _bounds_in_regions(
             known.step + 1,
             jnp.minimum(known.squared, smallest),
             jnp.where(smallest < known.squared, position, known.nearest),
-            lax.dynamic_update_slice(known.bounds, bounds, (region * each, 0)),
+            lax.dynamic_update_slice_in_dim(known.bounds, bounds, region * each, axis=0),
         )
 
     infinite = jnp.full((len(near) * each, len(block)), jnp.inf, block.dtype)
