@@ -328,7 +328,7 @@ def geodesic_distances(
             row[:] = search(source, np.arange(len(mesh.vertices)))
         distances[distances > limit] = np.inf
         return distances
-    graph, nodes, _ = _network(mesh, points, np.empty(0, dtype=np.int64))
+    graph, nodes = _network(mesh, points)
     return dijkstra(graph, indices=nodes, limit=limit)[:, : len(mesh.vertices)]
 
 
@@ -379,7 +379,8 @@ def geodesic_distances_between(
 
     if isinstance(starts, SurfacePoints) and isinstance(ends, SurfacePoints):
         distances = _straight_distances(mesh, starts, ends)
-    graph, nodes, targets = _network(mesh, starts, ends)
+    graph, nodes = _network(mesh, starts)
+    arrivals = _arrivals(mesh, ends)
     at_once = max(1, _DISTANCES_AT_ONCE // graph.shape[0])
     pending = np.argsort(nodes, kind="stable")
     for radius in [*(np.sqrt(mesh.area) * np.array(_RADII)), np.inf]:
@@ -388,7 +389,7 @@ def geodesic_distances_between(
             rows = dijkstra(graph, indices=sources[start : start + at_once], limit=radius)
             first, last = np.searchsorted(row, [start, start + at_once])
             pairs = pending[first:last]
-            found = rows[row[first:last] - start, targets[pairs]]
+            found = arrivals.distances(rows, row[first:last] - start, pairs)
             distances[pairs] = np.minimum(distances[pairs], found)
         pending = pending[distances[pending] > radius]
     return distances
@@ -430,40 +431,72 @@ def _straight_distances(
 
 
 def _network(
-    mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints, ends: Int64[np.ndarray, " q"] | SurfacePoints
-) -> tuple[csr_array, Int64[np.ndarray, " p"], Int64[np.ndarray, " q"]]:
+    mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints
+) -> tuple[csr_array, Int64[np.ndarray, " p"]]:
     """Add surface points to the geodesic graph as nodes.
 
-    The added lines are directed: from `points` to vertices, and from vertices to `ends`. Therefore no path
-    leads through an added node, and a distance does not depend on the other added points.
+    The added lines are directed from the points to vertices. Therefore no path leads through an added node,
+    and a distance does not depend on the other added points.
 
-    **Returns:** The graph, the nodes of the points, and the nodes of the ends.
+    **Returns:** The graph, and the nodes of the points.
     """
     graph, size = geodesic_graph(mesh), len(mesh.vertices)
-    if not isinstance(points, SurfacePoints) and not isinstance(ends, SurfacePoints):
-        return graph, points, ends
-    coordinates, sides = graph.tocoo(), _sides(mesh)
-    lines = [_Lines(coordinates.row, coordinates.col, coordinates.data)]
+    if not isinstance(points, SurfacePoints):
+        return graph, points
+    coordinates = graph.tocoo()
+    number, vertices, lengths = _lines_from_points(mesh, points)
+    lines = _Lines(coordinates.row, coordinates.col, coordinates.data), _Lines(size + number, vertices, lengths)
+    return _shortest(lines, size + len(points)), size + np.arange(len(points))
 
-    def lines_from(added: SurfacePoints) -> _Lines:
-        corners = mesh.faces[added.faces]
-        offsets = mesh.vertices[corners] - added.positions(mesh)[:, None]
-        number = np.repeat(np.arange(len(added)), 3)
-        near = _Lines(number, corners.ravel(), np.linalg.norm(offsets, axis=2).ravel())
-        far = _lines(sides, *_exits(sides, added), _DEPTH)
-        return _Lines(*(np.concatenate(part) for part in zip(near, far, strict=True)))
 
-    if isinstance(points, SurfacePoints):
-        number, vertices, lengths = lines_from(points)
-        lines.append(_Lines(size + number, vertices, lengths))
-        points = size + np.arange(len(points))
-        size += len(points)
-    if isinstance(ends, SurfacePoints):
-        number, vertices, lengths = lines_from(ends)
-        lines.append(_Lines(vertices, size + number, lengths))
-        ends = size + np.arange(len(ends))
-        size += len(ends)
-    return _shortest(lines, size), points, ends
+def _lines_from_points(mesh: Mesh, points: SurfacePoints) -> _Lines:
+    """Return straight lines from points on faces to vertices. The origins are the numbers of the points."""
+    corners, sides = mesh.faces[points.faces], _sides(mesh)
+    offsets = mesh.vertices[corners] - points.positions(mesh)[:, None]
+    number = np.repeat(np.arange(len(points)), 3)
+    near = _Lines(number, corners.ravel(), np.linalg.norm(offsets, axis=2).ravel())
+    far = _lines(sides, *_exits(sides, points), _DEPTH)
+    return _Lines(*(np.concatenate(part) for part in zip(near, far, strict=True)))
+
+
+class _Arrivals(NamedTuple):
+    """The last lines of the paths that end at given points.
+
+    A path ends at point i with one of the lines `first[i]` to `first[i + 1] - 1`. Line l leads from the
+    vertex `vertices[l]` to the point, and has the length `lengths[l]`.
+    """
+
+    first: Int64[np.ndarray, " p1"]
+    vertices: Int64[np.ndarray, " l"]
+    lengths: Float64[np.ndarray, " l"]
+
+    def distances(
+        self,
+        to_vertices: Float64[np.ndarray, "s n"],
+        sources: Int64[np.ndarray, " q"],
+        points: Int64[np.ndarray, " q"],
+    ) -> Float64[np.ndarray, " q"]:
+        """Return the distances from `sources[i]` to `points[i]` (q,).
+
+        `to_vertices` contains the distances from each source to all vertices (s, n).
+        """
+        counts = self.first[points + 1] - self.first[points]
+        pair, line = _ranges(self.first[points], counts)
+        lengths = to_vertices[sources[pair], self.vertices[line]] + self.lengths[line]
+        return np.minimum.reduceat(lengths, np.cumsum(counts) - counts)
+
+
+def _arrivals(mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints) -> _Arrivals:
+    """Return the last lines of the paths that end at vertices or at points on faces.
+
+    A path to a vertex ends with a line of length zero from the vertex to itself.
+    """
+    if not isinstance(points, SurfacePoints):
+        return _Arrivals(np.arange(len(points) + 1), points, np.zeros(len(points)))
+    number, vertices, lengths = _lines_from_points(mesh, points)
+    order = np.argsort(number, kind="stable")
+    first = np.searchsorted(number[order], np.arange(len(points) + 1))
+    return _Arrivals(first, vertices[order], lengths[order])
 
 
 def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
