@@ -445,7 +445,10 @@ def _network(
         return graph, points
     coordinates = graph.tocoo()
     number, vertices, lengths = _lines_from_points(mesh, points)
-    lines = _Lines(coordinates.row, coordinates.col, coordinates.data), _Lines(size + number, vertices, lengths)
+    lines = (
+        _Lines(coordinates.row, coordinates.col, coordinates.data),
+        _Lines(size + number, vertices, lengths),
+    )
     return _shortest(lines, size + len(points)), size + np.arange(len(points))
 
 

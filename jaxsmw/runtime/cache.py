@@ -24,6 +24,7 @@ import platformdirs
 
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
+from jaxsmw.runtime.program_checksums import CHECKSUMS, remove_damaged_programs
 
 # Every key is a hash that includes this number. Increment this number when a change of the code changes the
 # results for the same inputs.
@@ -34,7 +35,7 @@ _FORMAT = 4
 _OWN_FILES = re.compile(r"(?:([a-z-]+)-[0-9a-f]{64}|\.[0-9a-f]{32})\.npz")
 # JAX stores compiled programs in one subdirectory for each type of processor.
 _PROGRAMS = re.compile(r"programs-[0-9a-f]{16}")
-_PROGRAM_FILES = ("-cache", "-atime")
+_PROGRAM_FILES = ("-cache", "-atime", CHECKSUMS)
 
 
 def cached(
@@ -155,7 +156,7 @@ def recomputing() -> Iterator[None]:
 
 
 def cache_compiled_programs() -> None:
-    """Make JAX store compiled programs on disk for later processes.
+    """Make JAX store compiled programs on disk for later processes, and remove damaged programs.
 
     The programs are stored in the directory of the cache and take at most 0.25 GiB. This function sets
     environment variables of JAX, so it must run before JAX is imported. If the user has set one of these
@@ -189,6 +190,7 @@ def cache_compiled_programs() -> None:
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
     if settings.keys().isdisjoint(os.environ):
+        remove_damaged_programs(directory)
         os.environ.update(settings)
 
 
