@@ -18,8 +18,9 @@
 - `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
   are included if they are installed (`jaxsmw[peers]`).
 - `scale`: the time from two mesh files of up to a million vertices to the refined map. The script measures
-  each size in a new process. The table states times, peak memory and errors. Power laws in the number of
-  vertices are fitted to the times and the memory. The table states the exponents.
+  each size twice, each time in a new process: cold, with an empty cache, and warm, with the cache of the
+  first process. The table states times, peak memory and errors. Power laws in the number of vertices are
+  fitted to the times and the memory. The table states the exponents.
 
 The candidates of a comparison take turns in one process, so that other load on the machine affects all
 candidates equally. Each ratio is computed from median times. The shapes are procedural creatures. To obtain
@@ -82,6 +83,7 @@ from jaxsmw.presets import PresetName
 from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
 from jaxsmw.report.tables import markdown
+from jaxsmw.runtime.cache import cache_compiled_programs
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.files import make_directory
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
@@ -443,7 +445,7 @@ def people(options: argparse.Namespace, number: int) -> list[tuple[Mesh, Mesh]]:
     if options.data is None:
         pairs = (creature_pair(vertices=5000, seed=seed) for seed in range(number))
         return [(pair.source, pair.target) for pair in pairs]
-    names = [(f"tr_reg_{80 + i:03}", f"tr_reg_{90 + i:03}") for i in range(number)]
+    names = [(f"tr_reg_{i:03}", f"tr_reg_{10 + i:03}") for i in range(number)]
     return [tuple(read_mesh(options.data / "off" / f"{name}.off") for name in pair) for pair in names]
 
 
@@ -588,33 +590,57 @@ def peak_memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
-def matched_from_files(
-    files: list[str], preset: PresetName
-) -> tuple[dict[str, float], float, list[np.ndarray]]:
-    """Match two mesh files, and measure the time of each step and the peak memory of the process.
+class FromFiles(NamedTuple):
+    """The measurements of a match from two mesh files to the map.
 
-    **Returns:** A tuple of three items. The first item is a dictionary from the name of each step to the
-    seconds of the step. The second item is the peak memory in GiB. The third item is a list of the initial
-    map and the refined map.
+    **Attributes:**
+
+    - `seconds`: a dictionary from the name of each step to its wall time in seconds.
+    - `cpu`: the CPU time in seconds.
+    - `peak`: the peak memory of the process in GiB.
+    - `maps`: the initial map and the refined map.
     """
-    start = time.perf_counter()
+
+    seconds: dict[str, float]
+    cpu: float
+    peak: float
+    maps: tuple[np.ndarray, np.ndarray]
+
+
+def matched_from_files(files: list[str], preset: PresetName) -> FromFiles:
+    """Match two mesh files, and measure the time of each step and the peak memory of the process."""
+    start, start_cpu = time.perf_counter(), time.process_time()
     meshes = [read_mesh(file) for file in files]
     seconds = {"reading": time.perf_counter() - start}
     result = match(*meshes, preset=preset)
     other = time.perf_counter() - start - sum(seconds.values()) - sum(result.seconds.values())
     seconds |= {**result.seconds, "other": other}
-    return seconds, peak_memory(), [result.initial_map, result.pointwise_map]
+    cpu = time.process_time() - start_cpu
+    return FromFiles(seconds, cpu, peak_memory(), (result.initial_map, result.pointwise_map))
+
+
+def in_new_process(cache: Path, function: Callable[..., FromFiles], *arguments: Any) -> FromFiles:
+    """Call a function in a new process, which uses the given directory as its cache."""
+    before = dict(os.environ)
+    os.environ["JAXSMW_CACHE"] = str(cache)
+    cache_compiled_programs()  # sets variables that the new process inherits
+    try:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
+            return executor.submit(function, *arguments).result()
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def scale(options: argparse.Namespace) -> Iterator[Part]:
     """For each of the presets `paper` and `accurate`, yield times and memory for shapes of several sizes."""
     large = () if options.quick else LARGE
     yield scaled(options, "paper", (10_000, 30_000, *large))
-    yield scaled(options, "accurate", (10_000, 30_000, *large[:2]))
+    yield scaled(options, "accurate", (10_000, 30_000, *large))
 
 
 def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]) -> Part:
-    """Measure one preset at several sizes, each in a new process."""
+    """Measure one preset at several sizes, cold and warm."""
     truth = pair_with_truth(options)
     rows, measured = [], []
     for size in sizes:
@@ -623,30 +649,51 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
             files = [str(Path(directory) / f"{side}.ply") for side in range(2)]
             for file, mesh in zip(files, meshes, strict=True):
                 write_mesh(Path(file), mesh)
-            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
-                seconds, peak, maps = executor.submit(matched_from_files, files, preset).result()
-        errors = [truth.error(pointwise_map, meshes[1]) for pointwise_map in maps]
-        measured.append({"vertices": size, "seconds": seconds, "peak_gib": peak, "errors": errors})
+            cold, warm = (
+                in_new_process(Path(directory) / "cache", matched_from_files, files, preset) for _ in range(2)
+            )
+        errors = [truth.error(pointwise_map, meshes[1]) for pointwise_map in cold.maps]
+        totals = {
+            "cold": sum(cold.seconds.values()),
+            "cold, CPU": cold.cpu,
+            "warm": sum(warm.seconds.values()),
+            "warm, CPU": warm.cpu,
+        }
+        measured.append(
+            {
+                "vertices": size,
+                "seconds": cold.seconds,
+                "totals": totals,
+                "peak_gib": cold.peak,
+                "errors": errors,
+            }
+        )
         rows.append(
             [str(size)]
-            + [f"{taken:.1f}" for taken in seconds.values()]
-            + [f"{sum(seconds.values()):.1f}", f"{peak:.2f}", *(f"{e:.1f}" for e in errors)]
+            + [f"{taken:.1f}" for taken in (*cold.seconds.values(), *totals.values())]
+            + [f"{cold.peak:.2f}", *(f"{e:.1f}" for e in errors)]
         )
-    columns = [*measured[0]["seconds"], "in all, seconds", "peak GiB", "initial error", "refined error"]
+    names = [*measured[0]["seconds"]], [*measured[0]["totals"]]
+    columns = [*names[0], *names[1], "peak GiB", "initial error", "refined error"]
 
     def exponent(values: list[float]) -> str:
         # The fit leaves out the smallest size, because constant costs dominate the time at this size.
         return f"{np.polyfit(np.log([m['vertices'] for m in measured[1:]]), np.log(values[1:]), 1)[0]:.2f}"
 
     if len(measured) > 2:
-        stages = [exponent([m["seconds"][name] for m in measured]) for name in measured[0]["seconds"]]
-        total = exponent([sum(m["seconds"].values()) for m in measured])
+        exponents = [
+            exponent([m[kind][name] for m in measured])
+            for kind, each in zip(("seconds", "totals"), names, strict=True)
+            for name in each
+        ]
         memory = exponent([m["peak_gib"] for m in measured])
-        rows.append(["exponent", *stages, total, memory, "", ""])
+        rows.append(["exponent", *exponents, memory, "", ""])
     return (
         f"Scale, {preset}",
-        f"Times of the preset {preset} from two PLY files to the map, including compilation. The peak memory "
-        "is the memory of the whole process. The errors are mean geodesic errors x10^-3.",
+        f"Times of the preset {preset} from two PLY files to the map in seconds, without the start of "
+        "Python. Steps are measured cold, with an empty cache. A warm process uses the cache of the cold "
+        "process. The peak memory is the memory of the whole cold process. Errors are mean geodesic errors "
+        "x10^-3.",
         [["vertices", *columns], *rows],
         {"measured": measured},
     )
@@ -717,7 +764,7 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
 
 
 def throughput(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the pairs per minute and the errors of several libraries, for pairs of ten people.
+    """Yield the pairs per minute and the errors of several libraries, for pairs of ten meshes of people.
 
     jaxsmw matches all pairs in one process, with an empty cache at first. Each other library matches some of
     the pairs in ten processes, each with one BLAS thread.
@@ -725,7 +772,7 @@ def throughput(options: argparse.Namespace) -> Iterator[Part]:
     if options.data is None:
         print("\nthroughput: left out, because it needs the option --data.")
         return
-    names = [f"tr_reg_{number:03}" for number in range(80, 90)]
+    names = [f"tr_reg_{number:03}" for number in range(0, 70, 7)]
     pairs = list(permutations(names, 2))
     files = {name: str(options.data / "off" / f"{name}.off") for name in names}
     measured: dict[str, dict[str, Any]] = {}
@@ -761,9 +808,9 @@ def throughput(options: argparse.Namespace) -> Iterator[Part]:
         rows.append([name, str(of["pairs"]), f"{of['seconds']:.0f}", f"{rate:.1f}", f"{error:.1f}"])
     yield (
         "Throughput",
-        "Ordered pairs of ten people with about 5000 vertices each. jaxsmw runs in one process, and its "
-        "times include compilation. Each other library runs in ten processes, and its times leave out the "
-        "start of the processes.",
+        "Ordered pairs of ten meshes of people, each with about 5000 vertices. jaxsmw runs in one process, "
+        "and its times include compilation. Each other library runs in ten processes, and its times leave "
+        "out the start of the processes.",
         rows,
         {"measured": measured},
     )
@@ -887,7 +934,9 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
                 curves.setdefault(name, []).append((int(np.max(measured["vertices"])), seconds))
     for measured in numbers["scale"][0]["measured"] if numbers.get("scale") else ():
         curves = panels.setdefault("From files to map", {})
-        for name, value in {**measured["seconds"], "peak memory, GiB": measured["peak_gib"]}.items():
+        totals = {f"in all, {name}": value for name, value in measured["totals"].items()}
+        of_steps = {**measured["seconds"], **totals, "peak memory, GiB": measured["peak_gib"]}
+        for name, value in of_steps.items():
             curves.setdefault(name, []).append((measured["vertices"], value))
     if not panels:
         return
@@ -897,9 +946,9 @@ def draw(numbers: dict[str, Any], file: Path) -> None:
     for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
         colors: dict[str, str] = {}
         for name, points in curves.items():
-            # A dotted line shows a run without our compiler options. The solid line of the same colour shows
-            # the run with these options.
-            usual = name.removesuffix(XLA_DEFAULTS)
+            # A dotted line shows a run without our compiler options, or CPU times. The solid line of the same
+            # colour shows the run with these options, or wall times.
+            usual = name.removesuffix(XLA_DEFAULTS).removesuffix(", CPU")
             color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
             style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}
             axis.loglog(*zip(*points, strict=True), label=name, **style)
