@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.runtime.threads import side_by_side
 
 _Vector = tuple[float, float, float]
 
@@ -648,15 +647,9 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     source_pose, *others = _KINDS[kind][1]
     target_pose = str(random.choice(others))
     body = _grown(kind, seed)
+    rest, faces = _triangulated(body, vertices, _random(seed, "source"))
     target_count = round(vertices * random.uniform(0.95, 0.99))
-
-    def triangulated(side: tuple[str, int]) -> tuple[np.ndarray, np.ndarray]:
-        purpose, count = side
-        return _triangulated(body, count, _random(seed, purpose))
-
-    (rest, faces), (target_rest, target_faces) = side_by_side(
-        triangulated, ("source", vertices), ("target", target_count)
-    )
+    target_rest, target_faces = _triangulated(body, target_count, _random(seed, "target"))
     _, nearest, points = igl.point_mesh_squared_distance(rest, target_rest, target_faces)
     corners = np.ascontiguousarray(target_rest[target_faces[nearest]].transpose(1, 0, 2))
     weights = np.maximum(igl.barycentric_coordinates(points, *corners), 0)
