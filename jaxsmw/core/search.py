@@ -327,12 +327,13 @@ def nearest_neighbor_in_patches(
     gives a lower bound on the distances from a query to the points of the patch. Computing this bound takes
     only r + 1 scalar products. Each region has such a box as well.
 
-    For each query, a point in the region with the nearest box is the first candidate. A patch or a region is
-    too far away if its lower bound exceeds the distance to the first candidate. The queries are divided into
-    patches, too. For each patch of queries, the search skips the regions that are too far away from every
-    query. In the other regions, the search skips the patches that are too far away from every query. The
-    bounds allow for rounding errors, so no nearest point is skipped. If the points are spread evenly in all
-    dimensions, the search skips no patch, and `nearest_neighbor` is faster.
+    For each query, a point in the region with the nearest box is the first candidate. A region is too far
+    away if its lower bound exceeds the distance to this candidate. In the other regions, a point of the patch
+    with the nearest box is the second candidate. A patch is too far away if its lower bound exceeds the
+    distance to the nearer candidate. The queries are divided into patches, too. For each patch of queries,
+    the search skips the regions and the patches that are too far away from every query. The bounds allow for
+    rounding errors, so no nearest point is skipped. If the points are spread evenly in all dimensions, the
+    search skips no patch, and `nearest_neighbor` is faster.
 
     **Arguments:**
 
