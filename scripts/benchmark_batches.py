@@ -1,17 +1,23 @@
 """Measures how many pairs per second a device refines, one by one and in batches.
 
-    python scripts/benchmark_batches.py [--vertices N] [--eigenvectors K] [--batch-sizes B ...] [--quick]
+    python scripts/benchmark_batches.py [--quick] [--data FAUST_R] [--output DIR]
 
-Each candidate refines the same random pairs in float32, with 3 iterations per pair. The following candidates
-take turns in one process:
+- `paper`: three iterations for random pairs in float32. The candidates are a Python loop over `refine`,
+  `jax.lax.map`, `jax.vmap` with several batch sizes, and `jaxsmw.refine_pairs`. The time of `refine_pairs`
+  includes the transfer of initial maps and results.
+- `accurate`: all stages of the preset `"accurate"` in float32, without repair. The candidates are several
+  batch sizes of `refine_batch`, which includes the transfer of initial maps and results. The last row is
+  `jaxsmw.match_pairs`, which also computes initial maps and scores, and repairs maps, on the host.
 
-- a Python loop over `refine`;
-- `jax.lax.map`;
-- `jax.vmap` with several batch sizes;
-- `jaxsmw.refine_pairs`. The time of `refine_pairs` includes the transfer of initial maps and results.
+The candidates of a table take turns in one process. The lower bound is the time of all matrix products of a
+program, computed in full float32 precision and in batches. The script finds these products in the traced
+program. For `paper`, the table also states the temporary memory of each compiled program, which excludes the
+program's arguments.
 
-The lower bound is the time of the matrix products of all iterations, computed in full float32 precision. The
-table also states the temporary memory of each compiled program. This memory excludes the program's arguments.
+On an accelerator, the script also refines pairs of shapes on the CPU, and states the share of vertices at
+which both devices give equal matches. The shapes are creatures or, with `--data`, people of the remeshed
+FAUST set. With `--data`, the script also states the errors of both devices' maps. The script writes the
+tables to `batches.md` and all numbers to `batches.json` in DIR.
 """
 
 from __future__ import annotations
@@ -19,22 +25,117 @@ from __future__ import annotations
 import argparse
 import json
 import os
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from itertools import permutations
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark_speed import ITERATIONS, medians
+from benchmark_speed import ITERATIONS, Part, medians, truth_of
 from jax import lax
+from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Int
 
+from jaxsmw.collection.pairs import match_pairs
+from jaxsmw.collection.shapes import prepare_pair, prepare_shapes
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.geometry.creature import CREATURES, creature
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.preparation import PreparedPair
+from jaxsmw.presets import PRESETS, PresetName
+from jaxsmw.repair.batches import refine_batch
 from jaxsmw.report.summary import provenance
+from jaxsmw.report.tables import markdown
 from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
+from jaxsmw.runtime.files import make_directory
 
 Pair = tuple[Spectrum, Spectrum, Int[Array, " m"]]
+
+# The floor is measured in batches of at most this number of products.
+PRODUCTS = 16
+# Products with less than this share of all operations are left out of the floor.
+NEGLIGIBLE = 1e-3
+# The number of shapes, and the number of pairs that the CPU refines for comparison.
+SHAPES, COMPARED = 10, 20
+
+
+class MatrixProduct(NamedTuple):
+    """The shapes of the factors of a `jax.lax.dot_general`, and its dimension numbers."""
+
+    left: tuple[int, ...]
+    right: tuple[int, ...]
+    dimensions: Any
+
+    @property
+    def operations(self) -> int:
+        """The number of multiplications."""
+        (contracted, _), (batch, _) = self.dimensions
+        shared = np.prod([self.left[axis] for axis in (*contracted, *batch)])
+        return int(np.prod(self.left) * np.prod(self.right) // shared)
+
+
+def matrix_products(function: Callable, *arguments: Any) -> Counter[MatrixProduct]:
+    """Return how often a function computes each matrix product.
+
+    An operation in a loop with an unknown number of steps is counted once.
+    """
+    found: Counter[MatrixProduct] = Counter()
+
+    def add(jaxpr: Jaxpr, times: int) -> None:
+        for equation in jaxpr.eqns:
+            if equation.primitive.name == "dot_general":
+                left, right = (variable.aval.shape for variable in equation.invars)
+                found[MatrixProduct(left, right, equation.params["dimension_numbers"])] += times
+            inner = times * equation.params.get("length", 1) if equation.primitive.name == "scan" else times
+            for value in jax.tree.leaves(
+                list(equation.params.values()), is_leaf=lambda leaf: isinstance(leaf, ClosedJaxpr | Jaxpr)
+            ):
+                if isinstance(value, ClosedJaxpr | Jaxpr):
+                    add(value.jaxpr if isinstance(value, ClosedJaxpr) else value, inner)
+
+    add(jax.make_jaxpr(function)(*arguments).jaxpr, 1)
+    return found
+
+
+def time_of_products(products: Counter[MatrixProduct], count: int, repeats: int) -> float:
+    """Return the seconds that the given products take for `count` pairs, in full float32 precision.
+
+    Only the maximum of each row of a product is kept.
+    """
+    size = min(PRODUCTS, count)
+    everything = sum(one.operations * times for one, times in products.items())
+    generator = np.random.default_rng(0)
+    candidates, times_of = {}, {}
+    for number, (one, times) in enumerate(products.items()):
+        if one.operations * times < NEGLIGIBLE * everything:
+            continue
+        factors = [
+            jnp.asarray(generator.standard_normal((size, *shape)), jnp.float32)
+            for shape in (one.left, one.right)
+        ]
+
+        def maximum(left: Array, right: Array, dimensions: Any = one.dimensions) -> Array:
+            return jnp.max(lax.dot_general(left, right, dimensions, precision=lax.Precision.HIGHEST), axis=-1)
+
+        each = jax.jit(jax.vmap(maximum))
+        candidates[str(number)], times_of[str(number)] = partial(each, *factors), times
+    measured = medians(candidates, repeats)
+    return sum(seconds * times_of[name] for name, seconds in measured.items()) * count / size
+
+
+def rates(seconds: dict[str, float], count: int, floor: float) -> list[list[str]]:
+    """Return a table with the pairs per second of each candidate, and its time divided by the floor."""
+    rows = [
+        [name, f"{count / median:.3g}", f"{median / floor:.2f}"]
+        for name, median in {"products alone": floor, **seconds}.items()
+    ]
+    return [["", "pairs per second", "time, products = 1"], *rows]
 
 
 def refine_one(pair: Pair) -> Refinement:
@@ -60,22 +161,8 @@ def random_spectrum(generator: np.random.Generator, n: int, k: int) -> Spectrum:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
-    parser.add_argument("--vertices", type=int, default=5000, help="per shape (default: %(default)s)")
-    parser.add_argument("--eigenvectors", type=int, default=100, help="per shape (default: %(default)s)")
-    parser.add_argument("--pairs", type=int, default=64, help="(default: %(default)s)")
-    parser.add_argument("--batch-sizes", type=int, nargs="+", default=[2, 4, 8, 16, 32, 64])
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--quick", action="store_true", help="refine 8 pairs once, in batches of 2 and 8")
-    options = parser.parse_args()
-    if options.quick:
-        options.pairs, options.batch_sizes, options.repeats = 8, [2, 8], 1
-    os.environ["JAXSMW_CACHE"] = "off"
-    print(json.dumps(provenance()))
-
+def paper(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the pairs per second of several ways to refine random pairs with the preset `"paper"`."""
     n, k, count = options.vertices, options.eigenvectors, options.pairs
     generator = np.random.default_rng(0)
     shapes = [random_spectrum(generator, n, k) for _ in range(8)]
@@ -83,23 +170,10 @@ def main() -> None:
     initial_maps = [jnp.asarray(generator.integers(0, n, n), jnp.int32) for _ in pairs]
     x, y = (stack([shapes[pair[side]] for pair in pairs]) for side in (0, 1))
     batch = x, y, jnp.stack(initial_maps)
-
-    # `products` computes the matrix products of one iteration for all pairs. Only the maximum of each column
-    # is kept.
-    @jax.jit
-    def products(a: Array, b: Array) -> Array:
-        return lax.map(
-            lambda pair: jnp.max(jnp.matmul(pair[0], pair[1].T, precision=lax.Precision.HIGHEST), axis=0),
-            (a, b),
-            batch_size=min(4, count),
-        )
-
     separate = [(shapes[i], shapes[j], T) for (i, j), T in zip(pairs, initial_maps, strict=True)]
-
     programs = {"lax.map": jax.jit(one_by_one)}
     for size in options.batch_sizes:
-        if size <= count:
-            programs[f"vmap of {size}"] = jax.jit(partial(in_batches, size=size))
+        programs[f"vmap of {size}"] = jax.jit(partial(in_batches, size=size))
     memory = {
         name: program.lower(batch).compile().memory_analysis().temp_size_in_bytes
         for name, program in programs.items()
@@ -110,7 +184,6 @@ def main() -> None:
 
     seconds = medians(
         {
-            "products alone": lambda: [products(x.eigenvectors, y.eigenvectors) for _ in range(ITERATIONS)],
             "loop": lambda: [refine_one(pair) for pair in separate],
             **{name: run(program) for name, program in programs.items()},
             "refine_pairs": lambda: [
@@ -120,12 +193,172 @@ def main() -> None:
         },
         options.repeats,
     )
-    print(f"\n{count} pairs of shapes with {n} vertices each, k = {k}, {ITERATIONS} iterations, float32")
-    print(f"estimated memory of one pair with its arguments: {bytes_per_pair(n, n, k) / 2**20:.0f} MiB\n")
-    print("| | pairs per second | time, products = 1 | program's memory, MiB |\n|---|---|---|---|")
-    for name, median in seconds.items():
-        taken = f"{memory[name] / 2**20:.0f}" if name in memory else "—"
-        print(f"| {name} | {count / median:.1f} | {median / seconds['products alone']:.2f} | {taken} |")
+    floor = time_of_products(matrix_products(refine_one, separate[0]), count, options.repeats)
+    header, *rows = rates(seconds, count, floor)
+    table = [[*header, "program's memory, MiB"]]
+    for name, *row in rows:
+        table.append([name, *row, f"{memory[name] / 2**20:.0f}" if name in memory else "—"])
+    yield (
+        "Preset paper",
+        f"{count} pairs of shapes with {n} vertices each, k = {k}, {ITERATIONS} iterations, float32. The "
+        f"estimated memory of one pair with its arguments is {bytes_per_pair(n, n, k) / 2**20:.0f} MiB.",
+        table,
+        {"seconds": seconds, "products": floor, "memory": memory, "pairs": count},
+    )
+
+
+class Shapes(NamedTuple):
+    """The meshes of several shapes, their names, and the ordered pairs to match, as positions in `meshes`."""
+
+    meshes: list[Mesh]
+    names: list[str]
+    pairs: list[tuple[int, int]]
+
+
+def chosen_shapes(options: argparse.Namespace) -> Shapes:
+    """Return people of the remeshed FAUST set if `--data` is given, else creatures in several poses."""
+    pairs = list(permutations(range(SHAPES), 2))[: options.pairs]
+    if options.data is not None:
+        names = [f"tr_reg_{number:03}" for number in range(0, 7 * SHAPES, 7)]
+        return Shapes([read_mesh(options.data / "off" / f"{name}.off") for name in names], names, pairs)
+    # Each creature has another seed, because the meshes of one creature have equal triangles in all poses.
+    kinds = [(kind, pose) for kind, poses in CREATURES.items() for pose in poses]
+    meshes = [
+        creature(kind, vertices=options.vertices, pose=pose, seed=seed)
+        for seed, (kind, pose) in enumerate(kinds[:SHAPES])
+    ]
+    return Shapes(meshes, [mesh.name for mesh in meshes], pairs)
+
+
+def accurate(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the pairs per second of the preset `"accurate"`, and the agreement with maps of the CPU."""
+    shapes = chosen_shapes(options)
+    preset, count = PRESETS["accurate"], len(shapes.pairs)
+    prepared = prepared_pairs(shapes, "accurate")
+    preset = preset.fitted(min(len(mesh.vertices) for mesh in shapes.meshes))
+
+    def in_batches_of(size: int) -> Callable[[], object]:
+        return lambda: [one.pointwise_map for one in refine_batch(prepared, preset.stages, batch_size=size)]
+
+    candidates = {f"batches of {size}": in_batches_of(size) for size in (1, *options.batch_sizes)}
+    seconds = medians(candidates, options.repeats)
+    largest = max(options.batch_sizes)
+    whole = medians(
+        {
+            "match_pairs": lambda: [
+                found.pointwise_map
+                for _, found in match_pairs(shapes.meshes, shapes.pairs, batch_size=largest)
+            ]
+        },
+        1,
+    )
+    products: Counter[MatrixProduct] = Counter()
+    for stage in preset.stages:
+        spectra = prepared[0].view(stage)
+        start = prepared[0].padded_map(prepared[0].initial_map)
+        samples = None
+        if stage.number_of_samples is not None and prepared[0].samples is not None:
+            samples = tuple(rows[: stage.number_of_samples] for rows in prepared[0].samples)
+        products += matrix_products(partial(refine, samples=samples, **stage.settings), *spectra, start)
+    floor = time_of_products(products, count, options.repeats)
+    yield (
+        "Preset accurate",
+        f"{count} ordered pairs of {len(shapes.meshes)} shapes with about {len(shapes.meshes[0].vertices)} "
+        f"vertices each, float32. match_pairs runs in batches of {largest}.",
+        rates(seconds | whole, count, floor),
+        {"seconds": seconds | whole, "products": floor, "pairs": count},
+    )
+
+
+def agreement(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the share of vertices at which the maps of the accelerator equal the maps of the CPU."""
+    if jax.default_backend() == "cpu":
+        print("\nagreement: left out, because it needs an accelerator.")
+        return
+    shapes = chosen_shapes(options)
+    shapes = shapes._replace(pairs=shapes.pairs[:: max(1, len(shapes.pairs) // COMPARED)])
+    rows, measured = [["preset", "equal matches", "smallest share of a pair"]], {}
+    if options.data is not None:
+        rows[0] += ["error x10^-3", "error of the CPU"]
+    names: tuple[PresetName, ...] = ("paper", "accurate")
+    for name in names:
+        prepared = prepared_pairs(shapes, name)
+        maps = [
+            [
+                outcome.unpadded_map(one.pair)
+                for one, outcome in zip(
+                    prepared,
+                    refine_batch(prepared, PRESETS[name].stages, devices=[device]),
+                    strict=True,
+                )
+            ]
+            for device in (jax.devices()[0], jax.devices("cpu")[0])
+        ]
+        equal = [float(np.mean(ours == its)) for ours, its in zip(*maps, strict=True)]
+        rows.append([name, f"{np.mean(equal):.2%}", f"{min(equal):.2%}"])
+        measured[name] = {"equal": equal}
+        if options.data is not None:
+            errors = [errors_of(options.data, shapes, of_device) for of_device in maps]
+            rows[-1] += [f"{np.mean(of_device):.2f}" for of_device in errors]
+            measured[name]["errors"] = errors
+    yield (
+        "Agreement with the CPU",
+        f"{len(shapes.pairs)} ordered pairs of {len(shapes.meshes)} shapes, all stages, without repair, "
+        "float32 on both devices.",
+        rows,
+        measured,
+    )
+
+
+def errors_of(data: Path, shapes: Shapes, maps: Sequence[np.ndarray]) -> list[float]:
+    """Return the mean geodesic error of each map, in thousandths of the square root of the area."""
+    truths = (truth_of(data, shapes.names[i], shapes.names[j]) for i, j in shapes.pairs)
+    return [truth.error(one, truth.meshes[1]) for truth, one in zip(truths, maps, strict=True)]
+
+
+def prepared_pairs(shapes: Shapes, preset: PresetName) -> list[PreparedPair]:
+    """Return the prepared pairs of the shapes, with initial maps from SHOT."""
+    found, _ = prepare_shapes(shapes.meshes, PRESETS[preset])
+    return [prepare_pair(found[i], found[j]) for i, j in shapes.pairs]
+
+
+PARTS = {"paper": paper, "accurate": accurate, "agreement": agreement}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
+    parser.add_argument("--vertices", type=int, default=5000, help="per shape (default: %(default)s)")
+    parser.add_argument(
+        "--eigenvectors", type=int, default=100, help="per random shape (default: %(default)s)"
+    )
+    parser.add_argument("--pairs", type=int, default=64, help="(default: %(default)s)")
+    parser.add_argument("--batch-sizes", type=int, nargs="+", default=[4, 16, 64])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="refine 8 pairs once, in batches of 2 and 8")
+    parser.add_argument(
+        "--data", type=Path, metavar="FAUST_R", help="the directory of the remeshed FAUST set"
+    )
+    parser.add_argument("--output", type=Path, default=Path("batches"), metavar="DIR")
+    options = parser.parse_args()
+    if options.quick:
+        options.pairs, options.batch_sizes, options.repeats = 8, [2, 8], 1
+    options.batch_sizes = [size for size in options.batch_sizes if size <= options.pairs]
+    os.environ["JAXSMW_CACHE"] = "off"
+
+    output = make_directory(options.output)
+    origin = provenance()
+    texts, numbers = [f"# Batches\n\n{json.dumps(origin)}"], {"provenance": origin}
+    print(texts[0])
+    for name in options.only:
+        for title, note, rows, measured in PARTS[name](options):
+            texts.append(f"## {title}\n\n{note}\n\n{markdown(rows)}")
+            print(f"\n{texts[-1]}", flush=True)
+            numbers[name] = measured
+            (output / "batches.md").write_text("\n\n".join(texts), "utf-8")
+            (output / "batches.json").write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

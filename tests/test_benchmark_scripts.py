@@ -6,6 +6,7 @@ from argparse import Namespace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -28,14 +29,47 @@ def single_precision():
         yield
 
 
-def test_every_way_to_refine_a_batch_is_measured(monkeypatch, capsys):
-    arguments = ["--quick", "--vertices", "150", "--eigenvectors", "8"]
+def rows_of(monkeypatch, capsys, tmp_path, *arguments):
+    """Run benchmark_batches.py, and return the first cells of the rows of its table."""
+    arguments = [*arguments, "--repeats", "1", "--output", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", ["benchmark_batches.py", *arguments])
     monkeypatch.setenv("JAXSMW_CACHE", "off")
     benchmark_batches.main()
     printed = capsys.readouterr().out
-    rows = [line.split(" | ")[0].removeprefix("| ") for line in printed.splitlines() if line.startswith("| ")]
-    assert rows[1:] == ["products alone", "loop", "lax.map", "vmap of 2", "vmap of 8", "refine_pairs"]
+    assert (tmp_path / "batches.md").read_text() in printed
+    return [line.split(" | ")[0].removeprefix("| ") for line in printed.splitlines() if line.startswith("| ")]
+
+
+def test_every_way_to_refine_a_batch_is_measured(monkeypatch, capsys, tmp_path):
+    arguments = ["--quick", "--only", "paper", "--vertices", "150", "--eigenvectors", "8"]
+    rows = rows_of(monkeypatch, capsys, tmp_path, *arguments)
+    assert rows[2:] == ["products alone", "loop", "lax.map", "vmap of 2", "vmap of 8", "refine_pairs"]
+
+
+def test_batches_of_the_preset_accurate_are_measured(monkeypatch, capsys, tmp_path):
+    monkeypatch.setattr(benchmark_batches, "SHAPES", 2)
+    arguments = ["--only", "accurate", "--vertices", "900", "--pairs", "2", "--batch-sizes", "2", "8"]
+    rows = rows_of(monkeypatch, capsys, tmp_path, *arguments)
+    assert rows[2:] == ["products alone", "batches of 1", "batches of 2", "match_pairs"]
+    numbers = json.loads((tmp_path / "batches.json").read_text())["accurate"]
+    assert numbers["pairs"] == 2 and 0 < numbers["products"] < numbers["seconds"]["match_pairs"]
+
+
+def test_matrix_products_are_counted_in_loops():
+    def function(a, b, c):
+        def step(state, _):
+            return jnp.tanh(state @ c), None
+
+        repeated, _ = jax.lax.scan(step, a @ b, length=3)
+        return jax.lax.map(lambda row: jax.jit(jnp.dot)(row, c), repeated)
+
+    found = benchmark_batches.matrix_products(function, *map(jnp.zeros, ((4, 5), (5, 6), (6, 6))))
+    counts = {(one.left, one.right): (times, one.operations) for one, times in found.items()}
+    assert counts == {
+        ((4, 5), (5, 6)): (1, 4 * 5 * 6),
+        ((4, 6), (6, 6)): (3, 4 * 6 * 6),
+        ((6,), (6, 6)): (4, 6 * 6),
+    }
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from jaxsmw.core.search import (
     nearest_in_both,
     nearest_neighbor,
     nearest_neighbor_in_patches,
+    queries_per_block,
     search_in_patches,
 )
 from jaxsmw.geometry.eigenbasis import compute_spectrum
@@ -65,6 +66,22 @@ def test_two_searches_in_one_loop_equal_two_searches(sizes):
     for one, found in zip(problems, nearest_in_both(*problems), strict=True):
         distances = cdist(one.queries, one.database) + np.where(one.database_mask, 0, np.inf)
         np.testing.assert_array_equal(found, np.argmin(distances, axis=1))
+
+
+@pytest.mark.parametrize(
+    ("m", "n", "expected"),
+    [(300, 5000, 384), (5000, 5000, 5120), (100_000, 100_000, 640), (10**6, 10**6, 128)],
+)
+def test_blocks_on_accelerators_are_large_but_limited(m, n, expected, monkeypatch):
+    assert queries_per_block(m, n) == 128
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert queries_per_block(m, n) == expected
+
+
+@pytest.mark.parametrize("size", [256, 384])
+def test_the_size_of_blocks_changes_no_match(size, monkeypatch):
+    monkeypatch.setattr("jaxsmw.core.search.queries_per_block", lambda m, n: size)
+    check_against_brute_force(nearest_neighbor, 300, 450, 7, draws=3)
 
 
 def test_ties_go_to_the_lowest_index():

@@ -25,6 +25,8 @@ from jaxsmw.core.products import product
 # argmax.
 BLOCK = 128
 _CHUNK = 64
+# On accelerators, the scores of a block are at most _SCORES numbers, which is 256 MiB in float32.
+_SCORES = 2**26
 # `_maximum` divides each chunk into parts of _RUN rows, and the list of all patches into _PARTS parts.
 _RUN, _PARTS = 8, 16
 # `make_patches` divides points along their first _COORDINATES coordinates. After _POWER_ITERATIONS power
@@ -73,20 +75,32 @@ def nearest_neighbor(
         half_norms = jnp.where(database_mask, half_norms, jnp.inf)
     half_norms = jnp.pad(half_norms, (0, chunks * _CHUNK - n), constant_values=jnp.inf)
     rows = jnp.pad(database, ((0, chunks * _CHUNK - n), (0, 0)))
+    size = queries_per_block(queries.shape[0], n)
 
     def search(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
         products = product(rows, block.T)
         # The queries are on the last axis, so XLA computes maxima over chunks for several neighbouring
         # queries at once.
-        scores = (products - half_norms[:, None]).reshape(chunks, _CHUNK, BLOCK)
+        scores = (products - half_norms[:, None]).reshape(chunks, _CHUNK, size)
         chunk_scores = _maximum(scores, 1, _CHUNK // _RUN)
         best_chunks = _two_best(chunk_scores)
-        chunk_rows = scores[best_chunks, :, jnp.arange(BLOCK)[None, :]]
+        chunk_rows = scores[best_chunks, :, jnp.arange(size)[None, :]]
         candidates = best_chunks * _CHUNK + jnp.argmax(chunk_rows, axis=2)
         masked = jnp.isinf(half_norms[candidates])
         return _nearest(block, rows[candidates], candidates, masked, n).astype(jnp.int32)
 
-    return in_blocks(search, queries, BLOCK)
+    return in_blocks(search, queries, size)
+
+
+def queries_per_block(m: int, n: int) -> int:
+    """Return how many of m queries an exhaustive search compares with n database rows at once.
+
+    On CPUs, a block is small, so that its scores fit into the cache. On accelerators, a block contains all
+    queries if their scores need at most 256 MiB, because many small blocks leave most of a GPU idle.
+    """
+    if jax.default_backend() == "cpu":
+        return BLOCK
+    return BLOCK * max(1, min(-(-m // BLOCK), _SCORES // (n * BLOCK)))
 
 
 class SearchProblem(NamedTuple):

@@ -19,7 +19,7 @@ from jaxsmw.choices import ITERATIONS
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.core.search import BLOCK
+from jaxsmw.core.search import queries_per_block
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.compilation import compiled
@@ -353,7 +353,8 @@ def _one_at_a_time(device: jax.Device) -> bool:
 def bytes_per_pair(m: int, n: int, k: int, itemsize: int = 4) -> int:
     """Return the approximate memory that `refine` uses on a device for one pair, in bytes.
 
-    The memory includes the spectra of the pair, and grows linearly with m and n.
+    The memory includes the spectra of the pair. On CPUs, it grows linearly with m and n. On accelerators, it
+    also includes the scores of a large block of queries; see `jaxsmw.core.search.queries_per_block`.
 
     **Arguments:**
 
@@ -361,5 +362,5 @@ def bytes_per_pair(m: int, n: int, k: int, itemsize: int = 4) -> int:
     - `k`: the number of eigenvectors.
     - `itemsize`: the size of one floating-point number, in bytes.
     """
-    eigenvectors, embeddings, scores = (m + n) * k, 2 * (m + n) * k, 3 * n * BLOCK
+    eigenvectors, embeddings, scores = (m + n) * k, 2 * (m + n) * k, 3 * n * queries_per_block(m, n)
     return itemsize * (eigenvectors + embeddings + scores)
