@@ -358,9 +358,7 @@ def _correspondence(
             ' If the units of length differ, set scale="unknown" (--scale unknown).' if pair.partial else ""
         )
         raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
-    spectrum_x, spectrum_y = preset.stages[-1].view(
-        prepared.spectrum_x, prepared.spectrum_y, partial=pair.partial and not prepared.trimmed
-    )
+    spectrum_x, spectrum_y = prepared.view(preset.stages[-1], padded=False)
     return Correspondence(
         pair=pair,
         pointwise_map=np.asarray(last.pointwise_map).astype(np.int64),

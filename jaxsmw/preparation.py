@@ -125,12 +125,17 @@ class PreparedPair:
         padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
         return jax.device_put(padded)
 
-    def view(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
-        """Return the padded spectra, restricted to the data that a stage uses.
+    def view(self, stage: Stage, *, padded: bool = True) -> tuple[Spectrum, Spectrum]:
+        """Return the spectra, restricted to the data that a stage uses; see `Stage.view`.
 
-        See `Stage.view`.
+        **Arguments:**
+
+        - `stage`: the stage.
+        - `padded`: whether the spectra are padded to the sizes that `program_size` returns.
         """
-        return stage.view(*self.padded, partial=self.pair.partial and not self.trimmed)
+        spectra = self.padded if padded else (self.spectrum_x, self.spectrum_y)
+        # The spectra of a trimmed pair have equal numbers of eigenvectors, so they need no common limit.
+        return stage.view(*spectra, partial=self.pair.partial and not self.trimmed)
 
 
 def prepare(
