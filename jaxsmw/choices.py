@@ -70,6 +70,20 @@ MethodName = Literal[
     "zoomout-sampled",
 ]
 """The names of the methods of a benchmark; see `jaxsmw.evaluation.opponents.registry.METHODS`."""
+ProtocolName = Literal[
+    "faust-r",
+    "scape-r",
+    "shrec19-r",
+    "smal-r",
+    "topkids",
+    "shrec16-cuts",
+    "shrec16-holes",
+    "tosca",
+    "dt4d-intra",
+    "dt4d-inter",
+]
+"""The names of the published protocols, which choose the pairs of a data set."""
+
 PeerName = Literal["pyfm-zoomout", "geomfum-zoomout"]
 """The names of other libraries' methods, which a benchmark can measure if the libraries are installed."""
 

@@ -6,7 +6,7 @@ import argparse
 import os
 from typing import get_args
 
-from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap, MethodName, PeerName
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap, MethodName, PeerName, ProtocolName
 from jaxsmw.cli.arguments import path, whole_number
 from jaxsmw.cli.console import report_progress, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
@@ -35,11 +35,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "installed. For a method of another program, give the directory of its maps, in files named X_Y.map. "
         "cpd takes 30 seconds per pair, and bcicp takes 15 seconds per pair. pfm matches partial shapes only",
     )
-    parser.add_argument(
+    pairs = parser.add_mutually_exclusive_group()
+    pairs.add_argument(
         "--pairs",
         metavar="N|FILE",
         type=path,
         help="number of random pairs, or a file that lists pairs (default: all pairs)",
+    )
+    pairs.add_argument(
+        "--protocol",
+        metavar="NAME",
+        choices=get_args(ProtocolName),
+        help="the pairs on which papers report errors: %(choices)s. The data set must be complete",
     )
     parser.add_argument(
         "--init",
@@ -109,12 +116,16 @@ def run(options: argparse.Namespace) -> None:
         ) from error
     from jaxsmw.evaluation.datasets import open_data_set
     from jaxsmw.evaluation.opponents.registry import find_methods, suited_methods
+    from jaxsmw.evaluation.protocols import protocol_pairs
     from jaxsmw.report.tables import markdown_table, write_tables
     from jaxsmw.runtime.files import make_directory
     from jaxsmw.runtime.workers import open_executor
 
     data_set = open_data_set(options.data)
-    pairs = choose_pairs(data_set, options.pairs, options.seed)
+    if options.protocol is None:
+        pairs = choose_pairs(data_set, options.pairs, options.seed)
+    else:
+        pairs = protocol_pairs(options.protocol, data_set)
     settings = Settings(options.init, options.mirrored, options.evaluation_samples, options.seed)
     methods = find_methods(options.methods) if options.methods else suited_methods(pairs)
     output = options.output or f"jaxsmw-benchmark-{data_set.name}"

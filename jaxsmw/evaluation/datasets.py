@@ -33,7 +33,7 @@ class DataPair:
 
     - `source`, `target`: the names of the source X and the target Y.
     - `source_file`, `target_file`: the paths of the mesh files of X and Y.
-    - `truth`: a tuple with the paths of the one or two ground-truth files, in a format that
+    - `truth`: a tuple with the paths of one to three ground-truth files, in a format that
       `read_ground_truth` reads. If the tuple is empty, vertex i of X corresponds to vertex i of Y.
     - `mirrored_truth`: a tuple with the paths of the files of the mirrored ground truth; None if the data set
       has no mirrored ground truth. In the mirrored ground truth, left and right are exchanged.
@@ -109,7 +109,8 @@ class DataSet:
 
     - `directory`: the path of the directory that contains the files.
     - `layout`: the name of the recognised layout: `"a remeshed set"`, `"SHREC'19 humans"`,
-      `"SHREC'16 partial"`, `"SHREC'16 topology"`, `"FAUST registrations"`, `"SCAPE"` or `"TOSCA"`.
+      `"SHREC'16 partial"`, `"SHREC'16 topology"`, `"DeformingThings4D"`, `"FAUST registrations"`,
+      `"SCAPE"` or `"TOSCA"`.
     - `pairs`: the pairs to match, as a tuple of `DataPair`. If the data set contains a list of pairs, the
       tuple contains the listed pairs in the order of the list.
     - `others`: a tuple of `DataPair`, with all pairs that have ground truth but are not in `pairs`. In a
@@ -152,6 +153,10 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
       target.
     - **SHREC'16 topology** (Lähner et al. 2016): the mesh `kid00` is the target of all pairs. The sources are
       the other meshes `kidNN`, each with a file `kidNN_ref.txt`.
+    - **DeformingThings4D** (remeshed characters, DT4D-H; Magnet et al. 2022): one folder (`off/`, …) contains
+      a folder of meshes for each class, and `corres/CLASS/` contains a file `NAME.vts` for each mesh. A file
+      `A_B.vts` in `corres/cross_category_corres/` lists the line in the `.vts` files of class B that
+      corresponds to each line in the `.vts` files of class A. The names of shapes have the form `CLASS/NAME`.
     - **FAUST registrations** (`tr_reg_NNN`), **SCAPE** (`meshNNN`) and **TOSCA** (`cat0`, …): the directory
       or one of its folders contains the meshes, and there is no ground-truth file. Vertex i of one shape
       corresponds to vertex i of every other shape. In TOSCA, vertices correspond only between shapes of the
@@ -161,7 +166,7 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
     line. The attribute `pairs` of the result then contains the listed pairs. Without a list, `pairs` contains
     all ordered pairs of different shapes with ground truth. In remeshed sets and in TOSCA, only shapes of the
     same class form pairs. The class of a shape is its name without the number at the end, for example `cat`
-    for `cat0`.
+    for `cat0`. In DeformingThings4D, the class is the folder of the shape.
 
     **Arguments:**
 
@@ -223,6 +228,7 @@ _EXPECTED = (
     "SHREC'19: NAME.obj with FARMgt_txt/NAME_NAME.txt",
     "SHREC'16 partial: null/ with cuts/ or holes/",
     "SHREC'16 topology: kid00.off with kidNN_ref.txt",
+    "DeformingThings4D: off/CLASS/NAME.off with corres/CLASS/NAME.vts",
     "FAUST: tr_reg_NNN.ply",
     "SCAPE: meshNNN.ply",
     "TOSCA: cat0.mat or cat0.off",
@@ -290,14 +296,8 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
     file names no pair.
     """
     path, known, pairs = Path(path), set(shapes), []
-    try:
-        lines = path.read_text("utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as text ({error}): give a list of pairs.") from error
-    for number, line in enumerate(lines, start=1):
-        names = re.split(r"[,;\s]+", line.partition("#")[0].strip())
-        if names == [""]:
-            continue
+    for number, line in _lines(path, "pairs").items():
+        names = re.split(r"[,;\s]+", line)
         wrong = [name for name in names if name not in known]
         if len(names) != 2 or wrong:
             fault = f"{wrong[0][:60]!a} is not one of the shapes" if wrong else "does not name two shapes"
@@ -306,6 +306,24 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
     if not pairs:
         raise InputError(f"{path}: names no pair: write two names of shapes on each line.")
     return pairs
+
+
+def read_shapes(path: str | os.PathLike[str]) -> list[str]:
+    """Read a list of shapes, one name per line, and return the names. Text after `#` is a comment.
+
+    **Raises:** `InputError` if the file cannot be read.
+    """
+    return list(_lines(Path(path), "shapes").values())
+
+
+def _lines(path: Path, what: str) -> dict[int, str]:
+    """Return the lines of a text file without comments and empty lines, as a dictionary from line numbers."""
+    try:
+        lines = path.read_text("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error}): give a list of {what}.") from error
+    stripped = {number: line.partition("#")[0].strip() for number, line in enumerate(lines, start=1)}
+    return {number: line for number, line in stripped.items() if line}
 
 
 def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataPair]:
@@ -346,8 +364,9 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
 
 
 def class_of(name: str) -> str:
-    """Return the class of a shape: its name without the number at the end."""
-    return re.sub(r"[_-]?\d+$", "", name)
+    """Return the class of a shape: its folder, or its name without the number at the end."""
+    folder, _, _ = name.rpartition("/")
+    return folder or re.sub(r"[_-]?\d+$", "", name)
 
 
 def _within_classes(names: Iterable[str]) -> list[tuple[str, str]]:
@@ -469,6 +488,44 @@ def _topology(directory: Path) -> _Pairs | None:
     return pairs, []
 
 
+# This folder of DeformingThings4D contains the correspondences between classes.
+_BETWEEN_CLASSES = "cross_category_corres"
+
+
+def _characters(directory: Path) -> _Pairs | None:
+    truths = {
+        f"{file.parent.name}/{file.stem}": file
+        for file in (directory / "corres").glob("*/*.vts")
+        if file.parent.name != _BETWEEN_CLASSES
+    }
+    if not truths:
+        return None
+    shapes: dict[str, Path] = {}
+    for folder in sorted(directory.iterdir()):
+        if folder.is_dir() and folder.name != "corres" and not shapes:
+            classes = (inner for inner in sorted(folder.iterdir()) if inner.is_dir())
+            shapes = {f"{one.name}/{name}": file for one in classes for name, file in _meshes(one).items()}
+    if missing := [name for name in truths if name not in shapes]:
+        raise InputError(
+            f"{directory}: has no mesh for {truths[missing[0]]}: add the mesh, or remove the .vts file."
+        )
+    if missing := [name for name in shapes if name not in truths]:
+        raise InputError(
+            f"{directory / 'corres' / missing[0]}.vts: the ground truth of {shapes[missing[0]]} is missing: "
+            "add this file, or remove the mesh."
+        )
+
+    def pair(x: str, y: str, *between: Path) -> DataPair:
+        return DataPair(x, y, shapes[x], shapes[y], (truths[x], truths[y], *between))
+
+    others = []
+    for file in sorted((directory / "corres" / _BETWEEN_CLASSES).glob("*_*.vts")):
+        one, _, another = file.stem.partition("_")
+        of_one, of_another = ([name for name in shapes if class_of(name) == c] for c in (one, another))
+        others += [pair(x, y, file) for x in of_one for y in of_another]
+    return [pair(*names) for names in _within_classes(shapes)], others
+
+
 def _identical(names: str) -> Callable[[Path], _Pairs | None]:
     """Return a function that opens a data set if its mesh names match the pattern `names`.
 
@@ -499,6 +556,7 @@ _LAYOUTS: dict[str, Callable[[Path], _Pairs | None]] = {
     "SHREC'19 humans": _shrec19,
     "SHREC'16 partial": _partial,
     "SHREC'16 topology": _topology,
+    "DeformingThings4D": _characters,
     "FAUST registrations": _identical(r"tr_reg_\d{3}"),
     "SCAPE": _identical(r"mesh\d{3}"),
     "TOSCA": _identical(r"(cat|centaur|david|dog|gorilla|horse|lioness|michael|seahorse|victoria|wolf)\d+"),

@@ -91,6 +91,8 @@ def read_ground_truth(
     - Two `.vts` files: the first file belongs to the source, and the second file belongs to the target. Each
       line contains one vertex, counted from 1. The vertices in line i of the two files correspond to each
       other.
+    - Three `.vts` files: the first two files belong to the source and the target. Line i of the third file
+      contains the line of the second file, counted from 1, that corresponds to line i of the first file.
     - Two files with other suffixes: the lines have the same meaning as in `.vts` files. Vertices are counted
       from 1 in `.mat` files, and from 0 in all other files.
     - One `.baryc_gt` or `.baryc_gt_sym` file: line i contains the true point of the i-th vertex of the
@@ -105,7 +107,7 @@ def read_ground_truth(
 
     **Arguments:**
 
-    - `paths`: the path of one file, or a sequence of one or two paths.
+    - `paths`: the path of one file, or a sequence of one to three paths.
     - `mesh_x`, `mesh_y`: the source X and the target Y, each a `Mesh`.
     - `index_base`: the index of the first vertex and of the first face in the files, 0 or 1. If None (the
       default), the index base of the format is used, as listed above.
@@ -136,9 +138,11 @@ def read_ground_truth(
 
 
 def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBase | None) -> GroundTruth:
-    if len(files) not in (1, 2):
-        raise InputError(f"ground truth: {len(files)} files were given: give one or two files.")
+    if len(files) not in (1, 2, 3):
+        raise InputError(f"ground truth: {len(files)} files were given: give one to three files.")
 
+    if len(files) == 3:
+        return _through_lines(files, mesh_x, mesh_y, index_base)
     if len(files) == 2:
         tables = [Table(file, columns=1) for file in files]
         if tables[0].rows != tables[1].rows:
@@ -170,6 +174,21 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
         )
     table.require_rows(mesh_x)
     return GroundTruth.of_all_vertices(table.vertices(0, mesh_y, table.index_base(index_base)))
+
+
+def _through_lines(
+    files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBase | None
+) -> GroundTruth:
+    """Read three files, of which the third contains lines of the second."""
+    of_x, of_y, lines = (Table(file, columns=1) for file in files)
+    if lines.rows != of_x.rows:
+        raise InputError(
+            f"{lines.path}: has {lines.rows} lines and {of_x.path} has {of_x.rows}, but line i of both files "
+            "must describe the same point: give files of one data set."
+        )
+    bases = [table.index_base(index_base, default=1) for table in (of_x, of_y, lines)]
+    chosen = lines.indices(0, of_y.rows, f"lines of {of_y.path}", bases[2])
+    return GroundTruth(of_x.vertices(0, mesh_x, bases[0]), of_y.vertices(0, mesh_y, bases[1])[chosen])
 
 
 def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, mesh_y: Mesh) -> None:
