@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from pathlib import Path
 from typing import get_args
 
 from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap, MethodName, PeerName, ProtocolName
@@ -80,6 +81,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="directory for results, tables and figures (default: jaxsmw-benchmark-NAME, where NAME is the "
         "name of the data set)",
     )
+    parser.add_argument(
+        "--verify",
+        metavar="RESULTS.CSV",
+        type=path,
+        help="measure a random tenth of the pairs in this file again, with all its methods, and compare the "
+        "errors; nothing is stored",
+    )
     processes = parser.add_mutually_exclusive_group()
     processes.add_argument(
         "--workers",
@@ -97,8 +105,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Match and measure all pairs that have no results yet, then write and print the tables of all pairs.
 
+    With `--verify`, measure a tenth of stored results again instead, and print a comparison.
+
     **Raises:** `InputError` if an option cannot be used or a needed package is not installed. If a pair
     cannot be measured, `InputError` is raised after the results of all other pairs are written.
+    `ArithmeticError` if stored results do not hold.
     """
     from jaxsmw.report.figures import check_drawable
 
@@ -106,15 +117,22 @@ def run(options: argparse.Namespace) -> None:
     try:
         import pyarrow  # noqa: F401 (the tables of all pairs need it, and they are written last)
 
-        from jaxsmw.evaluation.benchmark import run_benchmark
-        from jaxsmw.evaluation.datasets import choose_pairs
-        from jaxsmw.evaluation.measurement import Settings
+        import jaxsmw.evaluation.benchmark  # noqa: F401
     except ModuleNotFoundError as error:
         raise InputError(
             f"benchmarks need {error.name}, which is not installed: install it with pip install "
             "'jaxsmw[benchmark]'."
         ) from error
-    from jaxsmw.evaluation.datasets import open_data_set
+    if options.verify is None:
+        _measure(options)
+    else:
+        _verify(options)
+
+
+def _measure(options: argparse.Namespace) -> None:
+    from jaxsmw.evaluation.benchmark import run_benchmark
+    from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
+    from jaxsmw.evaluation.measurement import Settings
     from jaxsmw.evaluation.opponents.registry import find_methods, suited_methods
     from jaxsmw.evaluation.protocols import protocol_pairs
     from jaxsmw.report.tables import markdown_table, write_tables
@@ -142,3 +160,46 @@ def run(options: argparse.Namespace) -> None:
         show(markdown_table(write_tables(directory, data_set, results, settings, methods)).rstrip("\n"))
     report_progress(f"the results are in {output}")
     results.check()
+
+
+def _verify(options: argparse.Namespace) -> None:
+    from jaxsmw.evaluation.datasets import open_data_set
+    from jaxsmw.evaluation.opponents.registry import find_methods
+    from jaxsmw.evaluation.verification import StoredResults
+    from jaxsmw.report.tables import markdown
+    from jaxsmw.runtime.workers import open_executor
+
+    given = {
+        "--pairs": options.pairs,
+        "--protocol": options.protocol,
+        "--methods": options.methods,
+        "--mirrored": options.mirrored or None,
+        "--evaluation-samples": options.evaluation_samples,
+        "--output": options.output,
+    }
+    if unused := [name for name, value in given.items() if value is not None]:
+        raise InputError(
+            f"--verify uses the settings of the stored results, so {unused[0]} has no effect: leave it out."
+        )
+    data_set = open_data_set(options.data)
+    stored = StoredResults(Path(options.verify), options.init)
+    pairs = stored.draw(data_set, options.seed)
+    methods = find_methods(stored.methods)
+    report_progress(f"{data_set.layout}, {len(pairs)} of the stored pairs are measured again")
+    with quiet_children(), open_executor(options.workers, options.scheduler) as executor:
+        found = stored.measure_again(data_set, pairs, methods, executor, quiet=options.quiet)
+    rows = [["method", "errors", "equal", "that hold", "largest difference x10^-3"]]
+    for name in methods:
+        own = [one for one in found if one.method == name]
+        equal, hold = sum(one.difference == 0 for one in own), sum(one.holds for one in own)
+        largest = max((one.difference for one in own), default=0.0)
+        rows.append([name, str(len(own)), str(equal), str(hold), f"{1000 * largest:.3g}"])
+    show(markdown(rows))
+    if wrong := [one for one in found if not one.holds]:
+        worst = max(wrong, key=lambda one: one.difference)
+        raise ArithmeticError(
+            f"{options.verify}: {len(wrong)} of {len(found)} errors do not hold. The largest difference is "
+            f"that of {worst.method} on {worst.source} to {worst.target}: {worst.stored:.4f} is stored, and "
+            f"{worst.measured:.4f} was measured now."
+        )
+    show(f"All {len(found)} errors hold: they differ by at most 2 %, or by at most 0.0005.")

@@ -43,12 +43,15 @@ class Journal:
     - `key`: the names of the key columns. If two rows have the same key, the second row is ignored.
     - `columns`: a mapping from the name of each required column to the function that checks its values. If
       None, the file must have the key columns, and may have any other columns.
+    - `read_only`: whether the file is only read. An unfinished line is then ignored, but not removed.
 
     **Raises:** `InputError` if the file cannot be read, or does not contain a table with these columns. If
     this error is raised, the file is not changed.
     """
 
-    def __init__(self, path: Path, key: Sequence[str], columns: Columns | None = None):
+    def __init__(
+        self, path: Path, key: Sequence[str], columns: Columns | None = None, *, read_only: bool = False
+    ):
         self.path = path
         self.key = tuple(key)
         self._fields: list[str] = [] if columns is None else list(columns)
@@ -64,7 +67,7 @@ class Journal:
             self._read(contents[:whole], columns or {})
         elif not _line(self._fields).encode().startswith(contents) and columns is not None:
             raise self._fault(1, f"is not the header {','.join(self._fields)}")
-        if whole < len(contents):
+        if whole < len(contents) and not read_only:
             os.truncate(path, whole)
 
     @property
