@@ -132,11 +132,7 @@ class StoredResults:
         results.check()
         stored = {_key(row): float(row["mean"]) for row in self.rows}
         measured = {_key(row): float(row["mean"]) for row in results.rows}
-        return [
-            Comparison(*key, stored[key], error)
-            for key, error in measured.items()
-            if key in stored
-        ]
+        return [Comparison(*key, stored[key], error) for key, error in measured.items() if key in stored]
 
 
 def _key(row: Row) -> tuple[str, str, str]:
