@@ -2,8 +2,8 @@
 
     python scripts/write_comparison.py
 
-The published errors come from docs/published_errors.csv, which states the source of each error. Our errors are
-the means of the files results.csv in docs/results/accuracy, each with the commit that its provenance.json
+The published errors come from docs/published_errors.csv, which states the source of each error. Our errors
+are the means of the files results.csv in docs/results/accuracy, each with the commit that its provenance.json
 states. The script replaces the text between the comments `<!-- published errors -->` or `<!-- our errors -->`
 and the next `<!-- end -->`.
 """
