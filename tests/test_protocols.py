@@ -106,13 +106,14 @@ LACKS = {
         lambda d: remeshed(d, FAUST[:-5]),
         "lacks the shapes tr_reg_095, tr_reg_096, tr_reg_097 and 2 more",
     ),
-    "a list": ("smal-r", lambda d: remeshed(d, ANIMALS), "lacks the list of test shapes, test_cat.txt"),
+    "a list": ("smal-r", lambda d: remeshed(d, ANIMALS), "lacks test_cat.txt, the list of its test shapes"),
     "a listed shape": (
         "smal-r",
         lambda d: remeshed(d, ["cow1", "cow2"], listed=["cow1", "cat"]),
         "lacks the shapes cat,",
     ),
     "humans": ("shrec19-r", shrec19, "lacks 40 of the shapes 1 to 44, such as 3"),
+    "animals": ("tosca", lambda d: remeshed(d, FAUST[:2]), "lacks the shapes of TOSCA, such as cat0"),
     "holes": (
         "shrec16-holes",
         lambda d: (partial(d), [file.unlink() for file in (d / "holes").iterdir()]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import chain, permutations
 
 from jaxsmw.choices import ProtocolName
 from jaxsmw.errors import InputError
@@ -70,7 +70,7 @@ def _between(data_set: DataSet, names: Iterable[tuple[str, str]]) -> list[DataPa
     **Raises:** `_MissingError` if the data set lacks one of the shapes or one of the ground truths.
     """
     names, shapes = list(names), data_set.shapes
-    if missing := [shape for shape in dict.fromkeys(sum(names, ())) if shape not in shapes]:
+    if missing := [shape for shape in dict.fromkeys(chain.from_iterable(names)) if shape not in shapes]:
         count = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         raise _MissingError(f"lacks the shapes {', '.join(missing[:3])}{count}")
     known = {pair.names: pair for pair in (*data_set.pairs, *data_set.others)}
@@ -84,12 +84,11 @@ def _among(*shapes: str) -> Callable[[DataSet], list[DataPair]]:
     return lambda data_set: _between(data_set, permutations(shapes, 2))
 
 
-def _listed_shapes(data_set: DataSet, *names: str) -> list[str]:
-    """Return the shapes that a text file lists. The first existing file of the given names is used."""
-    for name in names:
-        if (path := data_set.directory / name).is_file():
-            return read_shapes(path)
-    raise _MissingError(f"lacks the list of test shapes, {' or '.join(names)}")
+def _listed_shapes(data_set: DataSet, name: str) -> list[str]:
+    """Return the shapes that a text file in the directory of the data set lists."""
+    if (path := data_set.directory / name).is_file():
+        return read_shapes(path)
+    raise _MissingError(f"lacks {name}, the list of its test shapes")
 
 
 def _test_animals(data_set: DataSet) -> list[DataPair]:
@@ -104,6 +103,15 @@ def _whole_humans(data_set: DataSet) -> list[DataPair]:
     return [pair for pair in (*data_set.pairs, *data_set.others) if "40" not in pair.names]
 
 
+_TOSCA_CLASSES = {"cat", "centaur", "david", "dog", "gorilla", "horse", "michael", "victoria", "wolf"}
+
+
+def _tosca(data_set: DataSet) -> list[DataPair]:
+    if found := [pair for pair in data_set.pairs if class_of(pair.source) in _TOSCA_CLASSES]:
+        return found
+    raise _MissingError("lacks the shapes of TOSCA, such as cat0")
+
+
 def _kind(kind: str) -> Callable[[DataSet], list[DataPair]]:
     """Return a function that chooses the partial shapes of one kind, cuts or holes."""
 
@@ -115,7 +123,7 @@ def _kind(kind: str) -> Callable[[DataSet], list[DataPair]]:
     return choose
 
 
-# Published evaluations leave this class out.
+# Li 2022 and Cao 2023 leave this class out.
 _IGNORED_CLASS = "pumpkinhulk"
 
 
@@ -201,7 +209,7 @@ PROTOCOLS: dict[ProtocolName, Protocol] = {
     ),
     "tosca": Protocol(
         ("TOSCA", "a remeshed set"),
-        lambda data_set: list(data_set.pairs),
+        _tosca,
         "TOSCA, original or remeshed",
         "the listed pairs of a remeshed set, or all ordered pairs within a class",
         "Ren 2018, Hu 2021 (MWP)",
