@@ -70,7 +70,7 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
-from jaxsmw.geometry.geodesics import geodesic_distances
+from jaxsmw.geometry.geodesics import geodesic_distances_between
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, poisson_disk_samples
@@ -497,12 +497,7 @@ class Truth(NamedTuple):
         """
         coarse = self.meshes[1]
         _, nearest = KDTree(coarse.vertices).query(target.vertices[pointwise_map[self.rows]])
-        sources, row = np.unique(self.targets, return_inverse=True)
-        distances = np.empty(len(row))
-        for group in np.array_split(np.arange(len(sources)), -(-len(sources) // 500)):
-            here = np.isin(row, group)
-            found = geodesic_distances(coarse, sources[group])
-            distances[here] = found[row[here] - group[0], nearest[here]]
+        distances = geodesic_distances_between(coarse, self.targets, nearest)
         return 1000 * float(distances.mean()) / coarse.area**0.5
 
 
