@@ -70,7 +70,7 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
-from jaxsmw.geometry.geodesics import geodesic_distances_between
+from jaxsmw.geometry.geodesics import geodesic_distances, geodesic_distances_between
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, poisson_disk_samples
