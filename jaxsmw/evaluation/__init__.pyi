@@ -1,10 +1,9 @@
 from .datasets import DataPair, DataSet, open_data_set
 from .ground_truth import GroundTruth, read_ground_truth
 from .metrics import GeodesicError, coverage, geodesic_error
-from .protocols import PROTOCOLS, Protocol, protocol_pairs
+from .protocols import Protocol, protocol_pairs
 
 __all__ = [
-    "PROTOCOLS",
     "DataPair",
     "DataSet",
     "GeodesicError",
