@@ -295,8 +295,8 @@ class TestBadFiles:
             read_ground_truth([one, two], X, Y)
         with pytest.raises(InputError, match=r"x.vts, line 1: has 2 numbers instead of 1"):
             read_ground_truth([write("x.vts", "1 2\n2 3\n"), one], X, Y)
-        with pytest.raises(InputError, match="3 files were given"):
-            read_ground_truth([one, two, two], X, Y)
+        with pytest.raises(InputError, match="4 files were given"):
+            read_ground_truth([one, two, two, two], X, Y)
         with pytest.raises(InputError, match=r"y.vts, line 1: 9 is not one of the vertices of mesh_x"):
             read_ground_truth([write("y.vts", "9\n"), write("x.vts", "1\n")], X, Y)
 
