@@ -123,6 +123,17 @@ def test_results_of_another_data_set_are_refused(scape, tmp_path):  # noqa: F811
         stored.draw(open_data_set(scape), 0)
 
 
+def test_methods_with_maps_from_a_directory_must_be_given(tmp_path):
+    stored = StoredResults(write_results(tmp_path, rows=ROW + ROW.replace("mwp", "theirs")), "shot")
+    with pytest.raises(InputError, match="contains the method theirs, whose maps come from a directory"):
+        stored.chosen_methods(None, ["mwp"])
+    assert stored.chosen_methods(None, ["mwp", "theirs"]) == ["mwp", "theirs"]
+    assert stored.chosen_methods(["mwp"], ["mwp"]) == ["mwp"]
+    assert stored.chosen_methods([str(tmp_path / "theirs")], ["mwp"]) == [str(tmp_path / "theirs")]
+    with pytest.raises(InputError, match="no results of the method zoomout: choose from mwp, theirs"):
+        stored.chosen_methods(["zoomout"], ["mwp"])
+
+
 def test_options_without_effect_are_refused(scape, tmp_path, capsys):  # noqa: F811
     path = write_results(tmp_path, rows=ROW)
     assert run_command(["benchmark", str(scape), "--verify", str(path), "--pairs", "3"]) == 2

@@ -85,8 +85,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--verify",
         metavar="RESULTS.CSV",
         type=path,
-        help="measure a random tenth of the pairs in this file again, with all its methods, and compare the "
-        "errors; nothing is stored",
+        help="measure a random tenth of the pairs in this file again, with all its methods or with "
+        "--methods, and compare the errors; nothing is stored",
     )
     processes = parser.add_mutually_exclusive_group()
     processes.add_argument(
@@ -164,7 +164,7 @@ def _measure(options: argparse.Namespace) -> None:
 
 def _verify(options: argparse.Namespace) -> None:
     from jaxsmw.evaluation.datasets import open_data_set
-    from jaxsmw.evaluation.opponents.registry import find_methods
+    from jaxsmw.evaluation.opponents.registry import find_methods, known_methods
     from jaxsmw.evaluation.verification import StoredResults
     from jaxsmw.report.tables import markdown
     from jaxsmw.runtime.workers import open_executor
@@ -172,7 +172,6 @@ def _verify(options: argparse.Namespace) -> None:
     given = {
         "--pairs": options.pairs,
         "--protocol": options.protocol,
-        "--methods": options.methods,
         "--mirrored": options.mirrored or None,
         "--evaluation-samples": options.evaluation_samples,
         "--output": options.output,
@@ -184,7 +183,7 @@ def _verify(options: argparse.Namespace) -> None:
     data_set = open_data_set(options.data)
     stored = StoredResults(Path(options.verify), options.init)
     pairs = stored.draw(data_set, options.seed)
-    methods = find_methods(stored.methods)
+    methods = find_methods(stored.chosen_methods(options.methods, known_methods()))
     report_progress(f"{data_set.layout}, {len(pairs)} of the stored pairs are measured again")
     with quiet_children(), open_executor(options.workers, options.scheduler) as executor:
         found = stored.measure_again(data_set, pairs, methods, executor, quiet=options.quiet)

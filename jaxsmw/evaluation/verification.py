@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -89,6 +89,31 @@ class StoredResults:
             )
         kept = ("mirrored", "evaluated_points", "seed")
         self.settings = Settings(init, **{name: stored[name] for name in kept})
+
+    def chosen_methods(self, given: Sequence[str] | None, known: Container[str]) -> list[str]:
+        """Return the methods to measure again, as names or directories with maps.
+
+        **Arguments:**
+
+        - `given`: names of methods, or directories with maps of stored methods; None for all stored methods.
+        - `known`: the names of methods that need no directory.
+
+        **Raises:** `InputError` if there are no stored results of a given method. If no methods are given,
+        `InputError` is raised if a stored method needs a directory.
+        """
+        if given is None:
+            if unknown := [name for name in self.methods if name not in known]:
+                raise InputError(
+                    f"{self.path}: contains the method {unknown[0]}, whose maps come from a directory: give "
+                    "--methods, with this directory or without this method."
+                )
+            return self.methods
+        if missing := [name for name in given if Path(name).name not in self.methods]:
+            raise InputError(
+                f"{self.path}: has no results of the method {missing[0]}: choose from "
+                f"{', '.join(self.methods)}."
+            )
+        return list(given)
 
     def draw(self, data_set: DataSet, seed: int) -> list[DataPair]:
         """Draw a tenth of the stored pairs at random, but at least one pair.
