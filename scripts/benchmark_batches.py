@@ -23,7 +23,6 @@ tables to `batches.md` and all numbers to `batches.json` in DIR.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -35,7 +34,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark_speed import ITERATIONS, Part, medians, truth_of
+from benchmark_speed import ITERATIONS, Part, measure_parts, medians, truth_of
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Int
@@ -50,10 +49,7 @@ from jaxsmw.io.mesh_files import read_mesh
 from jaxsmw.preparation import PreparedPair
 from jaxsmw.presets import PRESETS, PresetName
 from jaxsmw.repair.batches import refine_batch
-from jaxsmw.report.summary import provenance
-from jaxsmw.report.tables import markdown
 from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
-from jaxsmw.runtime.files import make_directory
 
 Pair = tuple[Spectrum, Spectrum, Int[Array, " m"]]
 
@@ -347,18 +343,7 @@ def main() -> None:
         options.pairs, options.batch_sizes, options.repeats = 8, [2, 8], 1
     options.batch_sizes = [size for size in options.batch_sizes if size <= options.pairs]
     os.environ["JAXSMW_CACHE"] = "off"
-
-    output = make_directory(options.output)
-    origin = provenance()
-    texts, numbers = [f"# Batches\n\n{json.dumps(origin)}"], {"provenance": origin}
-    print(texts[0])
-    for name in options.only:
-        for title, note, rows, measured in PARTS[name](options):
-            texts.append(f"## {title}\n\n{note}\n\n{markdown(rows)}")
-            print(f"\n{texts[-1]}", flush=True)
-            numbers[name] = measured
-            (output / "batches.md").write_text("\n\n".join(texts), "utf-8")
-            (output / "batches.json").write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")
+    measure_parts("Batches", PARTS, options)
 
 
 if __name__ == "__main__":

@@ -43,7 +43,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from importlib import import_module
@@ -988,19 +988,34 @@ def main() -> None:
     options.sizes, options.repeats = (SIZES[:1], 3) if options.quick else (SIZES, 9)
     os.environ["JAXSMW_CACHE"] = "off"
 
-    output = make_directory(options.output)
+    measure_parts("Speed", PARTS, options, draw)
+
+
+def measure_parts(
+    title: str,
+    parts: Mapping[str, Callable[[argparse.Namespace], Iterator[Part]]],
+    options: argparse.Namespace,
+    draw: Callable[[dict[str, Any], Path], object] | None = None,
+) -> None:
+    """Measure the parts named in `options.only`, and print each table when it is measured.
+
+    The tables and all numbers are written to files in `options.output`, with names made from the title. The
+    function `draw` draws the numbers to a file.
+    """
+    file = make_directory(options.output) / title.lower()
     origin = provenance()
-    parts, numbers = [f"# Speed\n\n{json.dumps(origin)}"], {"provenance": origin}
-    print(parts[0])
+    texts, numbers = [f"# {title}\n\n{json.dumps(origin)}"], {"provenance": origin}
+    print(texts[0])
     for name in options.only:
         numbers[name] = []
-        for title, note, rows, measured in PARTS[name](options):
-            parts.append(f"## {title}\n\n{note}\n\n{markdown(rows)}")
-            print(f"\n{parts[-1]}", flush=True)
+        for heading, note, rows, measured in parts[name](options):
+            texts.append(f"## {heading}\n\n{note}\n\n{markdown(rows)}")
+            print(f"\n{texts[-1]}", flush=True)
             numbers[name].append(measured)
-            (output / "speed.md").write_text("\n\n".join(parts), "utf-8")
-            (output / "speed.json").write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")
-            draw(numbers, output / "speed.png")
+            file.with_suffix(".md").write_text("\n\n".join(texts), "utf-8")
+            file.with_suffix(".json").write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")
+            if draw is not None:
+                draw(numbers, file.with_suffix(".png"))
 
 
 if __name__ == "__main__":

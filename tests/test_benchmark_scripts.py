@@ -51,7 +51,7 @@ def test_batches_of_the_preset_accurate_are_measured(monkeypatch, capsys, tmp_pa
     arguments = ["--only", "accurate", "--vertices", "900", "--pairs", "2", "--batch-sizes", "2", "8"]
     rows = rows_of(monkeypatch, capsys, tmp_path, *arguments)
     assert rows[2:] == ["products alone", "batches of 1", "batches of 2", "match_pairs"]
-    numbers = json.loads((tmp_path / "batches.json").read_text())["accurate"]
+    (numbers,) = json.loads((tmp_path / "batches.json").read_text())["accurate"]
     assert numbers["pairs"] == 2 and 0 < numbers["products"] < numbers["seconds"]["match_pairs"]
 
 

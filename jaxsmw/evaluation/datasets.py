@@ -132,9 +132,14 @@ class DataSet:
     def shapes(self) -> dict[str, Path]:
         """A dictionary from the names of shapes to their mesh files, for all shapes that occur in a pair."""
         found = {}
-        for pair in (*self.pairs, *self.others):
+        for pair in self.known_pairs.values():
             found[pair.source], found[pair.target] = pair.source_file, pair.target_file
         return found
+
+    @property
+    def known_pairs(self) -> dict[tuple[str, str], DataPair]:
+        """A dictionary from the names of each pair with ground truth to the pair."""
+        return {pair.names: pair for pair in (*self.pairs, *self.others)}
 
 
 def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
@@ -353,7 +358,7 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
             raise InputError(f"{count} pairs cannot be measured: give at least 1.")
         rows = np.random.default_rng(seed).permutation(len(pairs))[:count]
         return [pairs[row] for row in np.sort(rows)]
-    known = {pair.names: pair for pair in (*pairs, *data_set.others)}
+    known = data_set.known_pairs
     listed = read_pairs(wanted, data_set.shapes)
     if unknown := [names for names in listed if names not in known]:
         raise InputError(
@@ -400,15 +405,7 @@ def _remeshed(directory: Path) -> _Pairs | None:
             f"{directory}: has {len(plain)} .vts files in corres/, but no folder with their meshes: put the "
             "meshes into off/ next to corres/."
         )
-    if missing := [name for name in shapes if name not in plain]:
-        raise InputError(
-            f"{truths / missing[0]}.vts: the ground truth of {shapes[missing[0]]} is missing: add this file, "
-            "or remove the mesh."
-        )
-    if missing := [name for name in plain if name not in shapes]:
-        raise InputError(
-            f"{directory}: has no mesh for {plain[missing[0]]}: add the mesh, or remove the .vts file."
-        )
+    _check_complete(directory, shapes, plain)
 
     def pair(x: str, y: str) -> DataPair:
         mirrored = None
@@ -421,6 +418,19 @@ def _remeshed(directory: Path) -> _Pairs | None:
     # whether a set is of this kind, so all pairs are allowed.
     present = {one.names for one in (*pairs, *others)}
     return pairs, others + [pair(*names) for names in permutations(shapes, 2) if names not in present]
+
+
+def _check_complete(directory: Path, shapes: Mapping[str, Path], truths: Mapping[str, Path]) -> None:
+    """Raise `InputError` if a mesh has no `.vts` file in `corres/`, or a `.vts` file has no mesh."""
+    if missing := [name for name in shapes if name not in truths]:
+        raise InputError(
+            f"{directory / 'corres' / missing[0]}.vts: the ground truth of {shapes[missing[0]]} is missing: "
+            "add this file, or remove the mesh."
+        )
+    if missing := [name for name in truths if name not in shapes]:
+        raise InputError(
+            f"{directory}: has no mesh for {truths[missing[0]]}: add the mesh, or remove the .vts file."
+        )
 
 
 def _shrec19(directory: Path) -> _Pairs | None:
@@ -505,15 +515,7 @@ def _characters(directory: Path) -> _Pairs | None:
         if folder.is_dir() and folder.name != "corres" and not shapes:
             classes = (inner for inner in sorted(folder.iterdir()) if inner.is_dir())
             shapes = {f"{one.name}/{name}": file for one in classes for name, file in _meshes(one).items()}
-    if missing := [name for name in truths if name not in shapes]:
-        raise InputError(
-            f"{directory}: has no mesh for {truths[missing[0]]}: add the mesh, or remove the .vts file."
-        )
-    if missing := [name for name in shapes if name not in truths]:
-        raise InputError(
-            f"{directory / 'corres' / missing[0]}.vts: the ground truth of {shapes[missing[0]]} is missing: "
-            "add this file, or remove the mesh."
-        )
+    _check_complete(directory, shapes, truths)
 
     def pair(x: str, y: str, *between: Path) -> DataPair:
         return DataPair(x, y, shapes[x], shapes[y], (truths[x], truths[y], *between))

@@ -141,18 +141,8 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
     if len(files) not in (1, 2, 3):
         raise InputError(f"ground truth: {len(files)} files were given: give one to three files.")
 
-    if len(files) == 3:
-        return _through_lines(files, mesh_x, mesh_y, index_base)
-    if len(files) == 2:
-        tables = [Table(file, columns=1) for file in files]
-        if tables[0].rows != tables[1].rows:
-            raise InputError(
-                f"{files[1]}: has {tables[1].rows} lines and {files[0]} has {tables[0].rows}, "
-                "but line i of both files must describe the same point: give two files of one data set."
-            )
-        bases = [t.index_base(index_base, default=1 if t.path.suffix == ".vts" else 0) for t in tables]
-        sides = zip(tables, (mesh_x, mesh_y), bases, strict=True)
-        return GroundTruth(*(table.vertices(0, mesh, base) for table, mesh, base in sides))
+    if len(files) > 1:
+        return _read_lines(files, mesh_x, mesh_y, index_base)
 
     (file,) = files
     if file.suffix == ".vts":
@@ -176,19 +166,23 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
     return GroundTruth.of_all_vertices(table.vertices(0, mesh_y, table.index_base(index_base)))
 
 
-def _through_lines(
-    files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBase | None
-) -> GroundTruth:
-    """Read three files, of which the third contains lines of the second."""
-    of_x, of_y, lines = (Table(file, columns=1) for file in files)
-    if lines.rows != of_x.rows:
+def _read_lines(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBase | None) -> GroundTruth:
+    """Read files for the source and the target, and perhaps a third file with lines of the second file."""
+    tables = [Table(file, columns=1) for file in files]
+    first, last = tables[0], tables[-1]
+    if first.rows != last.rows:
         raise InputError(
-            f"{lines.path}: has {lines.rows} lines and {of_x.path} has {of_x.rows}, but line i of both files "
-            "must describe the same point: give files of one data set."
+            f"{last.path}: has {last.rows} lines and {first.path} has {first.rows}, but line i of both files "
+            f"must describe the same point: give {len(files)} files of one data set."
         )
-    bases = [table.index_base(index_base, default=1) for table in (of_x, of_y, lines)]
-    chosen = lines.indices(0, of_y.rows, f"lines of {of_y.path}", bases[2])
-    return GroundTruth(of_x.vertices(0, mesh_x, bases[0]), of_y.vertices(0, mesh_y, bases[1])[chosen])
+    bases = [t.index_base(index_base, default=1 if t.path.suffix == ".vts" else 0) for t in tables]
+    sources, targets = (
+        table.vertices(0, mesh, base)
+        for table, mesh, base in zip(tables, (mesh_x, mesh_y), bases, strict=False)
+    )
+    if len(files) == 3:
+        targets = targets[last.indices(0, len(targets), f"lines of {files[1]}", bases[2])]
+    return GroundTruth(sources, targets)
 
 
 def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, mesh_y: Mesh) -> None:

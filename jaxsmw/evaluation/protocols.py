@@ -73,7 +73,7 @@ def _between(data_set: DataSet, names: Iterable[tuple[str, str]]) -> list[DataPa
     if missing := [shape for shape in dict.fromkeys(chain.from_iterable(names)) if shape not in shapes]:
         count = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
         raise _MissingError(f"lacks the shapes {', '.join(missing[:3])}{count}")
-    known = {pair.names: pair for pair in (*data_set.pairs, *data_set.others)}
+    known = data_set.known_pairs
     if unknown := [pair for pair in names if pair not in known]:
         raise _MissingError(f"lacks the ground truth of {' to '.join(unknown[0])}")
     return [known[pair] for pair in names]
@@ -100,7 +100,7 @@ def _whole_humans(data_set: DataSet) -> list[DataPair]:
     shapes = [str(number) for number in range(1, 45) if number != 40]
     if missing := [shape for shape in shapes if shape not in data_set.shapes]:
         raise _MissingError(f"lacks {len(missing)} of the shapes 1 to 44, such as {missing[0]}")
-    return [pair for pair in (*data_set.pairs, *data_set.others) if "40" not in pair.names]
+    return [pair for names, pair in data_set.known_pairs.items() if "40" not in names]
 
 
 _TOSCA_CLASSES = {"cat", "centaur", "david", "dog", "gorilla", "horse", "michael", "victoria", "wolf"}

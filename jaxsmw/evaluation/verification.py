@@ -120,8 +120,8 @@ class StoredResults:
 
         **Raises:** `InputError` if the data set lacks a stored pair.
         """
-        known = {pair.names: pair for pair in (*data_set.pairs, *data_set.others)}
-        stored = list(dict.fromkeys((row["source"], row["target"]) for row in self.rows))
+        known = data_set.known_pairs
+        stored = list(dict.fromkeys(_key(row)[:2] for row in self.rows))
         if unknown := [names for names in stored if names not in known]:
             raise InputError(
                 f"{self.path}: contains the pair {' to '.join(unknown[0])}, which is not in "
