@@ -65,6 +65,7 @@ MethodName = Literal[
     "icp",
     "cpd",
     "bcicp",
+    "smooth-shells",
     "pfm",
     "zoomout",
     "zoomout-sampled",

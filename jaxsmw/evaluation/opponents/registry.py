@@ -16,6 +16,7 @@ from jaxsmw.evaluation.opponents.partial_functional_maps import PARTIAL_FUNCTION
 from jaxsmw.evaluation.opponents.peers import installed_peers
 from jaxsmw.evaluation.opponents.presets import ACCURATE, MWP, MWP_SAMPLED
 from jaxsmw.evaluation.opponents.published_maps import PublishedMaps
+from jaxsmw.evaluation.opponents.smooth_shells import SMOOTH_SHELLS
 from jaxsmw.evaluation.opponents.spectral_icp import NO_FILTER, SPECTRAL_ICP
 from jaxsmw.evaluation.opponents.zoomout import ZOOMOUT, ZOOMOUT_SAMPLED
 
@@ -28,6 +29,7 @@ METHODS: dict[str, Method] = {
     "icp": SPECTRAL_ICP,
     "cpd": CPD,
     "bcicp": BCICP,
+    "smooth-shells": SMOOTH_SHELLS,
     "pfm": PARTIAL_FUNCTIONAL_MAPS,
     "zoomout": ZOOMOUT,
     "zoomout-sampled": ZOOMOUT_SAMPLED,
