@@ -640,7 +640,7 @@ def scale(options: argparse.Namespace) -> Iterator[Part]:
 def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]) -> Part:
     """Measure one preset at several sizes, cold and warm."""
     truth = pair_with_truth(options)
-    rows, measured = [], []
+    measured: list[dict[str, Any]] = []
     for size in sizes:
         meshes = [finer(mesh, size, seed=size + side) for side, mesh in enumerate(truth.meshes)]
         with tempfile.TemporaryDirectory() as directory:
@@ -666,21 +666,32 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
                 "errors": errors,
             }
         )
-        rows.append(
-            [str(size)]
-            + [f"{taken:.1f}" for taken in (*cold.seconds.values(), *totals.values())]
-            + [f"{cold.peak:.2f}", *(f"{e:.1f}" for e in errors)]
-        )
-    names = [*measured[0]["seconds"]], [*measured[0]["totals"]]
+    # Some stages run only for some sizes, and only then have steps of their own.
+    names = [
+        list(dict.fromkeys(name for each in measured for name in each[kind]))
+        for kind in ("seconds", "totals")
+    ]
     columns = [*names[0], *names[1], "peak GiB", "initial error", "refined error"]
+    rows = [
+        [
+            str(each["vertices"]),
+            *(f"{each['seconds'].get(name, 0):.1f}" for name in names[0]),
+            *(f"{each['totals'][name]:.1f}" for name in names[1]),
+            f"{each['peak_gib']:.2f}",
+            *(f"{error:.1f}" for error in each["errors"]),
+        ]
+        for each in measured
+    ]
 
     def exponent(values: list[float]) -> str:
         # The fit leaves out the smallest size, because constant costs dominate the time at this size.
+        if min(values[1:]) <= 0:
+            return ""
         return f"{np.polyfit(np.log([m['vertices'] for m in measured[1:]]), np.log(values[1:]), 1)[0]:.2f}"
 
     if len(measured) > 2:
         exponents = [
-            exponent([m[kind][name] for m in measured])
+            exponent([m[kind].get(name, 0) for m in measured])
             for kind, each in zip(("seconds", "totals"), names, strict=True)
             for name in each
         ]
