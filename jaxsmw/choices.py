@@ -64,7 +64,6 @@ MethodName = Literal[
     "no-filter",
     "icp",
     "cpd",
-    "bcicp",
     "smooth-shells",
     "pfm",
     "zoomout",

@@ -202,7 +202,6 @@ _CHANGES: dict[str, list[dict[str, int]]] = {
     "mwp": [{"k": k, "iterations": i} for i in (3, 10) for k in (50, 100, 150, 200) if (k, i) != (100, 3)],
     "icp": [{"k": 20}, {"k": 50}, {"k": 200}, {"iterations": 50}],
     "cpd": [{"k": 20}, {"k": 60}],
-    "bcicp": [{"k": 30}, {"k": 100}],
     "zoomout": [{"k": 60}, {"k": 200}, {"first": 10}, {"first": 50}, {"step": 1}, {"step": 20}],
 }
 

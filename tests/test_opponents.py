@@ -94,7 +94,7 @@ def test_all_methods_repair_a_noisy_initial_map():
     prepared = PreparedPair(Pair(mesh_x, mesh_y), x, y, initial_map, initial_map, on_both)
     pair = MethodInput.of(prepared, ("X", "Y"))
     for name, method in METHODS.items():
-        if method.both_directions or method.partial_only or isinstance(method, SmoothShells):
+        if method.partial_only or isinstance(method, SmoothShells):
             continue  # tested in files of their own
         if isinstance(method, ZoomOut):
             # JAX compiles the program anew for each size, so large steps save time.

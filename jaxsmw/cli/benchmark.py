@@ -34,8 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="methods to measure (default: all methods that suit the pairs): "
         f"{', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} if these libraries are "
         "installed. For a method of another program, give the directory of its maps, in files named X_Y.map. "
-        "cpd and smooth-shells take 20 to 30 seconds per pair, and bcicp takes 15 seconds per pair. pfm "
-        "matches partial shapes only",
+        "cpd and smooth-shells take 20 to 30 seconds per pair. pfm matches partial shapes only",
     )
     pairs = parser.add_mutually_exclusive_group()
     pairs.add_argument(

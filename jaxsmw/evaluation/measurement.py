@@ -232,7 +232,6 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
         settings.init,
         number_of_eigenvectors,
         number_of_descriptors=max(method.number_of_descriptors for method in methods),
-        both_directions=any(method.both_directions for method in methods),
     )
     rows = []
     for name, method in task.methods.items():

@@ -6,8 +6,8 @@ The modules of this package are:
 - `initial_map`: the initial map without refinement.
 - `presets`: this library's own methods.
 - `published_maps`: methods that read the maps of other programs from files.
-- `spectral_icp`, `zoomout`, `bcicp`, `smooth_shells`, `cpd`, `partial_functional_maps`: methods by other
-  authors, reimplemented here.
+- `spectral_icp`, `zoomout`, `smooth_shells`, `cpd`, `partial_functional_maps`: methods by other authors,
+  reimplemented here.
 - `peers`: methods of other libraries, if these are installed.
 - `registry`: the name of each method on the command line and in results.
 

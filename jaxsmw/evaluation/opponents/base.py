@@ -9,9 +9,7 @@ import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Int, Int64
+from jaxtyping import Array, Int
 
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
@@ -19,7 +17,6 @@ from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.preparation import PreparedPair
-from jaxsmw.runtime.padding import pad_rows
 from jaxsmw.stage import Stage
 
 MOST_SAMPLES = 1000
@@ -41,8 +38,6 @@ class MethodInput:
     - `initial_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `samples`: sampled vertices of X (s_x,) and of Y (s_y,) in farthest-point order, for methods that
       iterate on samples.
-    - `reverse_initial_map`: the initial map Y -> X (n,), 0-based vertices of X, or None. Methods whose
-      attribute `both_directions` is True need this map.
     - `meshes`: the meshes of X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
     - `partial`: whether X and Y are a partial pair, that is, one shape is a part of the other shape. The
@@ -54,39 +49,27 @@ class MethodInput:
     spectrum_y: Spectrum
     initial_map: Int[Array, " m"]
     samples: tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
-    reverse_initial_map: Int[Array, " n"] | None = None
     meshes: tuple[Mesh, Mesh] | None = None
     names: tuple[str, str] = ("X", "Y")
     partial: bool = False
     prepared: PreparedPair | None = None
 
     @classmethod
-    def of(
-        cls,
-        prepared: PreparedPair,
-        names: tuple[str, str],
-        reverse_initial_map: Int64[np.ndarray, " n"] | None = None,
-    ) -> MethodInput:
+    def of(cls, prepared: PreparedPair, names: tuple[str, str]) -> MethodInput:
         """Create the input of all methods from a prepared pair.
 
         **Arguments:**
 
         - `prepared`: the prepared pair that `jaxsmw.preparation.prepare` returns, with samples.
         - `names`: the names of X and Y.
-        - `reverse_initial_map`: the initial map Y -> X (n,), or None.
         """
         assert prepared.samples is not None
         spectrum_x, spectrum_y = prepared.padded
-        reverse = None
-        if reverse_initial_map is not None:
-            padded = pad_rows(reverse_initial_map, spectrum_y.mask.shape[0])
-            reverse = jnp.asarray(padded, jnp.int32)
         return cls(
             spectrum_x,
             spectrum_y,
             prepared.padded_map(prepared.initial_map),
             prepared.samples,
-            reverse,
             prepared.pair.meshes,
             names,
             prepared.pair.partial,
@@ -124,7 +107,6 @@ class Method(abc.ABC):
     - `reference`: the publication and the settings of the method, as text that is printed with the results.
     - `number_of_eigenvectors`: the largest number of eigenvectors that the method uses.
     - `number_of_descriptors`: the largest number of descriptors that the method uses.
-    - `both_directions`: whether the method needs `MethodInput.reverse_initial_map`.
     - `full_only`: whether the method matches only pairs of full shapes.
     - `partial_only`: whether the method matches only partial pairs.
     """
@@ -132,7 +114,6 @@ class Method(abc.ABC):
     reference: str
     number_of_eigenvectors: int
     number_of_descriptors: int = 0
-    both_directions: bool = False
     full_only: bool = False
     partial_only: bool = False
 

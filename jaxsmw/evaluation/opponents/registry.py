@@ -9,7 +9,6 @@ from pathlib import Path
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.evaluation.opponents.base import Method
-from jaxsmw.evaluation.opponents.bcicp import BCICP
 from jaxsmw.evaluation.opponents.cpd import CPD
 from jaxsmw.evaluation.opponents.initial_map import UNREFINED
 from jaxsmw.evaluation.opponents.partial_functional_maps import PARTIAL_FUNCTIONAL_MAPS
@@ -28,7 +27,6 @@ METHODS: dict[str, Method] = {
     "no-filter": NO_FILTER,
     "icp": SPECTRAL_ICP,
     "cpd": CPD,
-    "bcicp": BCICP,
     "smooth-shells": SMOOTH_SHELLS,
     "pfm": PARTIAL_FUNCTIONAL_MAPS,
     "zoomout": ZOOMOUT,

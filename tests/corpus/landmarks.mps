@@ -1,0 +1,2 @@
+<?xml version="1.0" encoding="UTF-8"?>
+<point_set_file><file_version>0.1</file_version><point_set><time_series><time_series_id>0</time_series_id><point><id>0</id><specification>0</specification><x>-0.49744</x><y>0.80487</y><z>0.00000</z></point><point><id>1</id><specification>0</specification><x>0.00000</x><y>0.50689</y><z>0.82016</z></point><point><id>2</id><specification>0</specification><x>0.84162</x><y>0.00000</y><z>0.52015</z></point></time_series></point_set></point_set_file>
