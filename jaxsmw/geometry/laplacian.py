@@ -40,8 +40,8 @@ def assemble_laplacian(
     areas A (n,), in the squared unit of the mesh. The rows of W and the entries of A are zero for
     unreferenced vertices.
 
-    **Raises:** `InputError` if the cotangent Laplacian is requested, but faces without area make this
-    Laplacian undefined.
+    **Raises:** `InputError` if the Laplacian contains NaN or a vertex has no positive area, for example
+    because faces without area make the cotangent Laplacian undefined.
     """
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)
@@ -53,11 +53,17 @@ def assemble_laplacian(
         local_stiffness, mass = robust_laplacian.mesh_laplacian(
             np.ascontiguousarray(mesh.vertices[referenced]), np.ascontiguousarray(compact[mesh.faces])
         )
+        masses = mass.diagonal()
+        if not np.isfinite(local_stiffness.data).all() or not (masses > 0).all():
+            raise InputError(
+                f"{mesh.name}: the robust Laplacian contains NaN, or a vertex has no positive area: remesh "
+                "the surface, or remove the triangles without area."
+            )
         scatter = sp.csc_matrix(
             (np.ones(len(referenced)), (referenced, np.arange(len(referenced)))),
             shape=(len(mesh.vertices), len(referenced)),
         )
-        return (scatter @ local_stiffness @ scatter.T).tocsc(), scatter @ mass.diagonal()
+        return (scatter @ local_stiffness @ scatter.T).tocsc(), scatter @ masses
     stiffness = -igl.cotmatrix(mesh.vertices, mesh.faces).tocsc()
     areas = mesh.vertex_areas
     if not np.isfinite(stiffness.data).all() or (areas[mesh.referenced_vertices] <= 0).any():

@@ -39,6 +39,8 @@ def nearest_among_compared(
     - `y`: the shape Y. Rows of masked vertices are never chosen.
 
     **Returns:** The row numbers in `features_y` (a,), 0-based.
+
+    **Raises:** `ArithmeticError` if some of the found rows are not the nearest; see `_check_nearest`.
     """
     dtype = y.spectrum.eigenvectors.dtype
 
@@ -49,7 +51,49 @@ def nearest_among_compared(
         *(padded(features.astype(dtype)) for features in (features_x, features_y)),
         database_mask=padded(np.asarray(y.spectrum.mask)),
     )
-    return np.asarray(nearest)[: len(features_x)].astype(np.int64)
+    found = np.asarray(nearest)[: len(features_x)].astype(np.int64)
+    usable = np.flatnonzero(np.asarray(y.spectrum.mask)[: len(features_y)])
+    _check_nearest(features_x, features_y, usable, found)
+    return found
+
+
+def _check_nearest(
+    queries: Float[np.ndarray, "a d"],
+    database: Float[np.ndarray, "b d"],
+    usable: Int64[np.ndarray, " u"],
+    found: Int64[np.ndarray, " a"],
+) -> None:
+    """Check a few results of a nearest-neighbour search, because all maps depend on this search.
+
+    NumPy computes the distances of some queries to the whole database in float64. A broken installation of
+    JAX, a broken processor or a compiler fault would otherwise give a wrong map without a message.
+
+    **Arguments:**
+
+    - `queries`, `database`: the points, (a, d) and (b, d). Points with NaN are not checked here.
+    - `usable`: the rows of the database that the search may return (u,).
+    - `found`: the row of the database that the search returned for each query (a,).
+
+    **Raises:** `ArithmeticError` if a result is not usable, or is farther than the nearest row by more than
+    the rounding errors of float32.
+    """
+    rows = np.linspace(0, len(queries) - 1, _CHECKED_QUERIES).astype(int)
+    few, all_rows = queries[rows].astype(np.float64), database[usable].astype(np.float64)
+    sizes, size = (all_rows**2).sum(axis=1), (few**2).sum(axis=1)
+    if not (np.isfinite(sizes).all() and np.isfinite(size).all()):
+        return
+    squared = size[:, None] - 2 * few @ all_rows.T + sizes
+    reached = ((few - database[found[rows]].astype(np.float64)) ** 2).sum(axis=1)
+    tolerance = _TOLERANCE * (size + sizes.max())
+    if not (np.isin(found[rows], usable).all() and (reached <= squared.min(axis=1) + tolerance).all()):
+        raise ArithmeticError(
+            "JAX returned wrong nearest neighbours, so numerical results of this installation cannot be "
+            "trusted: install jax and jaxlib again, and unset XLA_FLAGS and JAX_PLATFORMS."
+        )
+
+
+# The number of queries that `_check_nearest` checks, and the tolerance relative to the squared norms.
+_CHECKED_QUERIES, _TOLERANCE = 32, 1e-4
 
 
 def to_all_vertices(sampled: SampledPair, found: Int64[np.ndarray, " a"]) -> Int64[np.ndarray, " m"]:
