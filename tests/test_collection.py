@@ -211,9 +211,15 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
             yield edge
 
     monkeypatch.setattr(edge_matcher, "match_edges", corrupting)
-    result = match_collection(meshes, preset="paper", settings=settings, mirror="no")
+    options = {"preset": "paper", "settings": settings, "mirror": "no", "directory": tmp_path}
+    result = match_collection(meshes, **options)
     (edge,) = (edge for edge in result.edges if (edge.source, edge.target) == (1, 3))
     assert edge.decision == "replaced"
+    # The same command keeps the template of its earlier results, which must not change the maps.
+    again = match_collection(meshes, template=result.template, **options)
+    for points, expected in zip(again.points, result.points, strict=True):
+        np.testing.assert_array_equal(points.faces, expected.faces)
+        np.testing.assert_array_equal(points.weights, expected.weights)
     assert "replaced" in edge.sentence(result.names)
     assert edge.residual < 0.05
     assert max(error(result, shapes, i, j) for i, j in permutations(range(5), 2)) < 0.1

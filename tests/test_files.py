@@ -2,12 +2,16 @@
 
 import errno
 import os
+import subprocess
+import sys
+import textwrap
 import threading
 from pathlib import Path
 
 import pytest
 
 from jaxsmw.errors import InputError
+from jaxsmw.runtime import files
 from jaxsmw.runtime.files import (
     atomic_write,
     check_directory,
@@ -104,6 +108,45 @@ def test_leftovers_of_killed_processes_are_removed_and_nothing_else(tmp_path):
     remove_leftovers(tmp_path)
     assert set(os.listdir(tmp_path)) == kept
     remove_leftovers(tmp_path / "missing")
+
+
+def test_files_of_living_processes_are_no_leftovers(tmp_path):
+    """Another process is in the middle of a write. Its file stays until the process is killed."""
+    program = """
+        import sys, time
+        from jaxsmw.runtime.files import atomic_write
+        with atomic_write(sys.argv[1]) as temporary:
+            temporary.write_text("half")
+            print("ready", flush=True)
+            time.sleep(60)
+        """
+    call = [sys.executable, "-c", textwrap.dedent(program), str(tmp_path / "map.txt")]
+    with subprocess.Popen(call, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+        (unfinished,) = os.listdir(tmp_path)
+        remove_leftovers(tmp_path)
+        assert os.listdir(tmp_path) == [unfinished]
+        process.kill()
+    # The first write of a process removes leftovers from the directory.
+    files._without_leftovers.discard(tmp_path)
+    with atomic_write(tmp_path / "other.txt"):
+        assert unfinished not in os.listdir(tmp_path)
+    assert os.listdir(tmp_path) == ["other.txt"]
+
+
+def test_without_locks_no_file_is_removed(tmp_path, monkeypatch):
+    """Some network file systems refuse locks. Writes work, and files of other processes stay."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    leftover = tmp_path / f".{'0' * 32}.txt"
+    leftover.touch()
+    files._without_leftovers.discard(tmp_path)
+    with atomic_write(tmp_path / "map.txt") as temporary:
+        temporary.write_text("whole")
+    assert (tmp_path / "map.txt").read_text() == "whole" and leftover.exists()
 
 
 def test_check_writable_raises_what_atomic_write_would_raise_later(tmp_path):

@@ -1,4 +1,4 @@
-"""Termination on Ctrl-C: the process ends immediately, prints one line and leaves no unfinished files.
+"""Termination on Ctrl-C or SIGTERM: the process ends at once, prints one line and leaves no unfinished files.
 
 By default Python raises `KeyboardInterrupt` in the main thread. Compiled code delays this exception until the
 code returns to Python. If `KeyboardInterrupt` is raised during garbage collection, Python discards it. If
@@ -26,20 +26,25 @@ if TYPE_CHECKING:
 # within this number of seconds, the second thread ends the process.
 _PATIENCE = 0.2
 
+# SIGINT comes from Ctrl-C. SIGTERM comes from `kill`, job schedulers and containers.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
 _message = "jaxsmw: interrupted; output files are complete or were not written.\n"
 # The thread that ends the process acquires this lock and never releases it, so no second thread interferes.
 _ending = allocate_lock()
 
 
 def end_when_interrupted() -> None:
-    """Install a handler that ends this process on SIGINT.
+    """Install a handler that ends this process on SIGINT and SIGTERM.
 
-    If SIGINT was already ignored when the process started, no handler is installed. The function must be
-    called in the main thread.
+    If a signal was already ignored when the process started, no handler is installed for it. The function
+    must be called in the main thread.
     """
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    handled = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    if not handled:
         return
-    signal.signal(signal.SIGINT, _end)
+    for number in handled:
+        signal.signal(number, _end)
     import threading
 
     reading, writing = os.pipe()
@@ -80,17 +85,17 @@ def quiet_children() -> Iterator[None]:
 
 
 def _wait_for_signal(reading: int) -> None:
-    while os.read(reading, 1) != bytes([signal.SIGINT]):
+    while (number := os.read(reading, 1)[0]) not in _SIGNALS:
         pass  # ignore other signals
     time.sleep(_PATIENCE)
-    _end()
+    _end(number)
     # `_end` returns only if the main thread already runs `_end`. The main thread may be stuck, for example
     # because nobody reads the message from a pipe. Therefore this thread ends the process after one second.
     time.sleep(1)
-    _die()
+    _die(number)
 
 
-def _end(*_: object) -> None:
+def _end(number: int, *_: object) -> None:
     if not _ending.acquire(blocking=False):
         return
     console = -1
@@ -107,7 +112,7 @@ def _end(*_: object) -> None:
         line = f"\n{_message.lstrip()}" if os.isatty(console) else _message
         # `print` would fail if the signal had interrupted another call of `print`.
         os.write(console, line.encode(errors="surrogateescape"))
-    _die()
+    _die(number)
 
 
 def _remove_unfinished_files() -> None:
@@ -116,15 +121,15 @@ def _remove_unfinished_files() -> None:
             files.remove_unfinished()
 
 
-def _die() -> None:
-    """End the process by SIGINT, which also ends a shell loop around the command."""
+def _die(number: int) -> None:
+    """End the process by a signal. SIGINT also ends a shell loop around the command."""
     with suppress(Exception):
         try:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
+            signal.signal(number, signal.SIG_DFL)
         except ValueError:  # `signal.signal` is allowed only in the main thread
             import ctypes
 
-            ctypes.pythonapi.PyOS_setsig(signal.SIGINT, signal.SIG_DFL)
-        os.kill(os.getpid(), signal.SIGINT)
+            ctypes.pythonapi.PyOS_setsig(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
         time.sleep(1)
-    os._exit(128 + signal.SIGINT)
+    os._exit(128 + number)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -46,16 +46,14 @@ class ConsistentMaps:
         shapes: Sequence[PreparedShape],
         maps: Mapping[Edge, EdgeMap],
         settings: CollectionSettings,
-        template: int | None = None,
     ) -> ConsistentMaps:
-        """Estimate the errors of all edges from cycles, and synchronise the maps.
+        """Estimate the errors of all edges from cycles, and synchronise the maps through `Network.medoid`.
 
         **Arguments:**
 
         - `shapes`: the N shapes.
         - `maps`: the map of each edge. The edges must connect all shapes.
         - `settings`: the settings of the collection.
-        - `template`: the index of the template in `shapes`. The default is `Network.medoid`.
         """
         meshes, units = [shape.mesh for shape in shapes], [shape.mesh.area**0.5 for shape in shapes]
         points = _both_directions(maps)
@@ -75,8 +73,14 @@ class ConsistentMaps:
         network = Network(
             meshes, points, dict(zip(maps, errors.tolist(), strict=True)), settings.synchronization
         )
-        chosen = network.medoid() if template is None else template
-        return cls(shapes, maps, settings, network, chosen, synchronize(network, chosen), cycle_errors)
+        medoid = network.medoid()
+        return cls(shapes, maps, settings, network, medoid, synchronize(network, medoid), cycle_errors)
+
+    def through(self, template: int) -> ConsistentMaps:
+        """Return the consistent maps through another template, the index of a shape in `shapes`."""
+        if template == self.template:
+            return self
+        return replace(self, template=template, points=synchronize(self.network, template))
 
     def residual(self, edge: Edge, network: Network | None = None) -> float:
         """Return the mean distance between the maps of an edge and the maps through the template.

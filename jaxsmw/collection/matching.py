@@ -137,9 +137,10 @@ def match_collection(
         maps = matcher.match(dict.fromkeys(edges), "edges")
         _check_connected(maps, shapes)
     with timed("synchronization", seconds):
-        position = None if template is None else list(usable).index(template)
-        first = ConsistentMaps.of(shapes, maps, settings, position)
-        consistent, replaced = _match_contradicted(first, edges, matcher, position)
+        first = ConsistentMaps.of(shapes, maps, settings)
+        consistent, replaced = _match_contradicted(first, edges, matcher)
+        if template is not None:
+            consistent = consistent.through(list(usable).index(template))
     points = [
         points_on_uncut(_reflected(of_shape) if other else of_shape, shape.mesh, mesh)
         for of_shape, other, shape, mesh in zip(consistent.points, mirrored, shapes, kept, strict=True)
@@ -210,11 +211,11 @@ def _check_connected(maps: Mapping[Edge, EdgeMap], shapes: Sequence[PreparedShap
 
 
 def _match_contradicted(
-    consistent: ConsistentMaps, edges: Sequence[Edge], matcher: EdgeMatcher, template: int | None
+    consistent: ConsistentMaps, edges: Sequence[Edge], matcher: EdgeMatcher
 ) -> tuple[ConsistentMaps, set[Edge]]:
     """Repeat the match of each edge that contradicts the consistent maps, and synchronise all maps again.
 
-    The template is chosen again as well, unless its number is given.
+    The template is chosen again as well.
 
     **Returns:** The final consistent maps, and the edges whose maps were replaced.
     """
@@ -229,7 +230,7 @@ def _match_contradicted(
         if not better:
             break
         replaced |= set(better)
-        consistent = ConsistentMaps.of(matcher.shapes, {**consistent.maps, **better}, settings, template)
+        consistent = ConsistentMaps.of(matcher.shapes, {**consistent.maps, **better}, settings)
     return consistent, replaced
 
 

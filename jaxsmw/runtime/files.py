@@ -12,6 +12,11 @@ from pathlib import Path
 
 from jaxsmw.errors import InputError
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 LARGEST_FILE = 2**30
 """The size of the largest file that is read as a whole, in bytes (1 GiB).
 
@@ -85,7 +90,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     If the block raises an exception, the temporary file is removed, and `path` is unchanged. The temporary
     file is in the directory of `path`, so the move is atomic. The temporary file has the suffix of `path`,
     because writers such as `numpy.savez` and `savefig` depend on the suffix. If `path` is a symbolic link,
-    the target of the link is replaced.
+    the target of the link is replaced. Temporary files that killed processes left in the directory are
+    removed first.
 
     **Returns:**
 
@@ -100,14 +106,20 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = _target(path)
     temporary = _temporary(target)
     _unfinished.add(temporary)
+    lock = -1
     try:
         _check_target(path, target)
-        temporary.touch(exist_ok=False)
+        if target.parent not in _without_leftovers:
+            remove_leftovers(target.parent)
+            _without_leftovers.add(target.parent)
+        lock = _create_locked(temporary)
         yield temporary
         os.replace(temporary, target)
     except OSError as error:
         raise _unwritable(path, error) from error
     finally:
+        if lock >= 0:
+            os.close(lock)
         # The temporary file does not exist if it was moved to `path`, or if the directory does not exist.
         if os.path.lexists(temporary):
             temporary.unlink()
@@ -116,6 +128,33 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 # The temporary files of all open blocks of `atomic_write`.
 _unfinished: set[Path] = set()
+# The directories from which this process has removed leftovers.
+_without_leftovers: set[Path] = set()
+
+
+def _create_locked(temporary: Path) -> int:
+    """Create an empty file and lock it, so that no other process takes it for a leftover.
+
+    **Returns:** The open file descriptor. The lock ends when the descriptor is closed, or with the process.
+    """
+    while True:
+        descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+        _lock(descriptor, wait=True)
+        if os.path.exists(temporary):
+            return descriptor
+        # Another process removed the file before it was locked.
+        os.close(descriptor)
+
+
+def _lock(descriptor: int, *, wait: bool) -> bool:
+    """Lock a file, and return whether this worked. Some systems and file systems have no locks."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 def remove_unfinished() -> None:
@@ -130,16 +169,25 @@ def remove_unfinished() -> None:
 
 
 def remove_leftovers(directory: Path) -> None:
-    """Remove the temporary files of `atomic_write` from a directory.
+    """Remove the temporary files that killed processes left in a directory.
 
-    Such files stay behind when a process is killed. The caller must ensure that no other process is writing
-    to the directory. If the directory does not exist, nothing happens.
+    The file of a living process is locked, and stays. On systems and file systems without locks, all files
+    stay. If the directory does not exist, nothing happens.
     """
     with suppress(OSError):
         for name in os.listdir(directory):
             if _TEMPORARY.fullmatch(name):
                 with suppress(OSError):
-                    (directory / name).unlink()
+                    _remove_unlocked(directory / name)
+
+
+def _remove_unlocked(file: Path) -> None:
+    descriptor = os.open(file, os.O_RDWR)
+    try:
+        if _lock(descriptor, wait=False):
+            file.unlink()
+    finally:
+        os.close(descriptor)
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
