@@ -28,6 +28,9 @@ _SMALLEST_PART = 1e-3
 # The area of a closed full shape must be at least this share of the area of the part. The area of a body
 # changes by a few per cent between poses.
 _SMALLEST_FULL_SHAPE = 0.8
+# If a mesh has at least this number of vertices, the eigenbases of a pair are computed one after the other,
+# which takes half of the memory.
+_ONE_BY_ONE_FROM = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,12 +245,17 @@ def paired_spectra(
         )
     if eigensolver == "auto":  # both shapes need the same eigensolver, because the spectra are compared
         eigensolver = choose_eigensolver(*pair.meshes)
-    eigenpairs_x, eigenpairs_y = side_by_side(
-        lambda mesh: eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver),
-        *pair.meshes,
-    )
-    # `as_spectrum` runs outside of the threads, because threads do not inherit `jax.enable_x64`.
-    spectrum_x, spectrum_y = as_spectrum(pair.mesh_x, *eigenpairs_x), as_spectrum(pair.mesh_y, *eigenpairs_y)
+
+    def compute(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
+
+    if max(len(mesh.vertices) for mesh in pair.meshes) < _ONE_BY_ONE_FROM:
+        eigenpairs_x, eigenpairs_y = side_by_side(compute, *pair.meshes)
+        # `as_spectrum` runs outside of the threads, because threads do not inherit `jax.enable_x64`.
+        spectrum_x = as_spectrum(pair.mesh_x, *eigenpairs_x)
+        spectrum_y = as_spectrum(pair.mesh_y, *eigenpairs_y)
+    else:
+        spectrum_x, spectrum_y = (as_spectrum(mesh, *compute(mesh)) for mesh in pair.meshes)
     for mesh, spectrum in zip(pair.meshes, (spectrum_x, spectrum_y), strict=True):
         check_eigenvalues(mesh, spectrum)
     if not pair.partial:

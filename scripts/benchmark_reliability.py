@@ -39,8 +39,8 @@ from jaxsmw.report.figures import save_figure
 # The number of pairs of `determinism`, and the numbers of vertices of the creatures.
 COMPARED_PAIRS = 6
 VERTICES = 5000
-# The sizes of the creatures of `long_run`.
-SMALLEST, LARGEST = 500, 1000
+# The smallest and largest number of vertices of the creatures of `long_run`, and the number of sizes.
+SMALLEST, LARGEST, SIZES = 500, 760, 6
 # The instruction sets beyond AVX2, in the names of NumPy.
 AVX512 = "AVX512F,AVX512CD,AVX512_SKX,AVX512_CLX,AVX512_CNL,AVX512_ICL,AVX512_SPR"
 # Each condition is a set of environment variables. Maps are compared with those of the named condition.
@@ -149,7 +149,7 @@ def status() -> tuple[float, int, int]:
 def long_run(options: argparse.Namespace) -> Iterator[Part]:
     """Yield memory, memory maps, open files and times over many pairs."""
     generator = np.random.default_rng(0)
-    sizes = np.geomspace(SMALLEST, LARGEST, 12).astype(int)
+    sizes = np.geomspace(SMALLEST, LARGEST, SIZES).astype(int)
     shapes = [
         creature("biped", vertices=int(size), pose=pose, seed=0)
         for size in sizes

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import COMMANDS
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from jaxsmw.cli.run import run_command
@@ -217,6 +217,7 @@ def files(names: list[str]) -> st.SearchStrategy:
 
 @fuzzed(300)
 @given(files(MESHES))
+@example(("binary.pcd", [("integer", 0.96875, 0.939453125, 8)], None))  # a signalling NaN
 def test_damaged_meshes(case):
     name, changes, suffix_of = case
     with directories() as (inputs, outputs):

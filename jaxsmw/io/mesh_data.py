@@ -135,7 +135,9 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
             f"mesh to one of {', '.join([*_FORMATTERS, *POINT_CLOUD_SUFFIXES])}."
         )
     try:
-        polygons = parse_gltf(data, path.parent) if suffix == ".gltf" else _PARSERS[suffix](data)
+        # Damaged files can contain numbers that overflow, or signalling NaN. `make_mesh` refuses them later.
+        with np.errstate(all="ignore"):
+            polygons = parse_gltf(data, path.parent) if suffix == ".gltf" else _PARSERS[suffix](data)
         at, polygon = _fans(polygons.sizes)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
