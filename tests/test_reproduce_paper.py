@@ -1,5 +1,6 @@
 """One command repeats the comparisons of the paper, derives data sets, and reports failures."""
 
+import argparse
 import re
 import shutil
 import sys
@@ -44,6 +45,18 @@ def test_every_changed_setting_belongs_to_its_method():
     assert found["mwp: k = 200, iterations = 10"].number_of_eigenvectors == 200
     assert found["zoomout: first = 50"].first == 50 and found["zoomout: step = 1"].step == 1
     assert len(set(found.values())) == len(found) > 20
+
+
+def test_smooth_shells_has_a_table_of_its_own(data):
+    """SmoothShells takes as long per pair as all other methods together."""
+    options = argparse.Namespace(pairs=1, seed=0, quick=False)
+    sets = [open_data_set(data / "bumps")]
+    (first,), (second,) = (
+        list(table(sets, options)) for table in (reproduce_paper.table1, reproduce_paper.table2)
+    )
+    assert {"mwp", "zoomout", "cpd"} < first.methods.keys() and "smooth-shells" not in first.methods
+    assert list(second.methods) == ["mwp", "accurate", "smooth-shells"]
+    assert [pair.name for pair in first.pairs] == [pair.name for pair in second.pairs]
 
 
 @pytest.mark.parametrize("name", reproduce_paper.MESHINGS)
