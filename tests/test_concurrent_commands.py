@@ -1,0 +1,129 @@
+"""Several commands share one cache, also if one of them is killed, or if the cache disappears while they run."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from command_line import SMALL, write_pair
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="signals need Linux")]
+
+# `JAXSMW_KILLS` also chooses the long form of tests/test_killed_commands.py.
+AT_ONCE = 8 if "JAXSMW_KILLS" in os.environ else 3
+
+
+@pytest.fixture
+def pair(tmp_path) -> Path:
+    (tmp_path / "meshes").mkdir()
+    return write_pair(tmp_path / "meshes")
+
+
+def started(pair: Path, output: Path, cache: Path, *options: str) -> subprocess.Popen[str]:
+    """Start a match that uses a cache directory."""
+    words = [
+        "match",
+        pair / "x.off",
+        pair / "y.ply",
+        "--output",
+        output,
+        "--preset",
+        "paper",
+        *SMALL,
+        "--quiet",
+    ]
+    return subprocess.Popen(
+        [sys.executable, "-m", "jaxsmw", *map(str, words), *options],
+        env={**os.environ, "JAXSMW_CACHE": str(cache)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def finished(process: subprocess.Popen[str]) -> str:
+    """Wait for a command, which must succeed. Return what it printed on standard error."""
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    return errors
+
+
+def test_commands_at_once_share_a_cache(tmp_path, pair):
+    """All commands start with an empty cache, and one is killed while it fills the cache."""
+    cache, out = tmp_path / "cache", tmp_path / "out"
+    cache.mkdir()
+    out.mkdir()
+    processes = [started(pair, out / f"{number}.txt", cache) for number in range(AT_ONCE)]
+    while not any(cache.rglob("*")):
+        assert processes[0].poll() is None
+        time.sleep(0.02)
+    processes[0].send_signal(signal.SIGKILL)
+    for process in processes[1:]:
+        assert finished(process) == ""
+    processes[0].communicate()
+    maps = {(out / f"{number}.txt").read_text() for number in range(1, AT_ONCE)}
+    assert len(maps) == 1
+    # Another command uses what the killed command left, and removes its unfinished files.
+    assert finished(started(pair, out / "0.txt", cache)) == ""
+    assert {(out / "0.txt").read_text()} == maps
+
+
+def test_a_cache_that_disappears_changes_nothing(tmp_path, pair):
+    cache, expected, found = tmp_path / "cache", tmp_path / "expected.txt", tmp_path / "found.txt"
+    cache.mkdir()
+    finished(started(pair, expected, cache))
+    stop = threading.Event()
+
+    def remove_again_and_again() -> None:
+        while not stop.is_set():
+            shutil.rmtree(cache, ignore_errors=True)
+            time.sleep(0.05)
+
+    remover = threading.Thread(target=remove_again_and_again)
+    remover.start()
+    try:
+        errors = finished(started(pair, found, cache))
+    finally:
+        stop.set()
+        remover.join()
+    # A warning may say that results cannot be cached.
+    assert all(line.startswith("warning: ") for line in errors.splitlines()), errors
+    assert found.read_text() == expected.read_text()
+
+
+def test_a_cache_on_a_full_disk_changes_nothing(tmp_path, pair):
+    """`/dev/full` cannot be a directory, so a limit on the size of files stands for a full disk."""
+    expected, found = tmp_path / "expected.txt", tmp_path / "found.txt"
+    finished(started(pair, expected, tmp_path / "whole"))
+    program = (
+        "import resource, signal, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192));"
+        "from jaxsmw.cli import main; sys.exit(main())"
+    )
+    words = [
+        "match",
+        pair / "x.off",
+        pair / "y.ply",
+        "--output",
+        found,
+        "--preset",
+        "paper",
+        *SMALL,
+        "--quiet",
+    ]
+    ended = subprocess.run(
+        [sys.executable, "-c", program, *map(str, words)],
+        env={**os.environ, "JAXSMW_CACHE": str(tmp_path / "full")},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert all(line.startswith("warning: ") for line in ended.stderr.splitlines()), ended.stderr
+    assert found.read_text() == expected.read_text()
