@@ -1,5 +1,6 @@
 """The command line refuses bad files, bad arguments, and outputs that cannot be written."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -35,6 +36,25 @@ def test_a_tiny_mesh_is_refused(run, tmp_path):
     )
     assert_refused(run(*call, "--eigenvectors", "3"), naming="--init wks")
     assert run(*call, "--eigenvectors", "3", "--init", "hks").code == 0
+
+
+def test_a_missing_file_is_named_before_libraries_are_imported(tmp_path):
+    program = "import sys; from jaxsmw.cli.run import run_command; code = run_command(sys.argv[1:]);"
+    program += "sys.exit(100 if 'jax' in sys.modules else code)"
+    mesh, missing = tmp_path / "x.off", tmp_path / "missing.off"
+    write_mesh(mesh, bumpy_mesh(1))
+    for words in (
+        ["match", mesh, missing, "--output", tmp_path / "map.txt"],
+        ["transfer", mesh, missing, "--registered", tmp_path / "r.ply"],
+        ["evaluate", mesh, mesh, missing, "--ground-truth", mesh],
+        ["render", missing, "--output", tmp_path / "x.png"],
+        ["spectrum", missing],
+    ):
+        ended = subprocess.run(
+            [sys.executable, "-c", program, *map(str, words)], capture_output=True, text=True
+        )
+        assert ended.returncode == 2, ended.stderr
+        assert ended.stderr == f"jaxsmw: {missing}: does not exist: check the path.\n"
 
 
 def test_a_missing_matplotlib_is_reported_before_the_work(run, pair, tmp_path, monkeypatch):

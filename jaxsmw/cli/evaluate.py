@@ -16,7 +16,7 @@ from jaxsmw.cli.arguments import (
     refuse_without,
 )
 from jaxsmw.cli.console import show
-from jaxsmw.cli.inputs import read_maps, read_mesh_file, read_truth
+from jaxsmw.cli.inputs import check_inputs, read_maps, read_mesh_file, read_truth
 from jaxsmw.cli.measurement import (
     add_evaluation,
     add_ground_truth,
@@ -63,8 +63,10 @@ def run(options: argparse.Namespace) -> None:
     """
     check_evaluation(options)
     refuse_without(options, "--page", bool(options.page), "partial", "up")
+    inputs = [options.source, options.target, *options.map, *options.ground_truth]
+    check_inputs(*inputs)
     check_outputs(
-        [options.source, options.target, *options.map, *options.ground_truth],
+        inputs,
         files=[options.output],
         figures=[options.figure],
         pages=[options.page],

@@ -22,6 +22,19 @@ if TYPE_CHECKING:
     from jaxsmw.geometry.mesh import Mesh
 
 
+def check_inputs(*paths: str | None) -> None:
+    """Check that the input files of a command exist, before libraries are imported for a second.
+
+    Paths that are None are ignored.
+
+    **Raises:** `InputError` if a file does not exist or is not a regular file.
+    """
+    from jaxsmw.runtime.files import size_of_file
+
+    for file in filter(None, paths):
+        size_of_file(file)
+
+
 def read_mesh_file(file: str, *, weld: bool) -> Mesh:
     """Read a mesh, and print a summary of it on standard error unless `--quiet` is given.
 

@@ -17,7 +17,13 @@ from jaxsmw.cli.arguments import (
 )
 from jaxsmw.cli.conclusion import estimate_error, measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, show
-from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_mesh_file, read_truth
+from jaxsmw.cli.inputs import (
+    check_initial_map,
+    check_inputs,
+    initial_map_files,
+    read_mesh_file,
+    read_truth,
+)
 from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
 from jaxsmw.cli.method import add_method, check_preset, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
@@ -158,8 +164,10 @@ def _check(options: argparse.Namespace) -> None:
     for file, contents in ((expected, "expected errors are"), (overlap, "the overlap is")):
         if file and Path(file).suffix.lower() in (".npy", ".mat"):
             raise InputError(f"{file}: {contents} written as text: choose another suffix, such as .txt.")
+    inputs = [options.source, options.target, *init_files, *(options.ground_truth or ())]
+    check_inputs(*inputs)
     check_outputs(
-        [options.source, options.target, *init_files, *(options.ground_truth or ())],
+        inputs,
         files=[options.output, points, options.one_to_one, expected, overlap],
         directories=_directories(options),
     )

@@ -13,7 +13,7 @@ from jaxsmw.cli.arguments import (
     path,
     refuse_without,
 )
-from jaxsmw.cli.inputs import read_maps, read_mesh_file
+from jaxsmw.cli.inputs import check_inputs, read_maps, read_mesh_file
 from jaxsmw.cli.outputs import check_outputs, is_page, report_written, write_comparison_page
 from jaxsmw.errors import InputError
 
@@ -89,8 +89,10 @@ def _check(options: argparse.Namespace, page: bool) -> None:
             f"--partial: has an effect only on pages: leave --partial out, or write {output} as .html."
         )
     refuse_without(options, "a map", bool(options.map), "index_base")
+    inputs = [options.source, options.target, *options.map]
+    check_inputs(*inputs)
     check_outputs(
-        [options.source, options.target, *options.map],
+        inputs,
         figures=[] if page else [output],
         pages=[output] if page else [],
     )

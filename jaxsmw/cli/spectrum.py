@@ -9,7 +9,7 @@ from jaxsmw.choices import NUMBER_OF_EIGENVECTORS
 from jaxsmw.cli.arguments import add_eigenproblem, add_weld, path, refuse_without, whole_number
 from jaxsmw.cli.banks import add_bank, make_bank
 from jaxsmw.cli.console import show
-from jaxsmw.cli.inputs import describe_mesh
+from jaxsmw.cli.inputs import check_inputs, describe_mesh
 from jaxsmw.cli.outputs import check_outputs, report_written
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ def run(options: argparse.Namespace) -> None:
     **Raises:** `InputError` if an option or a file cannot be used.
     """
     refuse_without(options, "--figure", bool(options.figure), "bank", "filters")
+    check_inputs(options.mesh)
     check_outputs([options.mesh], files=[options.output], figures=[options.figure])
     if options.output:
         from jaxsmw.io.spectra import check_spectrum_path

@@ -20,7 +20,7 @@ from jaxsmw.cli.arguments import (
 )
 from jaxsmw.cli.conclusion import show_quality, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.inputs import check_initial_map, initial_map_files, read_maps, report_mesh
+from jaxsmw.cli.inputs import check_initial_map, check_inputs, initial_map_files, read_maps, report_mesh
 from jaxsmw.cli.method import add_method, check_preset, given_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
 from jaxsmw.errors import InputError
@@ -210,8 +210,10 @@ def _check(options: argparse.Namespace) -> None:
         check_readable_suffix(options.landmarks)
     if options.landmarks_output:
         check_landmark_suffix(options.landmarks_output)
+    inputs = [options.source, options.target, options.map, options.landmarks, *init_files]
+    check_inputs(*inputs)
     check_outputs(
-        [options.source, options.target, options.map, options.landmarks, *init_files],
+        inputs,
         files=[options.registered, options.attributes, options.landmarks_output],
         directories=report_directories(options.report),
     )
