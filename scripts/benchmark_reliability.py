@@ -13,7 +13,6 @@ FAUST_R is the directory of the remeshed FAUST set. Without it, pairs of procedu
 from __future__ import annotations
 
 import argparse
-import gc
 import os
 import subprocess
 import sys
@@ -161,7 +160,6 @@ def long_run(options: argparse.Namespace) -> Iterator[Part]:
         start = time.perf_counter()
         match(shapes[x], shapes[y], preset=options.preset)
         history.append((time.perf_counter() - start, *status()))
-    gc.collect()
     tenth = max(1, len(history) // 10)
     rows = []
     for begin in range(0, len(history), tenth):

@@ -106,7 +106,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = _target(path)
     temporary = _temporary(target)
     _unfinished.add(temporary)
-    lock = -1
+    lock = None
     try:
         _check_target(path, target)
         if target.parent not in _without_leftovers:
@@ -118,11 +118,12 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     except OSError as error:
         raise _unwritable(path, error) from error
     finally:
-        if lock >= 0:
-            os.close(lock)
         # The temporary file does not exist if it was moved to `path`, or if the directory does not exist.
         if os.path.lexists(temporary):
             temporary.unlink()
+        # Another process could take the file for a leftover if the lock ended earlier.
+        if lock is not None:
+            os.close(lock)
         _unfinished.discard(temporary)
 
 
@@ -132,11 +133,15 @@ _unfinished: set[Path] = set()
 _without_leftovers: set[Path] = set()
 
 
-def _create_locked(temporary: Path) -> int:
+def _create_locked(temporary: Path) -> int | None:
     """Create an empty file and lock it, so that no other process takes it for a leftover.
 
     **Returns:** The open file descriptor. The lock ends when the descriptor is closed, or with the process.
+    Without locks (Windows), the file is closed, because Windows does not move open files. The result is None.
     """
+    if fcntl is None:
+        temporary.touch(exist_ok=False)
+        return None
     while True:
         descriptor = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
         _lock(descriptor, wait=True)
