@@ -121,7 +121,9 @@ def damaged_member(content: bytes, damage: tuple[str, float, float, int]) -> byt
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = {name: archive.read(name) for name in archive.namelist()}
-    except zipfile.BadZipFile:
+    except Exception:  # earlier damages of an archive can raise any exception
+        return content
+    if not members:
         return content
     chosen = sorted(members)[choice % len(members)]
     kind = ("flip", "cut", "integer", "number", "end")[choice % 5]
