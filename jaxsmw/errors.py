@@ -8,9 +8,13 @@ from typing import Any, get_args
 class InputError(ValueError):
     """The exception that functions raise for input that cannot be used; a subclass of `ValueError`.
 
-    The message names the input, its fault and a remedy. The command line prints the message and exits with
-    code 2.
+    The message names the input, its fault and a remedy. The command line prints the message and the notes of
+    the exception, and exits with code 2.
     """
+
+    def lines(self) -> list[str]:
+        """Return the message and the notes."""
+        return [str(self), *getattr(self, "__notes__", ())]
 
 
 def check_choice(value: object, choices: Any, kind: str) -> None:

@@ -1,6 +1,8 @@
-"""Numbers as text, for messages and reports."""
+"""Numbers and names as text, for messages and reports."""
 
 from __future__ import annotations
+
+import unicodedata
 
 
 def count_of(number: int, noun: str) -> str:
@@ -15,3 +17,17 @@ def percentage(probability: float) -> str:
     if probability < 0.01:
         return "below 1 %"
     return "above 99 %" if probability > 0.99 else f"{100 * probability:.0f} %"
+
+
+def printable(line: str) -> str:
+    r"""Return a line of text with an escape sequence such as `\\x1b` in place of each control character.
+
+    File names can contain line breaks, codes that control a terminal, and bytes that are not valid UTF-8.
+    """
+    if line.isprintable():
+        return line
+    return "".join(ascii(c)[1:-1] if unicodedata.category(c) in _CONTROL else c for c in line)
+
+
+# Control characters, surrogates, and separators of lines and paragraphs.
+_CONTROL = frozenset({"Cc", "Cs", "Zl", "Zp"})

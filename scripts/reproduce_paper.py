@@ -368,7 +368,7 @@ def main() -> None:
                         temporary.write_text(overview(found), "utf-8")
         Results([], {}, failures).check()
     except InputError as error:
-        parser.exit(2, f"{error}\n")
+        parser.exit(2, "\n".join([*error.lines(), ""]))
     print(options.output / "README.md")
 
 

@@ -57,6 +57,18 @@ def test_a_missing_file_is_named_before_libraries_are_imported(tmp_path):
         assert ended.stderr == f"jaxsmw: {missing}: does not exist: check the path.\n"
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such names")
+def test_control_characters_of_names_are_escaped(run, tmp_path):
+    """The names contain a line break, a code that clears a terminal, and a byte that is not UTF-8."""
+    hostile = tmp_path / "a\nb\x1b[2J\udcff é.off"
+    assert_refused(run("spectrum", hostile), naming=r"a\nb\x1b[2J\udcff é.off: does not exist")
+    write_mesh(hostile, bumpy_mesh(2))
+    out = tmp_path / "\n.npz"
+    ended = run("spectrum", hostile, "--eigenvectors", "3", "--output", out)
+    assert ended.code == 0 and out.exists()
+    assert not any(c in ended.output + ended.errors for c in "\x1b\udcff")
+
+
 def test_a_missing_matplotlib_is_reported_before_the_work(run, pair, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     meshes, truth = [pair / "x.off", pair / "y.ply"], pair / "truth.txt"

@@ -10,18 +10,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 from jaxsmw.errors import InputError
+from jaxsmw.wording import printable
 
 _logger = logging.getLogger("jaxsmw")
 
 
 def show(text: str) -> None:
-    """Print a result on standard output.
+    """Print a result, which can have several lines, on standard output.
 
     **Raises:** `BrokenPipeError` if standard output is a pipe that its reader has closed. `InputError` if
     standard output cannot be written for any other reason.
     """
     with _writing_output():
-        print(text, flush=True)
+        print("\n".join(map(printable, text.split("\n"))), flush=True)
 
 
 def flush_output() -> None:
@@ -52,10 +53,10 @@ def _writing_output() -> Iterator[None]:
 
 
 def say(message: str) -> None:
-    """Print a message on standard error."""
+    """Print a message as one line on standard error."""
     if sys.stderr is not None:
         with suppress(OSError):  # the command continues even if a message cannot be printed
-            print(message, file=sys.stderr, flush=True)
+            print(printable(message), file=sys.stderr, flush=True)
 
 
 def report_progress(message: str) -> None:

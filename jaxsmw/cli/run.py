@@ -25,7 +25,10 @@ def run_command(arguments: Sequence[str]) -> int:
     except SystemExit as ending:  # the parser exits after the help and after bad arguments
         return int(ending.code or 0)
     except InputError as error:
-        say(f"jaxsmw: {error}")
+        message, *notes = error.lines()
+        say(f"jaxsmw: {message}")
+        for note in notes:
+            say(note)
         return 2
     except ArithmeticError as error:
         say(f"jaxsmw: {error}")

@@ -52,24 +52,21 @@ class Results(NamedTuple):
     def check(self) -> None:
         """Check that every shape and every pair was measured.
 
-        **Raises:** `InputError` if a measurement failed. The message lists the causes of all failures. For
-        each cause, the message names the first three shapes or pairs that failed.
+        **Raises:** `InputError` if a measurement failed. The exception has one note for each cause. The note
+        names the cause, and the first three shapes or pairs that failed.
         """
         if not self.failures:
             return
         causes: dict[str, list[str]] = {}
         for name, cause in self.failures.items():
             causes.setdefault(cause, []).append(name)
-        lines = [f"{_some(names)}: {cause}" for cause, names in causes.items()]
-        raise InputError(
-            "\n".join(
-                [
-                    "some shapes or pairs could not be measured: correct these faults, and run the same "
-                    "benchmark again (all other results are kept):",
-                    *lines,
-                ]
-            )
+        error = InputError(
+            "some shapes or pairs could not be measured: correct these faults, and run the same benchmark "
+            "again (all other results are kept):"
         )
+        for cause, names in causes.items():
+            error.add_note(f"{_some(names)}: {cause}")
+        raise error
 
 
 def _some(names: Sequence[str]) -> str:
