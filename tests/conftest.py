@@ -4,6 +4,7 @@ import gc
 import os
 import pickle
 import shutil
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,10 @@ from threadpoolctl import threadpool_limits
 # bytecode, each process would compile the package and all tests anew.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# A shell script starts background commands with an ignored SIGINT. The commands that the tests start and interrupt
+# would inherit this setting.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 # Imports create many objects and no garbage. `pytest_collection_finish` enables garbage collection again.
 gc.disable()
 
