@@ -6,6 +6,7 @@ The functions need the extra `jaxsmw[report]`. They return each figure as a `mat
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -23,6 +24,7 @@ from jaxsmw.report.inputs import check_error_limit, check_errors, check_function
 from jaxsmw.report.rendering import camera_axes, choose_azimuth, render
 from jaxsmw.report.standing import stand, stand_pair
 from jaxsmw.runtime.files import atomic_write, check_writable
+from jaxsmw.wording import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -516,7 +518,13 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
     suffix = Path(path).suffix.lower()
     import matplotlib
 
-    with atomic_write(path) as temporary, matplotlib.rc_context({"svg.hashsalt": "jaxsmw"}):
+    with (
+        atomic_write(path) as temporary,
+        matplotlib.rc_context({"svg.hashsalt": "jaxsmw"}),
+        warnings.catch_warnings(),
+    ):
+        # Names can contain characters that the font lacks. The figure shows a box for each of them.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure.savefig(temporary, format=suffix[1:], dpi=_DPI, metadata=_METADATA[suffix])
 
 
@@ -603,7 +611,7 @@ def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margi
 
 
 def _shorten(name: str) -> str:
-    half = _LONGEST_NAME // 2
+    name, half = printable(name), _LONGEST_NAME // 2
     return name if len(name) <= _LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}"
 
 
