@@ -17,10 +17,8 @@ from jaxsmw.io.mesh_files import write_mesh
 from jaxsmw.runtime.files import atomic_write, remove_unfinished
 
 LINE = "jaxsmw: interrupted; output files are complete or were not written.\n"
-# If the tests run in the background, SIGINT may be ignored, and child processes inherit this setting.
 PROLOGUE = """
 import os, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)
 def interrupt():
     os.kill(os.getpid(), signal.SIGINT)
 """
@@ -158,6 +156,23 @@ def test_an_interrupted_benchmark_prints_one_line(tmp_path):
     os.killpg(process.pid, signal.SIGINT)
     kept = f"finished pairs are kept in {output}, and the same command continues from there"
     assert_interrupted(process, None, line=f"\njaxsmw: interrupted; {kept}.\n")
+
+
+def test_workers_do_not_receive_an_interruption_while_they_start():
+    """The start of the first worker also starts Python's resource tracker, which unblocks SIGINT."""
+    program = """
+    import signal
+    from jaxsmw.cli.interruption import quiet_children
+    from jaxsmw.runtime.workers import Workers
+    blocked = lambda: signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    if __name__ == "__main__":
+        with quiet_children(), Workers(1) as executor:
+            executor.submit(int).result()
+            assert blocked()
+        assert not blocked()
+    """
+    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_a_second_interruption_has_no_effect(pair, tmp_path):
