@@ -73,6 +73,27 @@ def test_new_files_have_the_default_permissions(tmp_path):
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
+def test_files_that_change_while_they_are_read_are_refused(tmp_path):
+    file = tmp_path / "growing.off"
+    file.write_bytes(bytes(50_000_000))
+    ended = threading.Event()
+
+    def grow() -> None:
+        with open(file, "ab", buffering=0) as growing:
+            while not ended.is_set():
+                growing.write(b"0")
+
+    writer = threading.Thread(target=grow)
+    writer.start()
+    try:
+        with pytest.raises(InputError, match=r"growing.off: changes while it is read: wait until the file"):
+            read_bytes(file)
+    finally:
+        ended.set()
+        writer.join()
+    assert read_bytes(file) == file.read_bytes()
+
+
 def test_symbolic_links_are_followed(tmp_path):
     (tmp_path / "store").mkdir()
     (tmp_path / "link.txt").symlink_to(tmp_path / "store" / "real.txt")

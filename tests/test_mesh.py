@@ -796,10 +796,10 @@ def test_a_pipe_is_refused_without_waiting(tmp_path):
 def test_unreadable_files_are_refused(saved, monkeypatch):
     path = saved("secret.off", SQUARE_FILES["plain.off"])
 
-    def refuse(self):
+    def refuse(*_):
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    monkeypatch.setattr("jaxsmw.runtime.files.open", refuse, raising=False)
     with pytest.raises(InputError, match=r"secret\.off: cannot be read \(Permission denied\)"):
         read_mesh(path)
 

@@ -48,19 +48,24 @@ def read_bytes(path: str | os.PathLike[str], *, largest: int | None = LARGEST_FI
 
     **Returns:** The contents of the file.
 
-    **Raises:** `InputError` if the file does not exist, is not a regular file, is too large, or cannot be
-    read.
+    **Raises:** `InputError` if the file does not exist, is not a regular file, is too large, cannot be read,
+    or changes while it is read.
     """
-    size = size_of_file(path)
-    if largest is not None and size > largest:
+    before = _status(path)
+    if largest is not None and before.st_size > largest:
         raise InputError(
             f"{path}: is larger than {largest >> 30} GiB, the largest size that can be read: decimate the "
             "mesh."
         )
     try:
-        return Path(path).read_bytes()
+        with open(path, "rb") as file:
+            contents = file.read(before.st_size + 1)
     except OSError as error:
         raise _unreadable(path, error) from error
+    after = _status(path)
+    if len(contents) != before.st_size or after.st_mtime_ns != before.st_mtime_ns:
+        raise InputError(f"{path}: changes while it is read: wait until the file is complete.")
+    return contents
 
 
 def size_of_file(path: str | os.PathLike[str]) -> int:
@@ -68,6 +73,10 @@ def size_of_file(path: str | os.PathLike[str]) -> int:
 
     **Raises:** `InputError` if the file does not exist, is not a regular file, or cannot be accessed.
     """
+    return _status(path).st_size
+
+
+def _status(path: str | os.PathLike[str]) -> os.stat_result:
     try:
         status = os.stat(path)
     except FileNotFoundError:
@@ -76,7 +85,7 @@ def size_of_file(path: str | os.PathLike[str]) -> int:
         raise _unreadable(path, error) from error
     if not stat.S_ISREG(status.st_mode):
         raise InputError(f"{path}: is not a regular file: give the path of a file.")
-    return status.st_size
+    return status
 
 
 def _unreadable(path: str | os.PathLike[str], error: OSError | ValueError) -> InputError:
