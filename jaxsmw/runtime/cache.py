@@ -161,7 +161,8 @@ def cache_compiled_programs() -> None:
     The programs are stored in the directory of the cache and take at most 0.25 GiB. This function sets
     environment variables of JAX, so it must run before JAX is imported. If the user has set one of these
     variables, the function changes none of them. Each type of processor has its own directory, because JAX
-    does not distinguish processors. Machines with different processors can therefore share the disk.
+    does not distinguish processors. Machines with different processors can therefore share the disk. The
+    function also silences JAX's warnings about programs that cannot be stored.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
@@ -192,6 +193,8 @@ def cache_compiled_programs() -> None:
     if settings.keys().isdisjoint(os.environ):
         remove_damaged_programs(directory)
         os.environ.update(settings)
+        # On a full disk, JAX warns once for each program, and `cached` warns about the same directory.
+        warnings.filterwarnings("ignore", "Error writing persistent compilation cache entry")
 
 
 class Content(NamedTuple):
