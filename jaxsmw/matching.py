@@ -41,6 +41,7 @@ from jaxsmw.repair.rounds import refine_in_stages
 from jaxsmw.repair.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.repair.settings import WITHOUT_REPAIR, ExpectedErrorSettings, RepairSettings
 from jaxsmw.repair.trimming import complete, trimmed_stage
+from jaxsmw.runtime.memory import return_free_memory
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.stage import Stage
@@ -260,6 +261,7 @@ def match_prepared(
     """
     if starts[0].spectrum_x.descriptors is None:
         preset = preset.without_descriptors()
+    return_free_memory()
     with _step("refinement", seconds), one_blas_thread():
         if not starts[0].pair.partial:
             wait(compiling)
