@@ -90,11 +90,14 @@ class Command:
 
 
 def moments(duration: float, seed: int) -> Iterator[tuple[float, signal.Signals]]:
-    """Yield random moments up to the duration, each with a signal."""
+    """Yield random moments up to the duration, each with a signal.
+
+    In the first 0.1 s, Python itself starts. Only then can a command handle signals.
+    """
     generator = random.Random(seed)
     for _ in range(KILLS):
         for number in SIGNALS:
-            yield generator.uniform(0.02, duration), number
+            yield generator.uniform(0.1, duration), number
 
 
 def files(directory: Path) -> dict[str, bytes]:
