@@ -286,10 +286,8 @@ def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
     (tmp_path / "perfect" / "mesh000_mesh001.map").write_text("1\n2\n")
     found = measure(["initial", str(tmp_path / "perfect")], output=other, pairs="6")
     assert list(found.failures) == ["mesh000 to mesh001"] and len(found.rows) == 10
-    with pytest.raises(InputError, match=r"all other results are kept\):$") as raised:
+    with pytest.raises(InputError, match=r"all other results are kept\):\nmesh000 to mesh001: .*has 2 lines"):
         found.check()
-    _, cause = raised.value.lines()
-    assert re.match("mesh000 to mesh001: .*has 2 lines", cause)
 
 
 @pytest.mark.slow
@@ -339,7 +337,7 @@ def test_a_bad_shape_does_not_stop_other_pairs(measure, scape, tmp_path):
     assert len(found.rows) == 2 and len((output / "results.csv").read_text().splitlines()) == 1 + 2
     with pytest.raises(InputError) as caught:
         found.check()
-    _, *causes = str(caught.value).splitlines()
+    _, *causes = caught.value.lines()
     assert len(causes) == 1 and "and 2 more: " in causes[0] and causes[0].count("mesh002.off") == 1
     (data / "mesh002.off").write_text(contents)
     found = measure(["initial"], data=data, output=output, pairs="6")

@@ -175,6 +175,30 @@ def test_workers_do_not_receive_an_interruption_while_they_start():
     assert ended.returncode == 0, ended.stderr
 
 
+def test_an_interruption_while_a_worker_starts_waits_until_the_worker_has_its_arguments():
+    program = """
+    import multiprocessing.util, time
+    from jaxsmw.cli.interruption import end_when_interrupted, quiet_children
+    from jaxsmw.runtime.workers import Workers
+    spawn = multiprocessing.util.spawnv_passfds
+    def interrupted(*arguments):
+        process = spawn(*arguments)
+        if b"resource_tracker" not in b"".join(map(os.fsencode, arguments[1])):
+            interrupt()
+            time.sleep(0.1)
+        return process
+    if __name__ == "__main__":
+        end_when_interrupted()
+        multiprocessing.util.spawnv_passfds = interrupted
+        with quiet_children(), Workers(1) as executor:
+            executor.submit(int).result()
+    """
+    ended = subprocess.run(
+        [sys.executable, "-c", PROLOGUE + textwrap.dedent(program)], capture_output=True, text=True
+    )
+    assert (ended.returncode, ended.stderr) == (-signal.SIGINT, LINE)
+
+
 def test_a_second_interruption_has_no_effect(pair, tmp_path):
     program = """
     import jaxsmw.matching

@@ -226,8 +226,11 @@ def test_damaged_meshes(case):
                 assert all(np.isfinite(values).all() for values in arrays.values())
 
 
+# A damaged header of an array can look like one that NumPy wrote under Python 2. NumPy reads it with a warning.
+@pytest.mark.filterwarnings("default:Reading `.npy`:UserWarning")
 @fuzzed(150)
 @given(files(MAPS), files(TRUTHS))
+@example(("map.npy", [("number", 0.5, 0.0, 1)], None), ("map.txt", [("cut", 0.0, 0.0, 0)], None))
 def test_damaged_maps_and_ground_truth(pointwise_map, truth):
     with directories() as (inputs, outputs):
         map_file = write_damaged(inputs, *pointwise_map)

@@ -71,8 +71,30 @@ class _OneCoreProcess(SpawnProcess):
     """
 
     def start(self) -> None:
-        with _environment(_ONE_CORE | {"XLA_FLAGS": _one_thread_flags()}):
+        with _environment(_ONE_CORE | {"XLA_FLAGS": _one_thread_flags()}), _signals_after():
             super().start()
+
+
+@contextmanager
+def _signals_after() -> Iterator[None]:
+    """Handle the signals SIGINT and SIGTERM that arrive in the `with` block at its end.
+
+    If a signal ended this process while it starts another one, the other process would lack its arguments and
+    print a traceback. Python handles signals only in the main thread.
+    """
+    received: list[int] = []
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                before[number] = signal.signal(number, lambda signum, _: received.append(signum))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for signum in received:
+            os.kill(os.getpid(), signum)  # `raise_signal` would send it to this thread, which may block it
 
 
 class _OneCoreContext(SpawnContext):
