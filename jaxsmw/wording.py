@@ -20,7 +20,7 @@ def percentage(probability: float) -> str:
 
 
 def printable(line: str) -> str:
-    r"""Return a line of text with an escape sequence such as `\\x1b` in place of each control character.
+    r"""Return a line of text with an escape sequence such as `\x1b` in place of each control character.
 
     File names can contain line breaks, codes that control a terminal, and bytes that are not valid UTF-8.
     """
