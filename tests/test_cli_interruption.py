@@ -183,7 +183,7 @@ def test_an_interruption_while_a_worker_starts_waits_until_the_worker_has_its_ar
     spawn = multiprocessing.util.spawnv_passfds
     def interrupted(*arguments):
         process = spawn(*arguments)
-        if b"resource_tracker" not in b"".join(map(os.fsencode, arguments[1])):
+        if b"spawn_main" in b"".join(map(os.fsencode, arguments[1])):
             interrupt()
             time.sleep(0.1)
         return process

@@ -75,12 +75,17 @@ def quiet_children() -> Iterator[None]:
     processes inherit this setting. Another thread of this process still receives SIGINT. The context manager
     also silences the warning of Python's resource tracker about leaked semaphores.
     """
-    silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
-    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, [os.environ.get("PYTHONWARNINGS"), silenced]))
-    # The start of the tracker unblocks SIGINT, so the tracker starts first.
     from multiprocessing.resource_tracker import ensure_running
 
+    # The start of the tracker unblocks SIGINT, so the tracker starts first.
+    filters = os.environ.get("PYTHONWARNINGS")
+    silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
+    os.environ["PYTHONWARNINGS"] = f"{filters},{silenced}" if filters else silenced
     ensure_running()
+    if filters is None:
+        del os.environ["PYTHONWARNINGS"]
+    else:
+        os.environ["PYTHONWARNINGS"] = filters
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
