@@ -57,6 +57,21 @@ def test_a_missing_file_is_named_before_libraries_are_imported(tmp_path):
         assert ended.stderr == f"jaxsmw: {missing}: does not exist: check the path.\n"
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems ignore this limit")
+def test_a_small_limit_of_address_space_is_refused_before_libraries_are_loaded(pair):
+    program = "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (3 * 10**8, 3 * 10**8));"
+    program += "from jaxsmw.cli import main; main()"
+    words = ["match", pair / "x.off", pair / "y.ply", "--output", pair / "limited.txt"]
+    ended = subprocess.run(
+        [sys.executable, "-c", program, *words], capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 2 and not (pair / "limited.txt").exists()
+    assert ended.stderr == (
+        "jaxsmw: the address space of this process is limited to 0.30 GB, but its libraries need at least 2 GB: "
+        "raise the limit (ulimit -v).\n"
+    )
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such names")
 def test_control_characters_of_names_are_escaped(run, tmp_path):
     """The names contain a line break, a code that clears a terminal, and a byte that is not UTF-8."""

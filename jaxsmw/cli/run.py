@@ -58,6 +58,8 @@ def _run(arguments: Sequence[str]) -> None:
     with warnings.catch_warnings():
         warnings.showwarning = show_once
         from jaxsmw.runtime.cache import cache_compiled_programs
+        from jaxsmw.runtime.memory import check_address_space
 
+        check_address_space()
         cache_compiled_programs()
         options.run(options)

@@ -1,4 +1,4 @@
-"""Returns free memory of the process to the operating system."""
+"""Checks the memory that the process may use, and returns free memory to the operating system."""
 
 from __future__ import annotations
 
@@ -8,8 +8,34 @@ import time
 from collections.abc import Callable
 from functools import cache
 
+from jaxsmw.errors import InputError
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+# The smallest limit of address space, in bytes, with which `jaxsmw match` ran on two cores.
+_LEAST_ADDRESS_SPACE = 2 * 10**9
 # The smallest time between two searches for free memory, in seconds. A search takes 20 to 90 ms.
 _INTERVAL = 10.0
+
+
+def check_address_space() -> None:
+    """Check that the process may use enough address space to load JAX and SciPy.
+
+    With less, these libraries abort the process or never return while they are loaded.
+
+    **Raises:** `InputError` if the limit of address space (`ulimit -v`) is below 2 GB.
+    """
+    if resource is None:
+        return
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < _LEAST_ADDRESS_SPACE:
+        raise InputError(
+            f"the address space of this process is limited to {limit / 1e9:.2f} GB, but its libraries need "
+            "at least 2 GB: raise the limit (ulimit -v)."
+        )
 
 
 def return_free_memory() -> None:
