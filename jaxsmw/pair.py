@@ -184,6 +184,8 @@ def _known_scale(mesh_x: Mesh, mesh_y: Mesh, partial: bool, scale: float | Scale
             )
         return found.scale
     check_number("scale", scale, positive=True)
+    if not 1e-100 <= scale <= 1e100:  # areas would overflow
+        raise InputError(f"scale is {scale!r}: give a number from 1e-100 to 1e100.")
     return float(scale)
 
 

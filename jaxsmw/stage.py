@@ -128,7 +128,7 @@ class Stage:
             )
         if self.number_of_samples is not None and self.number_of_samples < self.number_of_eigenvectors:
             raise InputError(
-                f"{self.number_of_samples} samples cannot distinguish {self.number_of_eigenvectors} "
+                f"number_of_samples is {self.number_of_samples}, too few for {self.number_of_eigenvectors} "
                 "eigenvectors: use more samples (usually five per eigenvector) or fewer eigenvectors."
             )
 

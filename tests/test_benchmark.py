@@ -197,6 +197,13 @@ def test_help_names_every_method():
 TOO_LONG = "x" * 300
 
 
+def test_the_data_set_is_refused_as_the_output(scape, capsys):
+    before = sorted(scape.iterdir())
+    assert run_command(["benchmark", str(scape), "--methods", "initial", "--output", str(scape)]) == 2
+    assert "is the directory of the data set: choose another directory" in capsys.readouterr().err
+    assert sorted(scape.iterdir()) == before
+
+
 def test_names_longer_than_the_file_system_allows_are_refused(scape, capsys):
     for call in (
         [TOO_LONG],

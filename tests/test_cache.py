@@ -381,3 +381,13 @@ def test_the_users_compilation_cache_is_respected(monkeypatch, tmp_path):
     before = dict(os.environ)
     cache_compiled_programs()
     assert dict(os.environ) == before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+def test_programs_are_not_stored_in_a_directory_whose_name_is_not_utf8(monkeypatch, tmp_path):
+    """JAX accepts only names in UTF-8."""
+    for name in [name for name in os.environ if name.startswith("JAX_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path / "caf\udce9"))
+    cache_compiled_programs()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ

@@ -41,13 +41,19 @@ def started(program: str, *arguments: object, start_new_session: bool = False) -
     )
 
 
-def assert_interrupted(process: subprocess.Popen[str], directory: Path | None, *, line: str = LINE) -> None:
-    """Check that the process prints one line, leaves no file in the directory, and is killed by SIGINT."""
+def assert_interrupted(
+    process: subprocess.Popen[str],
+    directory: Path | None,
+    *,
+    line: str = LINE,
+    by: signal.Signals = signal.SIGINT,
+) -> None:
+    """Check that the process prints one line, leaves no file in the directory, and is killed by the signal."""
     try:
         output, errors = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert process.returncode == -signal.SIGINT, errors
+    assert process.returncode == -by, errors
     assert errors.endswith(line) and errors.count("jaxsmw: interrupted") == 1
     for complaint in ("Traceback", "Exception", "Error", "leaked"):
         assert complaint not in errors
@@ -208,6 +214,16 @@ def test_a_second_interruption_has_no_effect(pair, tmp_path):
     """
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
     assert_interrupted(started(program, *call), tmp_path)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_other_signals_end_a_command_in_the_same_way(pair, tmp_path, number):
+    program = f"""
+    import jaxsmw.matching
+    jaxsmw.matching.match = lambda *_, **__: os.kill(os.getpid(), {int(number)})
+    """
+    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
+    assert_interrupted(started(program, *call), tmp_path, by=number)
 
 
 def test_an_ignored_signal_stays_ignored(pair):

@@ -72,6 +72,12 @@ def test_a_small_limit_of_address_space_is_refused_before_libraries_are_loaded(p
     )
 
 
+@pytest.mark.parametrize("scale", ["1e300", "1e-300"])
+def test_extreme_scales_are_refused(run, pair, tmp_path, scale):
+    call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", "--partial", "--quiet"]
+    assert_refused(run(*call, "--scale", scale), naming="give a number from 1e-100 to 1e100")
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such names")
 def test_control_characters_of_names_are_escaped(run, tmp_path):
     """The names contain a line break, a code that clears a terminal, and a byte that is not UTF-8."""

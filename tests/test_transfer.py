@@ -310,7 +310,7 @@ class TestRegisteredMesh:
         points = at_vertices(mesh, np.arange(len(mesh.vertices)))
         with pytest.raises(InputError, match="161 points for 162 vertices: give one"):
             register_mesh(mesh, mesh, points[np.arange(161)])
-        for stiffness in (0.0, -1.0, np.inf, np.nan):
+        for stiffness in (0.0, -1.0, 1e100, np.inf, np.nan):
             with pytest.raises(InputError, match="give a positive number"):
                 register_mesh(mesh, mesh, points, stiffness=stiffness)
         with pytest.raises(InputError, match="points on mesh: face indices must lie between"):

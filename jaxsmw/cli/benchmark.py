@@ -148,6 +148,8 @@ def _measure(options: argparse.Namespace) -> None:
     methods = find_methods(options.methods) if options.methods else suited_methods(pairs)
     output = options.output or f"jaxsmw-benchmark-{data_set.name}"
     check_outputs([options.pairs], directories=[(output, ())])
+    if Path(output).resolve() == data_set.directory.resolve():
+        raise InputError(f"{output}: is the directory of the data set: choose another directory.")
     directory = make_directory(output)
     report_progress(f"{data_set.layout}, {len(pairs)} of {len(data_set.pairs)} pairs")
     announce_consequence(f"finished pairs are kept in {output}, and the same command continues from there")
@@ -185,6 +187,7 @@ def _verify(options: argparse.Namespace) -> None:
     pairs = stored.draw(data_set, options.seed)
     methods = find_methods(stored.chosen_methods(options.methods, known_methods()))
     report_progress(f"{data_set.layout}, {len(pairs)} of the stored pairs are measured again")
+    announce_consequence("the stored results are unchanged")
     with quiet_children(), open_executor(options.workers, options.scheduler) as executor:
         found = stored.measure_again(data_set, pairs, methods, executor, quiet=options.quiet)
     rows = [["method", "errors", "equal", "that hold", "largest difference x10^-3"]]

@@ -73,7 +73,7 @@ def show_quality(correspondence: Correspondence, expected_error: Float[np.ndarra
         parts.append(f"distortion {correspondence.distortion:.3f} (1 for isometries)")
     if expected_error is not None:
         mean = correspondence.mesh_x.average(expected_error)
-        parts.append(f"mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)")
+        parts.append(f"area-weighted mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)")
         if (probability := correspondence.wrong_probability(expected_error)) is not None:
             from jaxsmw.wording import percentage
 

@@ -1,4 +1,4 @@
-"""Termination on Ctrl-C or SIGTERM: the process ends at once, prints one line and leaves no unfinished files.
+"""Termination by a signal: the process ends at once, prints one line and leaves no unfinished files.
 
 By default Python raises `KeyboardInterrupt` in the main thread. Compiled code delays this exception until the
 code returns to Python. If `KeyboardInterrupt` is raised during garbage collection, Python discards it. If
@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 # within this number of seconds, the second thread ends the process.
 _PATIENCE = 0.2
 
-# SIGINT comes from Ctrl-C. SIGTERM comes from `kill`, job schedulers and containers.
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# SIGINT comes from Ctrl-C. SIGTERM comes from `kill`, job schedulers and containers. SIGHUP comes from a
+# terminal that closes.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _message = "jaxsmw: interrupted; output files are complete or were not written.\n"
 # The thread that ends the process acquires this lock and never releases it, so no second thread interferes.
@@ -35,7 +36,7 @@ _ending = allocate_lock()
 
 
 def end_when_interrupted() -> None:
-    """Install a handler that ends this process on SIGINT and SIGTERM.
+    """Install a handler that ends this process on SIGINT, SIGTERM and SIGHUP.
 
     If a signal was already ignored when the process started, no handler is installed for it. The function
     must be called in the main thread.

@@ -31,7 +31,8 @@ def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose
         nargs="+",
         required=required,
         help=f"{purpose}: a file with one target vertex per line, a file with a source and a target vertex "
-        "per line, a .baryc_gt file, or two .vts files (source first)",
+        "per line, a .baryc_gt file, or two .vts files (source first). Two other files are read like .vts "
+        "files: line i of both contains the vertices of the same point",
     )
 
 

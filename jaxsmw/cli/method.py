@@ -78,7 +78,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "--preset",
         choices=get_args(PresetName),
         help="method of refinement: paper is the method of the MWP paper; fast is the same method on "
-        "samples; accurate has more stages and repairs maps, so refinement takes three to four times as long "
+        "samples; accurate has more stages and repairs maps, so refinement takes nine to ten times as long "
         f"as with paper (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is "
         "given)",
     )

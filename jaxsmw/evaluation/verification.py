@@ -174,10 +174,11 @@ def _stored_settings(path: Path) -> dict[str, Any]:
         return {name: settings[name] for name in ("init", "mirrored", "evaluated_points", "seed")}
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read ({error.strerror}): restore the file, which belongs to results.csv."
+            f"{path}: cannot be read ({error.strerror}): restore the file, which a benchmark writes "
+            "beside its results."
         ) from error
     except (ValueError, KeyError, TypeError):
         raise InputError(
-            f"{path}: does not contain the settings of a benchmark: restore the file, which belongs to "
-            "results.csv."
+            f"{path}: does not contain the settings of a benchmark: restore the file, which a benchmark "
+            "writes beside its results."
         ) from None

@@ -162,7 +162,8 @@ def cache_compiled_programs() -> None:
     environment variables of JAX, so it must run before JAX is imported. If the user has set one of these
     variables, the function changes none of them. Each type of processor has its own directory, because JAX
     does not distinguish processors. Machines with different processors can therefore share the disk. The
-    function also silences JAX's warnings about programs that cannot be stored.
+    function also silences JAX's warnings about programs that cannot be stored
+    or loaded.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
@@ -182,6 +183,10 @@ def cache_compiled_programs() -> None:
         return  # `cached` will warn
     if not os.access(directory, os.W_OK):
         return  # JAX would issue a warning for each program that it cannot store
+    try:
+        str(directory).encode()
+    except UnicodeEncodeError:
+        return  # JAX accepts only names in UTF-8
     settings = {
         "JAX_COMPILATION_CACHE_DIR": str(directory),
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(int(min(2**28, cache_limit()))),
@@ -193,8 +198,9 @@ def cache_compiled_programs() -> None:
     if settings.keys().isdisjoint(os.environ):
         remove_damaged_programs(directory)
         os.environ.update(settings)
-        # On a full disk, JAX warns once for each program, and `cached` warns about the same directory.
-        warnings.filterwarnings("ignore", "Error writing persistent compilation cache entry")
+        # On a full disk, or without the directory, JAX warns once for each program. `cached` warns about the
+        # same directory.
+        warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
 
 
 class Content(NamedTuple):

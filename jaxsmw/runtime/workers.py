@@ -77,7 +77,7 @@ class _OneCoreProcess(SpawnProcess):
 
 @contextmanager
 def _signals_after() -> Iterator[None]:
-    """Handle the signals SIGINT and SIGTERM that arrive in the `with` block at its end.
+    """Handle the signals SIGINT, SIGTERM and SIGHUP that arrive in the `with` block at its end.
 
     If a signal ended this process while it starts another one, the other process would lack its arguments and
     print a traceback. Python handles signals only in the main thread.
@@ -85,7 +85,7 @@ def _signals_after() -> Iterator[None]:
     received: list[int] = []
     before = {}
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) not in (signal.SIG_IGN, None):
                 before[number] = signal.signal(number, lambda signum, _: received.append(signum))
     try:

@@ -24,6 +24,9 @@ from jaxsmw.wording import count_of
 DEFAULT_STIFFNESS = 0.005
 """The default stiffness of a registered mesh, a length in units of the square root of the target's area."""
 
+LARGEST_STIFFNESS = 1e6
+"""The largest permitted stiffness. At 10, the mesh already keeps its shape. At 1e100, numbers overflow."""
+
 # The stiffness with which `points_of_map` smooths a map to vertices. (Entry R22)
 _STIFFNESS_OF_MAPS = 0.01
 
@@ -281,12 +284,13 @@ def register_mesh(
 
     **Returns:** A `RegisteredMesh` with positions `vertices` (m, 3) in the unit of Y.
 
-    **Raises:** `InputError` if the points do not fit the meshes, or the stiffness is not positive and finite.
-    `ArithmeticError` if the deformation does not converge.
+    **Raises:** `InputError` if the points do not fit the meshes, or the stiffness is not positive or too
+    large. `ArithmeticError` if the deformation does not converge.
     """
-    if not 0 < stiffness < np.inf:
+    if not 0 < stiffness <= LARGEST_STIFFNESS:
         raise InputError(
-            f"the stiffness is {stiffness}: give a positive number, such as {DEFAULT_STIFFNESS}."
+            f"the stiffness is {stiffness}: give a positive number of at most {LARGEST_STIFFNESS:g}, such as "
+            f"{DEFAULT_STIFFNESS}."
         )
     points = check_surface_points(points, mesh_y, "points")
     if len(points) != len(mesh_x.vertices):

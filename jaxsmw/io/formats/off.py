@@ -27,7 +27,7 @@ def parse_off(data: bytes) -> Polygons:
     counts = re.match(r"\s*(\d{1,18})\s+(\d{1,18})(\s|$)", lines[0]) if lines else None
     if counts is None:
         raise InputError(
-            "lacks the numbers of vertices and faces after the keyword OFF: export the mesh again."
+            "lacks valid numbers of vertices and faces after the keyword OFF: export the mesh again."
         )
     n, f = int(counts[1]), int(counts[2])
     lines = lines[1:]
