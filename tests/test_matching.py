@@ -466,7 +466,7 @@ def test_the_functional_initial_map_is_better_than_nearest_neighbours(pair):
     [
         ({"refiner": Meyer()}, "refiner"),
         ({"iterations": 0}, "at least 1"),
-        ({"number_of_samples": 10}, "cannot distinguish 100 eigenvectors"),
+        ({"number_of_samples": 10}, "too few for 100 eigenvectors"),
         ({"number_of_descriptors": 353}, "SHOT has 352"),
     ],
     ids=str,
