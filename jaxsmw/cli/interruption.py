@@ -78,15 +78,13 @@ def quiet_children() -> Iterator[None]:
     """
     from multiprocessing.resource_tracker import ensure_running
 
-    # The start of the tracker unblocks SIGINT, so the tracker starts first.
+    from jaxsmw.runtime.workers import environment
+
     filters = os.environ.get("PYTHONWARNINGS")
     silenced = "ignore::UserWarning:multiprocessing.resource_tracker"
-    os.environ["PYTHONWARNINGS"] = f"{filters},{silenced}" if filters else silenced
-    ensure_running()
-    if filters is None:
-        del os.environ["PYTHONWARNINGS"]
-    else:
-        os.environ["PYTHONWARNINGS"] = filters
+    # The start of the tracker unblocks SIGINT, so the tracker starts first.
+    with environment({"PYTHONWARNINGS": f"{filters},{silenced}" if filters else silenced}):
+        ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield

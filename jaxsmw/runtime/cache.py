@@ -162,8 +162,7 @@ def cache_compiled_programs() -> None:
     environment variables of JAX, so it must run before JAX is imported. If the user has set one of these
     variables, the function changes none of them. Each type of processor has its own directory, because JAX
     does not distinguish processors. Machines with different processors can therefore share the disk. The
-    function also silences JAX's warnings about programs that cannot be stored or
-    loaded.
+    function also silences JAX's warnings about programs that cannot be stored or loaded.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """

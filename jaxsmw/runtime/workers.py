@@ -71,7 +71,7 @@ class _OneCoreProcess(SpawnProcess):
     """
 
     def start(self) -> None:
-        with _environment(_ONE_CORE | {"XLA_FLAGS": _one_thread_flags()}), _signals_after():
+        with environment(_ONE_CORE | {"XLA_FLAGS": _one_thread_flags()}), _signals_after():
             super().start()
 
 
@@ -116,7 +116,7 @@ def _one_thread_flags() -> str:
 
 
 @contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Set environment variables within the `with` block, and restore the previous values at its end."""
     with _starting:
         before = {name: os.environ.get(name) for name in variables}
