@@ -543,7 +543,7 @@ def test_the_quality_of_the_map_is_printed(run, pair, tmp_path, monkeypatch):
     assert re.fullmatch(r"distortion 1\.0\d\d \(1 for isometries\)", quality) and not computed
     output = run(*call, "--report", tmp_path / "r", "--expected-error", tmp_path / "e.txt", *SMALL).output
     source = read_mesh(pair / "x.off")
-    mean = f"mean expected error {1e3 * source.average(computed[0]):.2f} x 10^-3 sqrt(area)"
+    mean = f"area-weighted mean expected error {1e3 * source.average(computed[0]):.2f} x 10^-3 sqrt(area)"
     summary = json.loads((tmp_path / "r" / "summary.json").read_text())
     wrong = f"wrong on a part of the body with probability {percentage(summary['wrong_probability'])}"
     assert QUALITY.search(output)[1] == f"{quality}, {mean}, {wrong}"
