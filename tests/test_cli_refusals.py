@@ -309,6 +309,7 @@ def test_hostile_map_files_are_refused(run, pair, tmp_path, name, use):
         ("match {x} {y} --out {t}/m", "--output"),
         ("evaluate {x} {y} {p}/truth.txt", "--ground-truth"),
         ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --output {t}/no/e.json", "no/e.json"),
+        ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --output {t}/e.csv", "ends in .json"),
         ("spectrum {x} --eigenvectors 642", "641"),
         ("spectrum {x} --bank regular --filters 6 --figure {t}/f.png", "is fixed"),
         ("spectrum {x} --filters 6", "--figure"),

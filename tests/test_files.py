@@ -57,6 +57,15 @@ def test_unwritable_paths_are_refused_and_leave_no_files(tmp_path, name):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("name", ["-", "a/", "missing/"])
+def test_names_of_no_file_are_refused(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    for write in (check_writable, lambda path: atomic_write(path).__enter__()):
+        with pytest.raises(InputError, match=f"^{name}: cannot be written because it"):
+            write(name)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_write_protection_is_respected(tmp_path, monkeypatch):
     path = tmp_path / "kept.txt"
     path.write_text("old")

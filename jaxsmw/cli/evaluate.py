@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 
 from jaxsmw.cli.arguments import (
     MAP_FORMS,
@@ -25,6 +26,7 @@ from jaxsmw.cli.measurement import (
     measure_errors,
 )
 from jaxsmw.cli.outputs import check_outputs, report_written, write_comparison_page
+from jaxsmw.errors import InputError
 
 HELP = "measure the geodesic errors of maps against the ground truth"
 
@@ -35,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("map", type=path, metavar="MAP", nargs="+", help=f"maps to measure: {MAP_FORMS}")
     add_ground_truth(parser, required=True, purpose="true map")
     parser.add_argument(
-        "--output", metavar="FILE", type=path, help="write the errors and quality curves to this JSON file"
+        "--output", metavar="FILE", type=path, help="write the errors and quality curves to this file (.json)"
     )
     parser.add_argument(
         "--figure",
@@ -71,6 +73,8 @@ def run(options: argparse.Namespace) -> None:
         figures=[options.figure],
         pages=[options.page],
     )
+    if options.output and Path(options.output).suffix.lower() != ".json":
+        raise InputError(f"{options.output}: errors are written as JSON: choose a name that ends in .json.")
     mesh_x = read_mesh_file(options.source, weld=options.weld)
     mesh_y = read_mesh_file(options.target, weld=options.weld)
     truth = read_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)

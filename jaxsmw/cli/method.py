@@ -209,8 +209,9 @@ def match_meshes(
 
     changes = _changes(options)
     if changes and options.preset is None:
+        listed = " and ".join(filter(None, [", ".join(changes[:-1]), changes[-1]]))
         report_progress(
-            f"note: preset {_PAPER} replaces {DEFAULT_PRESET}, because {' and '.join(changes)} "
+            f"note: preset {_PAPER} replaces {DEFAULT_PRESET}, because {listed} "
             f"{'changes' if len(changes) == 1 else 'change'} the paper's method."
         )
     with jax.enable_x64(options.precision == "float64"):

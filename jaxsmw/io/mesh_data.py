@@ -10,6 +10,7 @@ different numbers of corners. pygltflib parses only the JSON part of glTF files,
 
 from __future__ import annotations
 
+import codecs
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -64,6 +65,8 @@ _FORMATTERS: dict[str, Callable[[MeshData], Written]] = {
     ".glb": format_glb,
     ".npz": format_npz,
 }
+# The formats whose files begin with text, even if numbers are binary.
+_TEXT = (".off", ".obj", ".ply", ".vtk", ".xyz", ".pcd")
 MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
 """The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
 POINT_CLOUD_SUFFIXES = tuple(suffix for suffix in _PARSERS if suffix not in _FORMATTERS)
@@ -134,6 +137,7 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
             f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
             f"mesh to one of {', '.join([*_FORMATTERS, *POINT_CLOUD_SUFFIXES])}."
         )
+    _check_readable(path, data)
     try:
         # Damaged files can contain numbers that overflow, or signalling NaN. `make_mesh` refuses them later.
         with np.errstate(all="ignore"):
@@ -163,6 +167,13 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
         skin=polygons.skin,
         label_names=polygons.label_names,
     )
+
+
+def _check_readable(path: Path, data: bytes) -> None:
+    if not data:
+        raise InputError(f"{path}: is empty: export the mesh again.")
+    if path.suffix.lower() in _TEXT and data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InputError(f"{path}: is UTF-16 text, which cannot be read: save the file as UTF-8.")
 
 
 def _fans(

@@ -245,6 +245,10 @@ def _check_target(path: str | os.PathLike[str], target: Path) -> None:
     **Raises:** `InputError` if the target cannot be written as a regular file; `OSError` if the operating
     system does not accept the name.
     """
+    if os.fspath(path) == "-":
+        raise InputError("-: cannot be written because it is no file name: choose the name of a file.")
+    if os.fspath(path).endswith(("/", os.sep)):
+        raise InputError(f"{path}: cannot be written because it names a directory: add the name of a file.")
     if not target.parent.is_dir():
         raise InputError(
             f"{path}: cannot be written because {target.parent} is not a directory: "

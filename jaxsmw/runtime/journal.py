@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,7 +44,8 @@ class Journal:
     - `key`: the names of the key columns. If two rows have the same key, the second row is ignored.
     - `columns`: a mapping from the name of each required column to the function that checks its values. If
       None, the file must have the key columns, and may have any other columns.
-    - `read_only`: whether the file is only read. An unfinished line is then ignored, but not removed.
+    - `read_only`: whether the file is only read. An unfinished line is then not removed, but ignored with
+      a warning.
 
     **Raises:** `InputError` if the file cannot be read, or does not contain a table with these columns. If
     this error is raised, the file is not changed.
@@ -67,7 +69,11 @@ class Journal:
             self._read(contents[:whole], columns or {})
         elif not _line(self._fields).encode().startswith(contents) and columns is not None:
             raise self._fault(1, f"is not the header {','.join(self._fields)}")
-        if whole < len(contents) and not read_only:
+        if whole == len(contents):
+            return
+        if read_only:
+            warnings.warn(f"{path}: ends in an unfinished line, which is ignored.", stacklevel=2)
+        else:
             os.truncate(path, whole)
 
     @property

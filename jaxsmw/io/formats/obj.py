@@ -38,7 +38,13 @@ def parse_obj(data: bytes) -> Polygons:
     if (corners == 0).any():
         raise InputError("a face uses vertex 0, but OBJ files count from 1: export the mesh again.")
     face_at = cache(lambda: [match.start() for match in face.finditer(content)])  # found on demand
-    corners = _counted_backward(corners, sizes, vertex, face_at, content)
+    written, corners = corners, _counted_backward(corners, sizes, vertex, face_at, content)
+    outside = (corners < 1) | (corners > len(vertices))
+    if outside.any():
+        raise InputError(
+            f"a face uses vertex {written[outside.argmax()]:.15g}, but the file has {len(vertices)} v lines: "
+            "correct the index or restore the missing vertices."
+        )
     labels, names = _labels(content, face_at)
     return Polygons(
         vertices,
