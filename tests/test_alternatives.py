@@ -1,9 +1,11 @@
 """Alternative maps are computed and compared on proxies."""
 
+import gc
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -127,6 +129,20 @@ def test_the_best_alternative_is_right_and_does_not_depend_on_the_position_in_sp
     turned = moved(mesh_x, Rotation.random(random_state=1)), moved(mesh_y, Rotation.random(random_state=2))
     (again, *_) = Alternatives(prepared(*turned), REPAIR).best(nonsense)
     assert np.mean(again == first) > 0.99
+
+
+def test_the_arrays_of_a_pair_are_freed_without_garbage_collection(pair):
+    mesh_x, mesh_y, truth = pair
+    start = prepared(mesh_x, mesh_y)
+    next(Alternatives(start, REPAIR).best(truth))
+    gc.collect()
+    gc.disable()
+    try:
+        arrays = len(jax.live_arrays())
+        next(Alternatives(start, REPAIR).best(truth))
+        assert len(jax.live_arrays()) == arrays
+    finally:
+        gc.enable()
 
 
 def test_alternatives_of_partial_pairs_come_from_descriptors_alone(pair):

@@ -92,10 +92,15 @@ class Alternatives:
         self._sampled = self.x.sampled_spectrum(), self.y.sampled_spectrum()
         self._coarse = self._step(self._stage)
         self._fine = self._step(self._stage.with_levels(chosen.fine_levels))
-        coarse_x, coarse_y = (
+        self._coarse_x, self._coarse_y = (
             side.truncate(chosen.eigenvectors) for side in (prepared.spectrum_x, prepared.spectrum_y)
         )
-        self.judge = Judge(self.pair, coarse_x, coarse_y, settings, self.deformation)
+
+    @property
+    def _judge(self) -> Judge:
+        # If the judge were an attribute, both objects would refer to each other. Python frees such objects
+        # late, and with them all arrays of the pair.
+        return Judge(self.pair, self._coarse_x, self._coarse_y, self.settings, self.deformation)
 
     def _proxy(self, side: tuple[Mesh, Spectrum, float]) -> Proxy:
         mesh, spectrum, unit = side
@@ -192,7 +197,7 @@ class Alternatives:
         starts, faults = [], []
         for candidate in candidates:
             everywhere = Outcome([], jax.device_put(self._extended(candidate.found)))
-            for fault in self.judge.faults(everywhere):
+            for fault in self._judge.faults(everywhere):
                 starts.append(candidate.found)
                 faults.append(fault[self.x.samples.vertices])
         return self._refined(step, starts, faults)
@@ -286,7 +291,7 @@ class Alternatives:
                 found = np.asarray(refined.pointwise_map)[: len(self.x.areas)].astype(np.int64)
                 everywhere = jax.device_put(self._extended(found))  # scores are computed at all vertices
                 refined = eqx.tree_at(lambda tree: tree.pointwise_map, refined, everywhere)
-                score = self.judge.score(self.judge.measured(Outcome([refined], everywhere)))
+                score = self._judge.score(self._judge.measured(Outcome([refined], everywhere)))
                 candidates.append(_Candidate(score, found))
         return sorted(candidates, key=lambda candidate: candidate.score)
 
