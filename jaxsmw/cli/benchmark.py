@@ -187,7 +187,7 @@ def _verify(options: argparse.Namespace) -> None:
     stored = StoredResults(Path(options.verify), options.init)
     pairs = stored.draw(data_set, options.seed)
     methods = find_methods(stored.chosen_methods(options.methods, known_methods()))
-    report_progress(f"{data_set.layout}, measures {count_of(len(pairs), 'stored pair')} again")
+    report_progress(f"{data_set.layout}: measuring {count_of(len(pairs), 'stored pair')} again")
     announce_consequence("the stored results are unchanged")
     with quiet_children(), open_executor(options.workers, options.scheduler) as executor:
         found = stored.measure_again(data_set, pairs, methods, executor, quiet=options.quiet)
