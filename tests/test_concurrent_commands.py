@@ -102,15 +102,26 @@ def test_a_cache_that_disappears_changes_nothing(tmp_path, pair):
     assert found.read_text() == expected.read_text()
 
 
-def test_a_cache_on_a_full_disk_changes_nothing(tmp_path, pair):
-    """`/dev/full` cannot be a directory, so a limit on the size of files stands for a full disk."""
+# A limit on the size of files stands for a full disk, because `/dev/full` cannot be a directory.
+FULL_DISK = """
+import resource, signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
+"""
+# What some network file systems answer.
+NO_LOCKS = """
+import errno, fcntl
+def refuse(*_):
+    raise OSError(errno.ENOLCK, "No locks available")
+fcntl.flock = refuse
+"""
+
+
+@pytest.mark.parametrize("fault", [FULL_DISK, NO_LOCKS], ids=["full disk", "no locks"])
+def test_a_cache_on_an_unsuitable_disk_changes_nothing(tmp_path, pair, fault):
     expected, found = tmp_path / "expected.txt", tmp_path / "found.txt"
     finished(started(pair, expected, tmp_path / "whole"))
-    program = (
-        "import resource, signal, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192));"
-        "from jaxsmw.cli import main; sys.exit(main())"
-    )
+    program = f"{fault}\nfrom jaxsmw.cli import main\nmain()"
     words = [
         "match",
         pair / "x.off",
@@ -127,7 +138,7 @@ def test_a_cache_on_a_full_disk_changes_nothing(tmp_path, pair):
         # With the variables of the tests, programs would be stored in another directory.
         env={
             **{name: value for name, value in os.environ.items() if "CACHE" not in name},
-            "JAXSMW_CACHE": str(tmp_path / "full"),
+            "JAXSMW_CACHE": str(tmp_path / "unsuitable"),
         },
         capture_output=True,
         text=True,
@@ -136,3 +147,6 @@ def test_a_cache_on_a_full_disk_changes_nothing(tmp_path, pair):
     assert ended.returncode == 0, ended.stderr
     assert_warned_at_most_once(ended.stderr)
     assert found.read_text() == expected.read_text()
+    if fault == NO_LOCKS:  # Results are cached, and programs are not.
+        cache = tmp_path / "unsuitable"
+        assert any(cache.glob("spectrum-*.npz")) and not any(cache.rglob("*-cache"))

@@ -1,6 +1,8 @@
 """Damaged result files are refused in one sentence and are not changed."""
 
+import errno
 import json
+import os
 
 import pytest
 
@@ -79,3 +81,14 @@ def test_a_directory_that_cannot_be_locked_is_named(tmp_path):
     (tmp_path / ".lock").mkdir()
     with pytest.raises(InputError, match="cannot be locked"), claimed_directory(tmp_path, {}):
         pass
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS])
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, number):
+    def refuse(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    with pytest.raises(InputError, match="on a file system with locks"), claimed_directory(tmp_path, {}):
+        pass
+    assert not list(tmp_path.iterdir())

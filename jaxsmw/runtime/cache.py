@@ -23,7 +23,7 @@ import numpy as np
 import platformdirs
 
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.files import atomic_write
+from jaxsmw.runtime.files import atomic_write, can_lock
 from jaxsmw.runtime.program_checksums import CHECKSUMS, remove_damaged_programs
 
 # Every key is a hash that includes this number. Increment this number when a change of the code changes the
@@ -182,6 +182,8 @@ def cache_compiled_programs() -> None:
         return  # `cached` will warn
     if not os.access(directory, os.W_OK):
         return  # JAX would issue a warning for each program that it cannot store
+    if not can_lock(directory):
+        return  # JAX would wait ten seconds for the lock of each program
     try:
         str(directory).encode()
     except UnicodeEncodeError:

@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from jaxsmw.errors import InputError
 
@@ -169,6 +170,19 @@ def _lock(descriptor: int, *, wait: bool) -> bool:
     except OSError:
         return False
     return True
+
+
+def can_lock(directory: Path) -> bool:
+    """Return whether files in a directory can be locked. Some network file systems have no locks.
+
+    If no file can be created, the result is False. On Windows the result is True, because its file systems
+    have locks.
+    """
+    if fcntl is None:
+        return True
+    with suppress(OSError), TemporaryFile(dir=directory) as file:
+        return _lock(file.fileno(), wait=False)
+    return False
 
 
 def remove_unfinished() -> None:

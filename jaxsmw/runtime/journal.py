@@ -19,7 +19,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.files import atomic_write
+from jaxsmw.runtime.files import atomic_write, can_lock
 
 Row = dict[str, Any]
 """A row of a journal: a dictionary from column names to values. In rows from a file, all values are text."""
@@ -208,6 +208,12 @@ def claimed_directory(
     results but no `provenance.json`. `InputError` is also raised if `provenance.json` is damaged, if the
     directory cannot be locked, or if another process is adding results.
     """
+    if not can_lock(directory):
+        # Some versions of `filelock` would report a lock of another process instead.
+        raise InputError(
+            f"{directory}: cannot be locked, because files cannot be created or locked there: give another "
+            "--output, on a file system with locks."
+        )
     # The operating system releases the lock even if the process is killed.
     lock = FileLock(directory / ".lock", timeout=0)
     try:
