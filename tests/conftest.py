@@ -21,10 +21,12 @@ from threadpoolctl import threadpool_limits
 # bytecode, each process would compile the package and all tests anew.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-# A shell script starts background commands with an ignored SIGINT. The commands that the tests start and interrupt
-# would inherit this setting.
+# A shell script starts background commands with an ignored SIGINT, and `nohup` ignores SIGHUP. The commands that the
+# tests start and interrupt would inherit these settings.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 # Imports create many objects and no garbage. `pytest_collection_finish` enables garbage collection again.
 gc.disable()
 

@@ -108,6 +108,19 @@ def test_a_disabled_cache_writes_nothing(setting, tmp_path, monkeypatch):
     assert compute.runs == 2 and not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows knows the user's directory otherwise")
+def test_a_user_without_a_home_directory_has_no_cache(monkeypatch):
+    for name in ("JAXSMW_CACHE", "HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def unknown(_: int) -> None:
+        raise KeyError("getpwuid(): uid not found")
+
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+    assert cached("test", [1], lambda: {"a": np.arange(3)})["a"].tolist() == [0, 1, 2]
+    assert cache_contents() == []
+
+
 def test_the_default_is_the_users_cache_directory(tmp_path, monkeypatch):
     monkeypatch.delenv("JAXSMW_CACHE", raising=False)
     monkeypatch.setattr("platformdirs.user_cache_dir", lambda name, **_: str(tmp_path / name))

@@ -72,6 +72,14 @@ def test_a_small_limit_of_address_space_is_refused_before_libraries_are_loaded(p
     )
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not remove the working directory")
+def test_a_removed_working_directory_is_refused(run, tmp_path, monkeypatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert_refused(run("spectrum", "../x.off"), naming="the working directory cannot be used (No such file")
+
+
 @pytest.mark.parametrize("scale", ["1e300", "1e-300"])
 def test_extreme_scales_are_refused(run, pair, tmp_path, scale):
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", "--partial", "--quiet"]

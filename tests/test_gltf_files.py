@@ -461,7 +461,7 @@ def test_invalid_data_uris_are_refused(tmp_path, uri):
 
 
 @pytest.mark.parametrize("text", [
-    b"", b"{", b"[]", b"3", b"null", b'{"asset": null}', b"\xff\xfe{}", b"[" * 10**6, b'{"asset": NaN}', b"1" * 10**4,
+    b" ", b"{", b"[]", b"3", b"null", b'{"asset": null}', b"\xff\xfe{}", b"[" * 10**6, b'{"asset": NaN}', b"1" * 10**4,
 ])  # fmt: skip
 def test_texts_that_are_not_documents_are_refused(tmp_path, text):
     (tmp_path / "m.gltf").write_bytes(text)

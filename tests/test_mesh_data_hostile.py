@@ -88,7 +88,7 @@ def mat(**more) -> bytes:
 
 HOSTILE = {
     # name: (content, what the message must say)
-    "empty.vtk": ("", "# vtk DataFile"),
+    "empty.vtk": ("", "is empty"),
     "other.vtk": ("OFF\n", "# vtk DataFile"),
     "version 9.vtk": (VTK.replace("3.0", "9.0"), "unknown version 9"),
     "version x.vtk": (VTK.replace("3.0", "x"), "# vtk DataFile"),
@@ -138,7 +138,7 @@ HOSTILE = {
     "data for two points.vtk": (VTK + "POINT_DATA 2\nSCALARS a float\nLOOKUP_TABLE default\n1 2\n", "'a' has 2 rows, but the file has 3 points"),
     "data for two cells.vtk": (VTK + "CELL_DATA 2\nSCALARS a float\nLOOKUP_TABLE default\n1 2\n", "'a' has 2 rows, but the file has 1 cell"),
     "texture of nan.vtk": (VTK + "POINT_DATA 3\nTEXTURE_COORDINATES t 2 float\nnan 0 0 0 0 0\n", "not finite"),
-    "empty.vtp": ("", "not a complete XML file"),
+    "empty.vtp": ("", "is empty"),
     "cut.vtp": (vtp()[:-20], "not a complete XML file"),
     "entities.vtp": (ENTITIES, "not a complete XML file"),
     "encoding.vtp": (vtp().replace('"1.0"?', '"1.0" encoding="nonsense"?'), "not a complete XML file"),
@@ -180,7 +180,7 @@ HOSTILE = {
     "block of junk.vtp": (vtp(packed(1, 36, 0, 6, content=b"junk!!"), form="binary", attributes=ZLIB), "cannot be unpacked"),
     "lzma of junk.vtp": (vtp(packed(1, 36, 0, 6, content=b"junk!!"), form="binary", attributes='compressor="vtkLZMADataCompressor"'), "cannot be unpacked"),
     "lz4 of junk.vtp": (vtp(packed(1, 36, 0, 6, content=b"junk!!"), form="binary", attributes='compressor="vtkLZ4DataCompressor"'), "cannot be unpacked"),
-    "empty.npz": (b"", "not a .npz file"),
+    "empty.npz": (b"", "is empty"),
     "junk.npz": (b"PK\3\4" + bytes(100), "not a .npz file"),
     "cut.npz": (npz(**NPZ)[:-30], "not a .npz file"),
     "no faces.npz": (npz(vertices=V), "no array called faces"),

@@ -279,7 +279,7 @@ def test_lzf_copies_overlap_their_own_end():
 
 
 HOSTILE = {
-    "empty.xyz": (b"", "contains no points"),
+    "empty.xyz": (b"", "is empty"),
     "header only.xyz": (b"x y z\n", "contains no points"),
     "two columns.xyz": (b"1 2 3\n" * 30 + b"1 2\n", "is written where 3 numbers should be"),
     "damaged first.xyz": (b"1O 2 3\n" + b"1 2 3\n" * 30, "'1O 2 3' is written where"),
@@ -289,10 +289,10 @@ HOSTILE = {
     "few.xyz": (b"1 2 3\n0 0 1\n", "2 different points cannot represent a surface"),
     "nan.xyz": (b"nan nan nan\n" * 30, "cannot represent a surface"),
     "binary.xyz": (bytes(range(256)) * 4, "not a text file"),
-    "empty.npy": (b"", "not a .npy file"),
+    "empty.npy": (b"", "is empty"),
     "text.npy": (b"1 2 3\n" * 30, "not a .npy file"),
     "no data.pcd": (b"FIELDS x y z\n", "no line DATA"),
-    "empty.pcd": (b"", "no line DATA"),
+    "empty.pcd": (b"", "is empty"),
     "no header.pcd": (b"DATA ascii\n" + lines(POINTS).encode(), "the header is damaged"),
     "no z.pcd": (pcd("ascii", lines(POINTS[:, :2]).encode(), "x y", "4 4", "F F"), "no field z"),
     "short.pcd": (pcd("ascii", lines(POINTS[1:]).encode()), "is followed by"),

@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> None:
 
     place = cache_directory()
     if place is None:
-        show("The cache is disabled, because JAXSMW_CACHE is empty or off.")
+        show("The cache is disabled, because JAXSMW_CACHE is empty or off, or you have no home directory.")
         return
     contents = cache_contents()
     if options.clear:

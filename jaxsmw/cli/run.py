@@ -58,8 +58,10 @@ def _run(arguments: Sequence[str]) -> None:
     with warnings.catch_warnings():
         warnings.showwarning = show_once
         from jaxsmw.runtime.cache import cache_compiled_programs
+        from jaxsmw.runtime.files import check_working_directory
         from jaxsmw.runtime.memory import check_address_space
 
         check_address_space()
+        check_working_directory()
         cache_compiled_programs()
         options.run(options)

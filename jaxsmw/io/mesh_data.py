@@ -66,7 +66,7 @@ _FORMATTERS: dict[str, Callable[[MeshData], Written]] = {
     ".npz": format_npz,
 }
 # The formats whose files begin with text, even if numbers are binary.
-_TEXT = (".off", ".obj", ".ply", ".vtk", ".xyz", ".pcd")
+_TEXT = (".off", ".obj", ".ply", ".vtk", ".pcd")
 MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
 """The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
 POINT_CLOUD_SUFFIXES = tuple(suffix for suffix in _PARSERS if suffix not in _FORMATTERS)

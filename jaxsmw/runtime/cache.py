@@ -277,9 +277,16 @@ def _own_files() -> Iterator[tuple[str, Path]]:
 
 
 def cache_directory() -> Path | None:
-    """Return the directory of the cache, or None if the cache is disabled."""
-    place = os.environ.get("JAXSMW_CACHE", platformdirs.user_cache_dir("jaxsmw", appauthor=False))
-    return None if place in ("", "off") else Path(place)
+    """Return the directory of the cache.
+
+    The result is None if the cache is disabled, or if the user has no home directory.
+    """
+    if (place := os.environ.get("JAXSMW_CACHE")) is not None:
+        return None if place in ("", "off") else Path(place)
+    try:
+        return Path(platformdirs.user_cache_dir("jaxsmw", appauthor=False))
+    except RuntimeError:  # an unknown user without the variable HOME, for example in a container
+        return None
 
 
 def cache_limit() -> float:

@@ -218,6 +218,19 @@ def _remove_unlocked(file: Path) -> None:
         os.close(descriptor)
 
 
+def check_working_directory() -> None:
+    """Check that the working directory exists, because relative paths depend on it.
+
+    **Raises:** `InputError` if the working directory was removed.
+    """
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise InputError(
+            f"the working directory cannot be used ({_reason(error)}): change to another directory."
+        ) from error
+
+
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Check that `atomic_write` can write a file. The check leaves no new file.
 
