@@ -125,7 +125,7 @@ def mirrored_descriptors(descriptors: Float32[np.ndarray, "n 352"]) -> Float32[n
 
 
 def _too_coarse(mesh: Mesh, lonely: float, radius: float, required: bool) -> str:
-    avoidance = ", or avoid SHOT (init='wks' and preset='paper'; for jaxsmw match --init wks --preset paper)"
+    avoidance = ", or the initial map 'wks' with the preset 'paper', which do not use SHOT"
     return (
         f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} neighbours within "
         f"the SHOT radius of {radius:.3g} sqrt(area), because the mesh is coarse there: use a finer mesh"
