@@ -102,7 +102,7 @@ def test_unreferenced_vertices_get_zeros_and_coincident_vertices_get_finite_valu
 
 def test_too_coarse_meshes_are_refused():
     coarse = make_mesh(*sphere_mesh(1))
-    with pytest.raises(InputError, match="--init wks"):
+    with pytest.raises(InputError, match="use a finer mesh, or the initial map 'wks'"):
         shot_descriptors(coarse)
     with pytest.raises(InputError, match=r"use a finer mesh\.$"):
         shot_descriptors(coarse, required=True)
