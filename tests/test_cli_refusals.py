@@ -28,13 +28,13 @@ def pair(tmp_path_factory) -> Path:
 def test_a_tiny_mesh_is_refused(run, tmp_path):
     (tmp_path / "tetrahedron.off").write_text(OFF.format(4, 4, TRIANGLES, FACES))
     call = ["match", *[tmp_path / "tetrahedron.off"] * 2, "--output", tmp_path / "map.txt", "--quiet"]
-    assert_refused(run(*call), naming="--init wks")
+    assert_refused(run(*call), naming="the initial map 'wks'")
     assert_refused(run(*call, "--eigenvectors", "100"), naming="choose a number from 1 to 3")
     assert_refused(
         run(*call, "--eigenvectors", "1", "--init", "hks"),
         naming="the largest of the 1 eigenvalues is zero",
     )
-    assert_refused(run(*call, "--eigenvectors", "3"), naming="--init wks")
+    assert_refused(run(*call, "--eigenvectors", "3"), naming="the initial map 'wks'")
     assert run(*call, "--eigenvectors", "3", "--init", "hks").code == 0
 
 
