@@ -25,9 +25,9 @@ def pair(tmp_path) -> Path:
     return write_pair(tmp_path / "meshes")
 
 
-def started(pair: Path, output: Path, cache: Path, *options: str) -> subprocess.Popen[str]:
-    """Start a match that uses a cache directory."""
-    words = [
+def match_words(pair: Path, output: Path) -> list[str]:
+    """Return the arguments of a match."""
+    call = [
         "match",
         pair / "x.off",
         pair / "y.ply",
@@ -38,8 +38,13 @@ def started(pair: Path, output: Path, cache: Path, *options: str) -> subprocess.
         *SMALL,
         "--quiet",
     ]
+    return list(map(str, call))
+
+
+def started(pair: Path, output: Path, cache: Path, *options: str) -> subprocess.Popen[str]:
+    """Start a match that uses a cache directory."""
     return subprocess.Popen(
-        [sys.executable, "-m", "jaxsmw", *map(str, words), *options],
+        [sys.executable, "-m", "jaxsmw", *match_words(pair, output), *options],
         env={**os.environ, "JAXSMW_CACHE": str(cache)},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -122,19 +127,8 @@ def test_a_cache_on_an_unsuitable_disk_changes_nothing(tmp_path, pair, fault):
     expected, found = tmp_path / "expected.txt", tmp_path / "found.txt"
     finished(started(pair, expected, tmp_path / "whole"))
     program = f"{fault}\nfrom jaxsmw.cli import main\nmain()"
-    words = [
-        "match",
-        pair / "x.off",
-        pair / "y.ply",
-        "--output",
-        found,
-        "--preset",
-        "paper",
-        *SMALL,
-        "--quiet",
-    ]
     ended = subprocess.run(
-        [sys.executable, "-c", program, *map(str, words)],
+        [sys.executable, "-c", program, *match_words(pair, found)],
         # With the variables of the tests, programs would be stored in another directory.
         env={
             **{name: value for name, value in os.environ.items() if "CACHE" not in name},

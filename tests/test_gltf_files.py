@@ -461,10 +461,10 @@ def test_invalid_data_uris_are_refused(tmp_path, uri):
 
 
 @pytest.mark.parametrize("text", [
-    b" ", b"{", b"[]", b"3", b"null", b'{"asset": null}', b"\xff\xfe{}", b"[" * 10**6, b'{"asset": NaN}', b"1" * 10**4,
+    b"", b"{", b"[]", b"3", b"null", b'{"asset": null}', b"\xff\xfe{}", b"[" * 10**6, b'{"asset": NaN}', b"1" * 10**4,
 ])  # fmt: skip
 def test_texts_that_are_not_documents_are_refused(tmp_path, text):
-    (tmp_path / "m.gltf").write_bytes(text)
+    (tmp_path / "m.gltf").write_bytes(text or b" ")  # an empty file has a sentence of its own
     (tmp_path / "m.glb").write_bytes(glb(text, b""))
     for name in ("m.gltf", "m.glb"):
         assert "JSON" in (message := refusal(tmp_path / name)) or "version 2.0" in message
