@@ -1,4 +1,4 @@
-from . import banks, collection, evaluation, functional_maps, geometry, io, learning, transfer
+from . import banks, benchmark, collection, evaluation, functional_maps, geometry, io, learning, transfer
 from .collection.matching import match_collection
 from .collection.pairs import match_pairs
 from .core.banks import CubicSpline, FilterBank, Meyer
@@ -12,24 +12,23 @@ from .core.refiners.wavelet_preservation import WaveletPreservation
 from .core.results import RESULTS
 from .core.solutions import Filtering, LeastSquares
 from .core.spectrum import Spectrum
-from .correspondence import Correspondence
+from .creature import creature_pair
 from .errors import InputError
 from .evaluation.ground_truth import read_ground_truth
 from .evaluation.metrics import geodesic_error
-from .geometry.creature import creature_pair
 from .geometry.eigenbasis import compute_spectrum
 from .geometry.mesh import Mesh, make_mesh
-from .initial_maps import initial_map
 from .io.map_files import read_pointwise_map, write_pointwise_map
 from .io.mesh_files import read_mesh, write_mesh
-from .matching import match
-from .pair import Pair, paired_spectra
-from .preparation import prepare
-from .presets import PRESETS, Preset
-from .repair.settings import RepairSettings
+from .matching.correspondence import Correspondence
+from .matching.match import match
+from .matching.pair import Pair, paired_spectra
+from .matching.presets import PRESETS, Preset
+from .matching.settings import RepairSettings
+from .matching.stages import Stage
+from .matching.starts import initial_map
 from .runtime.batches import refine_pairs, stack
 from .runtime.compilation import compiler_options
-from .stage import Stage
 
 __version__: str
 __all__ = [
@@ -55,6 +54,7 @@ __all__ = [
     "Stage",
     "WaveletPreservation",
     "banks",
+    "benchmark",
     "collection",
     "compiler_options",
     "compute_spectrum",
@@ -73,7 +73,6 @@ __all__ = [
     "match_collection",
     "match_pairs",
     "paired_spectra",
-    "prepare",
     "read_ground_truth",
     "read_mesh",
     "read_pointwise_map",

@@ -69,7 +69,7 @@ MethodName = Literal[
     "zoomout",
     "zoomout-sampled",
 ]
-"""The names of the methods of a benchmark; see `jaxsmw.evaluation.opponents.registry.METHODS`."""
+"""The names of the methods of a benchmark; see `jaxsmw.benchmark.opponents.registry.METHODS`."""
 ProtocolName = Literal[
     "faust-r",
     "scape-r",

@@ -43,12 +43,12 @@ from jaxsmw.collection.pairs import match_pairs
 from jaxsmw.collection.shapes import prepare_pair, prepare_shapes
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.geometry.creature import CREATURES, creature
+from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.mesh_files import read_mesh
-from jaxsmw.preparation import PreparedPair
-from jaxsmw.presets import PRESETS, PresetName
-from jaxsmw.repair.batches import refine_batch
+from jaxsmw.matching.batches import refine_batch
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.presets import PRESETS, PresetName
 from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
 
 Pair = tuple[Spectrum, Spectrum, Int[Array, " m"]]

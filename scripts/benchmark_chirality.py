@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxsmw import Pair, paired_spectra, read_mesh
-from jaxsmw.repair.chirality import Hands
+from jaxsmw.matching.search.chirality import Hands
 
 
 def main() -> None:

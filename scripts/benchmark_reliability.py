@@ -29,10 +29,10 @@ from scipy.spatial import KDTree
 from tqdm import tqdm
 
 from jaxsmw.collection import match_pairs
-from jaxsmw.geometry.creature import creature, creature_pair
+from jaxsmw.creature import creature, creature_pair
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.mesh_files import read_mesh
-from jaxsmw.matching import match
+from jaxsmw.matching.match import match
 from jaxsmw.report.figures import save_figure
 
 # The number of pairs of `determinism`, and the numbers of vertices of the creatures.

@@ -63,32 +63,32 @@ from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from jaxsmw.benchmark.tables import markdown
 from jaxsmw.choices import Eigensolver, Search
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.geometry.creature import creature_pair
+from jaxsmw.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
 from jaxsmw.geometry.geodesics import geodesic_distances, geodesic_distances_between
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, poisson_disk_samples
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.initial_maps import initial_map
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
-from jaxsmw.matching import match
-from jaxsmw.pair import Pair
-from jaxsmw.preparation import prepare
-from jaxsmw.presets import PresetName
+from jaxsmw.matching.match import match
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.presets import PresetName
+from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.starts import initial_map
 from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance
-from jaxsmw.report.tables import markdown
 from jaxsmw.runtime.cache import cache_compiled_programs
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.files import make_directory
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
-from jaxsmw.stage import Stage
 
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)

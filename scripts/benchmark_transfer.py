@@ -36,12 +36,12 @@ from jaxtyping import Float64
 
 from jaxsmw import Mesh, geodesic_error, match, read_ground_truth, read_mesh
 from jaxsmw.choices import MatchInit
-from jaxsmw.correspondence import Correspondence
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import farthest_point_samples, nearest_surface_points
 from jaxsmw.geometry.alignment import align_rigidly
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal
 from jaxsmw.io import Landmarks, read_landmark_file
+from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.runtime.compilation import release_programs
 from jaxsmw.runtime.journal import Journal
 from jaxsmw.runtime.provenance import made_with

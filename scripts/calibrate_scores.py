@@ -39,13 +39,12 @@ from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from jaxsmw import InputError, geodesic_error, match, read_mesh
-from jaxsmw.correspondence import Correspondence
-from jaxsmw.evaluation.datasets import DataPair, DataSet, choose_pairs, open_data_set
-from jaxsmw.presets import PRESETS, PresetName
-from jaxsmw.repair.scores import dirichlet_energy_ratio, distortion
-from jaxsmw.repair.settings import WrongProbabilitySettings
-from jaxsmw.repair.wrong_probability import wrong_probability
-from jaxsmw.report.tables import markdown
+from jaxsmw.benchmark.datasets import DataPair, DataSet, choose_pairs, open_data_set
+from jaxsmw.benchmark.tables import markdown
+from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.presets import PRESETS, PresetName
+from jaxsmw.matching.scores import dirichlet_energy_ratio, distortion, wrong_probability
+from jaxsmw.matching.settings import WrongProbabilitySettings
 from jaxsmw.runtime.compilation import release_programs
 from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
@@ -126,7 +125,7 @@ def scores_of(found: Correspondence) -> dict[str, float]:
 
 
 def fitted(maps: Sequence[Measured]) -> WrongProbabilitySettings:
-    """Fit the coefficients of `jaxsmw.repair.wrong_probability` to maps by logistic regression."""
+    """Fit the coefficients of `jaxsmw.matching.scores` to maps by logistic regression."""
     features = np.array([[1, np.log(one.distortion), np.log(one.mean_expected)] for one in maps])
     signs = np.where([one.wrong for one in maps], 1, -1)
 

@@ -29,7 +29,7 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxsmw
-from jaxsmw.geometry.creature import creature
+from jaxsmw.creature import creature
 from jaxsmw.report.colors import position_colors
 from jaxsmw.report.figures import draw_correspondence, draw_mesh
 from jaxsmw.runtime.files import atomic_write
@@ -89,7 +89,7 @@ def real_cases(data: Path) -> Iterator[Case]:
         ("different_kinds", "tosca_nonisometric", ("8_gorilla_03", "8_woman_04"), {"preset": "accurate"}),
     ):
         (pair,) = (
-            pair for pair in jaxsmw.evaluation.open_data_set(data / directory).pairs if pair.names == names
+            pair for pair in jaxsmw.benchmark.open_data_set(data / directory).pairs if pair.names == names
         )
         source, target = jaxsmw.read_mesh(pair.source_file), jaxsmw.read_mesh(pair.target_file)
         yield Case(name, source, target, pair.ground_truth(source, target), {}, cure, None)
@@ -120,7 +120,7 @@ def landmarks_on_arms(
     return np.stack([KDTree(points).query(tips)[1] for points in (at_source, at_target)], axis=1)
 
 
-def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
+def front_of(pair: jaxsmw.creature.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
     """Return the front part of the source as a separate mesh, and the ground truth of this mesh."""
     full, ahead = pair.source, pair.source.vertices[:, 2]
     faces = full.faces[(ahead[full.faces] > np.quantile(ahead, 0.45)).all(axis=1)]
@@ -131,7 +131,7 @@ def front_of(pair: jaxsmw.geometry.CreaturePair) -> tuple[jaxsmw.Mesh, jaxsmw.ev
 
 
 def coarser(
-    pair: jaxsmw.geometry.CreaturePair, vertices: int
+    pair: jaxsmw.creature.CreaturePair, vertices: int
 ) -> tuple[jaxsmw.Mesh, jaxsmw.evaluation.GroundTruth]:
     """Return a decimated target and its ground truth.
 

@@ -69,17 +69,17 @@ from jaxsmw import (
     Spectrum,
     WaveletPreservation,
     compute_spectrum,
-    prepare,
     read_mesh,
 )
+from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.core.products import product
 from jaxsmw.core.signatures import wave_kernel_signature
 from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
-from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.functional_maps import nearest_neighbor
 from jaxsmw.geometry import farthest_point_samples, shot_descriptors
 from jaxsmw.geometry.shot import SHOT_DIMENSION
 from jaxsmw.learning import WaveletPreservationLayer
+from jaxsmw.matching.preparation import prepare
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0

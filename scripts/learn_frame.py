@@ -63,15 +63,15 @@ from jaxsmw import (
     WaveletPreservation,
     initial_map,
     paired_spectra,
-    prepare,
     read_mesh,
 )
 from jaxsmw.banks import SoftmaxFrame
+from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.core.banks import FilterBank, Power, Warped
 from jaxsmw.core.soft_maps import Recovery, SoftMap, Softmax, SparseSoftMap
-from jaxsmw.evaluation.datasets import DataPair
 from jaxsmw.geometry import farthest_point_samples
 from jaxsmw.learning import refine_softly
+from jaxsmw.matching.preparation import prepare
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, KNOTS, FILTERS = 1000, 32, 6

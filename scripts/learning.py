@@ -19,9 +19,9 @@ from jaxtyping import Array, Float, Float64, Int
 from tqdm import tqdm
 
 from jaxsmw import InputError, Mesh, Spectrum, WaveletPreservation, geodesic_error, refine
-from jaxsmw.evaluation.datasets import DataPair, open_data_set
-from jaxsmw.evaluation.intervals import mean_interval
-from jaxsmw.report.tables import markdown
+from jaxsmw.benchmark.datasets import DataPair, open_data_set
+from jaxsmw.benchmark.intervals import mean_interval
+from jaxsmw.benchmark.tables import markdown
 from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.journal import Journal, claimed_directory
 from jaxsmw.runtime.provenance import code_digest, commit, machine, made_with, measured_code, versions

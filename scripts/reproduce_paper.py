@@ -40,15 +40,15 @@ from jaxtyping import Int64
 from scipy.spatial import KDTree
 
 from jaxsmw import InputError
-from jaxsmw.evaluation.benchmark import Results, run_benchmark
-from jaxsmw.evaluation.datasets import DataPair, DataSet, choose_pairs, class_of, open_data_set
-from jaxsmw.evaluation.measurement import Settings
-from jaxsmw.evaluation.opponents.base import Method
-from jaxsmw.evaluation.opponents.published_maps import PublishedMaps
-from jaxsmw.evaluation.opponents.registry import METHODS, suited_methods
+from jaxsmw.benchmark.benchmark import Results, run_benchmark
+from jaxsmw.benchmark.datasets import DataPair, DataSet, choose_pairs, class_of, open_data_set
+from jaxsmw.benchmark.measurement import Settings
+from jaxsmw.benchmark.opponents.base import Method
+from jaxsmw.benchmark.opponents.published_maps import PublishedMaps
+from jaxsmw.benchmark.opponents.registry import METHODS, suited_methods
+from jaxsmw.benchmark.tables import MethodSummary, markdown, write_tables
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
-from jaxsmw.report.tables import MethodSummary, markdown, write_tables
 from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.workers import open_executor
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxsmw.report.tables import markdown
+from jaxsmw.benchmark.tables import markdown
 from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxsmw.collection.shape_models import shape_model
-from jaxsmw.geometry.creature import creature
+from jaxsmw.creature import creature
 from jaxsmw.report.collection_page import PageEdge
 
 HOSTILE = '</script></title><img src=x onerror="window.hacked=1"><b>\'&{{script}}'

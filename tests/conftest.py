@@ -166,7 +166,7 @@ def compile_once(common_directory: Path) -> Iterator[None]:
 def triangulate_creatures_once(common_directory: Path) -> Iterator[None]:
     """Share the triangulations of creatures among all test processes, because each takes a second or more."""
     # The type checks apply only to modules that are imported after this file.
-    from jaxsmw.geometry import creature
+    from jaxsmw import creature
     from jaxsmw.runtime.cache import Store
 
     directory = common_directory / "creatures"

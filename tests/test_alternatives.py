@@ -11,21 +11,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxsmw import creature_pair, geodesic_error, match, read_mesh
+from jaxsmw.benchmark.datasets import open_data_set
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation.datasets import open_data_set
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
-from jaxsmw.pair import Pair
-from jaxsmw.preparation import prepare
-from jaxsmw.presets import PRESETS
-from jaxsmw.repair.alternatives import Alternatives
-from jaxsmw.repair.outcome import Judge, Outcome
-from jaxsmw.repair.proxies import Proxy, deformation, distance_error, map_difference
-from jaxsmw.repair.rounds import refine_in_stages
-from jaxsmw.repair.settings import AlternativeSettings
-from jaxsmw.stage import Stage
+from jaxsmw.matching.judge import Judge, Outcome
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.presets import PRESETS
+from jaxsmw.matching.search.alternatives import Alternatives
+from jaxsmw.matching.search.proxies import Proxy, deformation, distance_error, map_difference
+from jaxsmw.matching.search.rounds import refine_in_stages
+from jaxsmw.matching.settings import AlternativeSettings
+from jaxsmw.matching.stages import Stage
 
 REPAIR = PRESETS["accurate"].repair
 # Fewer samples and levels, which compile faster.

@@ -26,19 +26,19 @@ from scipy.spatial import KDTree
 from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 from jaxsmw import InputError
+from jaxsmw.benchmark import measurement
+from jaxsmw.benchmark.benchmark import Results, run_benchmark
+from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
+from jaxsmw.benchmark.measurement import CURVE, FIGURES, Settings
+from jaxsmw.benchmark.opponents.base import Method, MethodInput
+from jaxsmw.benchmark.opponents.peers import installed_peers
+from jaxsmw.benchmark.opponents.registry import METHODS, find_methods
+from jaxsmw.benchmark.tables import _introduction, latex_table, markdown, markdown_table, summarize_methods
 from jaxsmw.choices import MethodName, PeerName
 from jaxsmw.cli.run import run_command
 from jaxsmw.core.results import RESULTS
-from jaxsmw.evaluation import measurement
-from jaxsmw.evaluation.benchmark import Results, run_benchmark
-from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
-from jaxsmw.evaluation.measurement import CURVE, FIGURES, Settings
-from jaxsmw.evaluation.opponents.base import Method, MethodInput
-from jaxsmw.evaluation.opponents.peers import installed_peers
-from jaxsmw.evaluation.opponents.registry import METHODS, find_methods
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import write_mesh
-from jaxsmw.report.tables import _introduction, latex_table, markdown, markdown_table, summarize_methods
 from jaxsmw.runtime.provenance import measured_code
 from jaxsmw.runtime.workers import open_executor
 
@@ -454,7 +454,7 @@ def test_importing_the_benchmark_registers_no_listener():
         import equinox, jax, optimistix
         from jax._src import monitoring
         before = list(monitoring.get_event_duration_listeners())
-        import jaxsmw.evaluation.benchmark
+        import jaxsmw.benchmark.benchmark
         print(monitoring.get_event_duration_listeners() == before)
     """
     found = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
@@ -561,7 +561,7 @@ def test_the_first_row_of_a_table_is_its_header():
 def test_the_digest_covers_all_code_that_results_depend_on():
     """The digest prevents results of changed code from being mixed with older results."""
     measured = {path.resolve() for path in measured_code()}
-    script = "import sys, jaxsmw.evaluation.benchmark; print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'jaxsmw'))"
+    script = "import sys, jaxsmw.benchmark.benchmark; print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'jaxsmw'))"
     found = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
     loaded = {Path(name).resolve() for name in found.stdout.split()}
     drawing = {path for path in loaded if path.parent.name == "report"}

@@ -16,7 +16,7 @@ import benchmark_batches
 import benchmark_collection
 import benchmark_speed
 
-from jaxsmw.geometry.creature import creature
+from jaxsmw.creature import creature
 from jaxsmw.io import write_mesh
 
 pytestmark = pytest.mark.study

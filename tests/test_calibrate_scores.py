@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxsmw import creature_pair, match
-from jaxsmw.presets import choose_preset
-from jaxsmw.repair.settings import WrongProbabilitySettings
-from jaxsmw.repair.wrong_probability import wrong_probability
+from jaxsmw.matching.presets import choose_preset
+from jaxsmw.matching.scores import wrong_probability
+from jaxsmw.matching.settings import WrongProbabilitySettings
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

@@ -8,8 +8,8 @@ from synthetic import bumpy_mesh
 import jaxsmw
 from jaxsmw import Mesh, Pair, creature_pair, make_mesh, match, paired_spectra
 from jaxsmw.geometry.shot import mirrored_descriptors, shot_descriptors
-from jaxsmw.repair.chirality import Hands, decide
-from jaxsmw.repair.settings import ChiralitySettings
+from jaxsmw.matching.search.chirality import Hands, decide
+from jaxsmw.matching.settings import ChiralitySettings
 
 
 @pytest.fixture(scope="module")

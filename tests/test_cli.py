@@ -26,21 +26,21 @@ from scipy.spatial import KDTree
 from synthetic import grid_mesh
 
 import jaxsmw
-import jaxsmw.matching
+import jaxsmw.matching.match
 from jaxsmw.banks import CubicSpline, Itersine, Meyer, SpectralDistribution, Warped
+from jaxsmw.benchmark.measurement import Settings
 from jaxsmw.cli.banks import BANKS, bounds_unless_tight, make_bank
 from jaxsmw.cli.run import run_command
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
 from jaxsmw.evaluation.ground_truth import read_ground_truth
-from jaxsmw.evaluation.measurement import Settings
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
-from jaxsmw.matching import match
+from jaxsmw.matching.match import match
+from jaxsmw.matching.stages import Stage
 from jaxsmw.report.texture import TEXTURE_FILES
-from jaxsmw.stage import Stage
 from jaxsmw.wording import percentage
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
@@ -178,7 +178,7 @@ def test_quiet_prints_nothing_on_standard_error(run, pair, tmp_path):
 @contextmanager
 def recorded_calls() -> Iterator[list[dict]]:
     """Yield a list, which gets one dictionary of settings for each call of `match`."""
-    calls, match = [], jaxsmw.matching.match
+    calls, match = [], jaxsmw.matching.match.match
 
     def recorded(*meshes, preset, **settings):
         found = match(*meshes, preset=preset, **settings)
@@ -192,7 +192,7 @@ def recorded_calls() -> Iterator[list[dict]]:
         return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jaxsmw.matching, "match", recorded)
+        patch.setattr(jaxsmw.matching.match, "match", recorded)
         yield calls
 
 
@@ -551,14 +551,16 @@ def test_the_quality_of_the_map_is_printed(run, pair, tmp_path, monkeypatch):
     written = source.average(np.loadtxt(tmp_path / "e.txt"))
     assert summary["result"]["expected error, mean"] == f"{written:.4f} √area"
 
-    match = jaxsmw.matching.match
+    match = jaxsmw.matching.match.match
     for distortion, suspicious, text in (
         (1.2345, False, "distortion 1.234 (1 for isometries)"),
         (2.5, True, "distortion 2.500 (1 for isometries), the map is suspicious"),
         (None, True, "the map is suspicious"),
     ):
         judged = {"distortion": distortion, "suspicious": suspicious}
-        monkeypatch.setattr(jaxsmw.matching, "match", lambda *a, j=judged, **k: replace(match(*a, **k), **j))
+        monkeypatch.setattr(
+            jaxsmw.matching.match, "match", lambda *a, j=judged, **k: replace(match(*a, **k), **j)
+        )
         for command in (call, ["transfer", *call[1:3], "--registered", tmp_path / "r.off", *call[5:]]):
             assert QUALITY.search(run(*command, *SMALL).output)[1] == text
 
@@ -623,7 +625,7 @@ def failing_match(monkeypatch) -> str:
     def fail(*_, **__):
         raise ArithmeticError(message)
 
-    monkeypatch.setattr("jaxsmw.matching.match", fail)
+    monkeypatch.setattr("jaxsmw.matching.match.match", fail)
     return message
 
 

@@ -81,7 +81,7 @@ def test_an_interrupted_import_ends_with_one_line(pair, tmp_path, module):
 IN_GARBAGE_COLLECTION = """
     import gc
     def interrupt_late(phase, _):
-        if phase == "start" and "jaxsmw.matching" in sys.modules:
+        if phase == "start" and "jaxsmw.matching.match" in sys.modules:
             gc.callbacks.clear()
             interrupt()
     gc.callbacks.append(interrupt_late)
@@ -97,7 +97,7 @@ IN_A_WRITE = """
     """
 IN_COMPILED_CODE = """
     import threading
-    import jaxsmw.matching
+    import jaxsmw.matching.match
     from jaxsmw.runtime.files import atomic_write
     def match_forever(*_, **__):
         # This thread blocks the signal and deadlocks, like compiled code that never returns to Python.
@@ -108,7 +108,7 @@ IN_COMPILED_CODE = """
             lock = threading.Lock()
             lock.acquire()
             lock.acquire()
-    jaxsmw.matching.match = match_forever
+    jaxsmw.matching.match.match = match_forever
     """
 
 
@@ -207,10 +207,10 @@ def test_an_interruption_while_a_worker_starts_waits_until_the_worker_has_its_ar
 
 def test_a_second_interruption_has_no_effect(pair, tmp_path):
     program = """
-    import jaxsmw.matching
+    import jaxsmw.matching.match
     def match_forever(*_, **__):
         interrupt(), interrupt(), interrupt()
-    jaxsmw.matching.match = match_forever
+    jaxsmw.matching.match.match = match_forever
     """
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
     assert_interrupted(started(program, *call), tmp_path)
@@ -219,8 +219,8 @@ def test_a_second_interruption_has_no_effect(pair, tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_other_signals_end_a_command_in_the_same_way(pair, tmp_path, number):
     program = f"""
-    import jaxsmw.matching
-    jaxsmw.matching.match = lambda *_, **__: os.kill(os.getpid(), {int(number)})
+    import jaxsmw.matching.match
+    jaxsmw.matching.match.match = lambda *_, **__: os.kill(os.getpid(), {int(number)})
     """
     call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
     assert_interrupted(started(program, *call), tmp_path, by=number)

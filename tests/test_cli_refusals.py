@@ -113,7 +113,7 @@ def test_a_missing_matplotlib_is_reported_before_the_work(run, pair, tmp_path, m
 
 
 def test_benchmarks_without_their_libraries_are_refused(run, tmp_path, monkeypatch):
-    monkeypatch.delitem(sys.modules, "jaxsmw.evaluation.benchmark", raising=False)
+    monkeypatch.delitem(sys.modules, "jaxsmw.benchmark.benchmark", raising=False)
     monkeypatch.setitem(sys.modules, "tqdm", None)
     outcome = run("benchmark", tmp_path, "--output", tmp_path / "o")
     assert_refused(outcome, naming="pip install 'jaxsmw[benchmark]'")
@@ -512,7 +512,7 @@ def test_too_little_memory_is_reported_in_one_sentence(run, pair, tmp_path, monk
     def fail(*_, **__):
         raise MemoryError("Unable to allocate 75.0 GiB")
 
-    monkeypatch.setattr("jaxsmw.matching.match", fail)
+    monkeypatch.setattr("jaxsmw.matching.match.match", fail)
     outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
     assert outcome.code == 1
     assert outcome.errors == (

@@ -21,7 +21,7 @@ from synthetic import bumpy_mesh
 from jaxsmw import InputError, make_mesh, read_mesh, write_mesh
 from jaxsmw.collection import CollectionSettings, edge_matcher, match_collection
 from jaxsmw.collection.files import write_registered
-from jaxsmw.geometry.creature import CREATURES, creature
+from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io import Landmarks, MeshData, read_landmark_file, write_landmark_file
 from jaxsmw.runtime.cache import Store

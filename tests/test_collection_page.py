@@ -13,8 +13,8 @@ from report_helpers import decode, embedded
 from scipy.spatial.distance import pdist
 
 from jaxsmw.collection.shape_models import shape_model
+from jaxsmw.creature import creature
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report import collection_page
 from jaxsmw.report.collection_page import PageEdge, layout, simplify, write_collection_page

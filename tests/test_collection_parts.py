@@ -29,13 +29,13 @@ from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_po
 from jaxsmw.core.banks import LowPass
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.geometry.creature import creature
+from jaxsmw.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.surface_distance import nearest_surface_points
-from jaxsmw.presets import PRESETS, Preset
-from jaxsmw.repair.batches import refine_batch
-from jaxsmw.repair.chirality import Decision
-from jaxsmw.stage import Stage
+from jaxsmw.matching.batches import refine_batch
+from jaxsmw.matching.presets import PRESETS, Preset
+from jaxsmw.matching.search.chirality import Decision
+from jaxsmw.matching.stages import Stage
 
 
 def random_distances(number, seed=0):

@@ -9,14 +9,14 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from jaxsmw import decode, encode
-from jaxsmw.core.refiner import Problem
-from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents.cpd import (
+from jaxsmw.benchmark.opponents.cpd import (
     DriftRecovery,
     coherent_point_drift,
     kernel_factor,
     recover_by_drift,
 )
+from jaxsmw.core.refiner import Problem
+from jaxsmw.core.spectrum import Spectrum
 
 pytestmark = pytest.mark.study
 

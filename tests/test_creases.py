@@ -7,14 +7,14 @@ from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh, grid_mesh, random_spectrum, sphere_mesh
 
 from jaxsmw import InputError, Stage, compute_spectrum, match
+from jaxsmw.benchmark.datasets import open_data_set
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
-from jaxsmw.evaluation.datasets import open_data_set
 from jaxsmw.geometry import crease_eigenvectors
 from jaxsmw.geometry.eigenbasis import eigenpairs
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import read_mesh
-from jaxsmw.presets import PRESETS
+from jaxsmw.matching.presets import PRESETS
 
 C = 9
 

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import eigsh
 
-from jaxsmw.errors import InputError
-from jaxsmw.geometry import creature as creature_module
-from jaxsmw.geometry.creature import (
+from jaxsmw import creature as creature_module
+from jaxsmw.creature import (
     _KINDS,
     _MIRROR,
     CREATURES,
@@ -18,6 +17,7 @@ from jaxsmw.geometry.creature import (
     creature,
     creature_pair,
 )
+from jaxsmw.errors import InputError
 
 # The dragon takes the longest time to generate, so its tests are marked slow.
 KINDS = [pytest.param(kind, marks=pytest.mark.slow) if kind == "dragon" else kind for kind in CREATURES]

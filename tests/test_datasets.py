@@ -10,7 +10,7 @@ import scipy.io
 from synthetic import grid_mesh
 
 from jaxsmw import InputError, read_mesh
-from jaxsmw.evaluation.datasets import DataSet, open_data_set, read_pairs
+from jaxsmw.benchmark.datasets import DataSet, open_data_set, read_pairs
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import write_mesh

@@ -139,7 +139,7 @@ def test_objects_that_are_not_meshes_are_refused(given, fault):
 
 def test_the_package_does_not_import_other_libraries():
     code = (
-        "import jaxsmw, jaxsmw.io.spectra, jaxsmw.matching, sys;"
+        "import jaxsmw, jaxsmw.io.spectra, jaxsmw.matching.match, sys;"
         "print([name for name in ('pyFM', 'geomfum', 'trimesh', 'pyvista', 'torch', 'potpourri3d') "
         "if name in sys.modules])"
     )

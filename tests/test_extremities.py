@@ -7,8 +7,8 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
-from jaxsmw.repair.extremities import extremities, plausible_pairings
-from jaxsmw.repair.proxies import Proxy
+from jaxsmw.matching.search.extremities import extremities, plausible_pairings
+from jaxsmw.matching.search.proxies import Proxy
 
 
 def reduced(mesh):

@@ -12,7 +12,6 @@ from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from jaxsmw import descriptors
 from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.refinement import refine
@@ -21,22 +20,23 @@ from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import LeastSquares
-from jaxsmw.correspondence import Correspondence
-from jaxsmw.descriptors import describe
+from jaxsmw.creature import creature_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
-from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.initial_maps import initial_map
-from jaxsmw.matching import match
-from jaxsmw.pair import Pair, paired_spectra
-from jaxsmw.presets import PRESETS, Preset, choose_preset
-from jaxsmw.repair.rounds import refine_in_stages
+from jaxsmw.matching import descriptors
+from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.descriptors import describe
+from jaxsmw.matching.match import match
+from jaxsmw.matching.pair import Pair, paired_spectra
+from jaxsmw.matching.presets import PRESETS, Preset, choose_preset
+from jaxsmw.matching.search.rounds import refine_in_stages
+from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.starts import initial_map
 from jaxsmw.runtime import threads as threads_module
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.stage import Stage
 
 STAGE = Stage(WaveletPreservation(bank=Meyer(4)), number_of_eigenvectors=30)
 OPTIONS = {"preset": STAGE, "mirror": "no"}
@@ -80,7 +80,7 @@ def test_invalid_arguments_are_refused_before_eigenbases_are_computed(pair, opti
     def refuse(*_, **__):
         raise AssertionError("eigenpairs were computed")
 
-    monkeypatch.setattr("jaxsmw.pair.eigenpairs", refuse)
+    monkeypatch.setattr("jaxsmw.matching.pair.eigenpairs", refuse)
     mesh_x, mesh_y, _ = pair
     if options == {"partial": True}:
         mesh_y = make_mesh(1000 * mesh_y.vertices, mesh_y.faces)
@@ -355,7 +355,7 @@ def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
         return refine_in_stages(*arguments, **options)
 
     meanwhile: list[list[int]] = []
-    monkeypatch.setattr("jaxsmw.matching.refine_in_stages", watched)
+    monkeypatch.setattr("jaxsmw.matching.match.refine_in_stages", watched)
     threads_module._libraries.cache_clear()  # other tests load libraries that bring their own BLAS
     with threadpool_limits(2, user_api="blas"):
         before = threads()
@@ -518,7 +518,7 @@ def test_the_stages_for_large_meshes_are_as_accurate(pair, usual):
 def test_presets_fit_small_meshes(monkeypatch):
     """A mesh of 162 vertices has neither 200 eigenvectors nor 1000 samples."""
     # Nothing is compiled in a thread here, because Beartype (used only in tests) captures warnings in threads.
-    monkeypatch.setattr("jaxsmw.matching._compile_ahead", lambda *_: [])
+    monkeypatch.setattr("jaxsmw.matching.match._compile_ahead", lambda *_: [])
     mesh = bumpy_mesh(2)
     with pytest.warns(UserWarning, match="continues without descriptors: .* coarse"):
         found = match(mesh, mesh, init=np.arange(162))
@@ -660,7 +660,7 @@ def test_surface_points_and_expected_errors_are_computed_once(pair, monkeypatch)
     copies = points.weights.copy(), expected.copy()
     points.faces[:], points.weights[:], expected[:] = -1, -1, -1  # a caller may change the results
     for name in ("expected_error", "nearest_point_on_candidates"):
-        monkeypatch.delattr(f"jaxsmw.correspondence.{name}")
+        monkeypatch.delattr(f"jaxsmw.matching.correspondence.{name}")
     again = found.surface_points()
     np.testing.assert_array_equal(again.weights, copies[0])
     np.testing.assert_array_equal(found.expected_error(), copies[1])

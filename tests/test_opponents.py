@@ -8,19 +8,19 @@ import pytest
 from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh, random_spectrum
 
+from jaxsmw.benchmark.opponents.base import MethodInput
+from jaxsmw.benchmark.opponents.initial_map import Unrefined
+from jaxsmw.benchmark.opponents.peers import installed_peers
+from jaxsmw.benchmark.opponents.presets import Refined
+from jaxsmw.benchmark.opponents.registry import METHODS
+from jaxsmw.benchmark.opponents.smooth_shells import SmoothShells
+from jaxsmw.benchmark.opponents.zoomout import ZoomOut
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.evaluation.opponents.base import MethodInput
-from jaxsmw.evaluation.opponents.initial_map import Unrefined
-from jaxsmw.evaluation.opponents.peers import installed_peers
-from jaxsmw.evaluation.opponents.presets import Refined
-from jaxsmw.evaluation.opponents.registry import METHODS
-from jaxsmw.evaluation.opponents.smooth_shells import SmoothShells
-from jaxsmw.evaluation.opponents.zoomout import ZoomOut
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.pair import Pair
-from jaxsmw.preparation import PreparedPair
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import PreparedPair
 
 pytestmark = pytest.mark.study
 

@@ -11,22 +11,22 @@ import pytest
 from synthetic import grid_mesh, random_spectrum
 
 import jaxsmw
-from jaxsmw.core.results import RESULTS
-from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.descriptors import describe
-from jaxsmw.errors import InputError
-from jaxsmw.evaluation.datasets import DataPair
-from jaxsmw.evaluation.opponents import partial_functional_maps as steps
-from jaxsmw.evaluation.opponents.base import MethodInput
-from jaxsmw.evaluation.opponents.partial_functional_maps import (
+from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.opponents import partial_functional_maps as steps
+from jaxsmw.benchmark.opponents.base import MethodInput
+from jaxsmw.benchmark.opponents.partial_functional_maps import (
     PartialMap,
     SurfaceGradient,
     partial_functional_map,
 )
-from jaxsmw.evaluation.opponents.registry import METHODS, suited_methods
-from jaxsmw.geometry.creature import creature
+from jaxsmw.benchmark.opponents.registry import METHODS, suited_methods
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.creature import creature
+from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.pair import Pair, paired_spectra
+from jaxsmw.matching.descriptors import describe
+from jaxsmw.matching.pair import Pair, paired_spectra
 from jaxsmw.runtime.compilation import compiled
 
 pytestmark = pytest.mark.study

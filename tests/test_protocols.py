@@ -6,8 +6,8 @@ import pytest
 from test_datasets import column, partial, put, shrec19, topology, tosca
 
 from jaxsmw import InputError, read_mesh
-from jaxsmw.evaluation import open_data_set, protocol_pairs
-from jaxsmw.evaluation.protocols import PROTOCOLS
+from jaxsmw.benchmark import open_data_set, protocol_pairs
+from jaxsmw.benchmark.protocols import PROTOCOLS
 
 HERE = Path(__file__).parent
 

@@ -14,18 +14,17 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import match
-from jaxsmw.pair import Pair
-from jaxsmw.preparation import PreparedPair
-from jaxsmw.presets import PRESETS, Preset
-from jaxsmw.repair.outcome import Judge
-from jaxsmw.repair.overlap import detours, overlap
-from jaxsmw.repair.rounds import refine_further, refine_in_stages
-from jaxsmw.repair.scores import distortion
-from jaxsmw.repair.settings import RepairSettings
+from jaxsmw.matching.judge import Judge
+from jaxsmw.matching.match import match
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.presets import PRESETS, Preset
+from jaxsmw.matching.scores import detours, distortion, overlap
+from jaxsmw.matching.search.rounds import refine_further, refine_in_stages
+from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.stages import Stage
 from jaxsmw.report.summary import summarize
 from jaxsmw.runtime import padding
-from jaxsmw.stage import Stage
 
 LEVELS = (20, 20, 40, 40)
 STAGE = Stage(FeatureRegression(LEVELS))
@@ -82,7 +81,7 @@ def test_padding_changes_nothing(body, swapped, monkeypatch):
     _, found = outcome(body, swapped)
     n = len(swapped)
     padded_size = padding.padded_size
-    monkeypatch.setattr("jaxsmw.preparation.padded_size", lambda size: padded_size(size) + 20)
+    monkeypatch.setattr("jaxsmw.matching.preparation.padded_size", lambda size: padded_size(size) + 20)
     _, more = outcome(body, swapped)
     assert more.pointwise_map.shape[0] == found.pointwise_map.shape[0] + 20
     np.testing.assert_array_equal(more.pointwise_map[:n], found.pointwise_map[:n])

@@ -11,14 +11,14 @@ import pytest
 from report_helpers import TALL, embedded, renumbered
 
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.correspondence import Correspondence
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import GeodesicError, geodesic_error
-from jaxsmw.matching import match
-from jaxsmw.presets import PRESETS
-from jaxsmw.repair.wrong_probability import wrong_probability
+from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.match import match
+from jaxsmw.matching.presets import PRESETS
+from jaxsmw.matching.scores import wrong_probability
+from jaxsmw.matching.stages import Stage
 from jaxsmw.report.summary import REPORT_FILES, summarize, write_comparison, write_report
-from jaxsmw.stage import Stage
 from jaxsmw.wording import percentage
 
 SOURCE = replace(TALL, vertices=TALL.vertices * (1 + 0.2 * np.sin(4 * TALL.vertices[:, [1]])), name="X.off")

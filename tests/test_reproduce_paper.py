@@ -15,8 +15,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import reproduce_paper
 
-from jaxsmw.evaluation.datasets import open_data_set
-from jaxsmw.evaluation.opponents.registry import METHODS
+from jaxsmw.benchmark.datasets import open_data_set
+from jaxsmw.benchmark.opponents.registry import METHODS
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
 

@@ -9,13 +9,13 @@ from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
 from jaxsmw import InputError, make_mesh, match, read_mesh, write_mesh
-from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
+from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
+from jaxsmw.creature import creature_pair
 from jaxsmw.geometry import estimate_scale
-from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.scale import ScaleSettings
-from jaxsmw.pair import Pair, paired_spectra
-from jaxsmw.repair.scores import distortion
+from jaxsmw.matching.pair import Pair, paired_spectra
+from jaxsmw.matching.scores import distortion
 
 PRESET = "paper"
 
@@ -117,7 +117,7 @@ def test_a_part_in_another_unit_is_matched_as_in_the_same_unit(part, body):
 
 def test_an_uncertain_scale_is_announced(part, monkeypatch):
     monkeypatch.setattr(
-        "jaxsmw.pair.estimate_scale", lambda *_: estimate_scale(*part)._replace(uncertain=True)
+        "jaxsmw.matching.pair.estimate_scale", lambda *_: estimate_scale(*part)._replace(uncertain=True)
     )
     with pytest.warns(UserWarning, match=r"the estimated scale 0\.99\d is uncertain"):
         Pair.make(*part, partial=True, scale="unknown")

@@ -12,17 +12,17 @@ from jaxsmw.geometry import sampling
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.sampling import coarse_edges
-from jaxsmw.pair import Pair
-from jaxsmw.repair.expected_error import expected_error
-from jaxsmw.repair.scores import (
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.scores import (
     area_shape_difference,
     dirichlet_energy_ratio,
     discontinuous_parts,
     distortion,
+    expected_error,
     orientation_reversal,
+    wrong_probability,
 )
-from jaxsmw.repair.settings import ExpectedErrorSettings, ScoreSettings
-from jaxsmw.repair.wrong_probability import wrong_probability
+from jaxsmw.matching.settings import ExpectedErrorSettings, ScoreSettings
 from jaxsmw.wording import percentage
 
 

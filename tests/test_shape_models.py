@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxsmw.collection.shape_models import ShapeModel, align, shape_model
+from jaxsmw.creature import CREATURES, creature
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.creature import CREATURES, creature
 
 N, VERTICES = 8, 60
 

@@ -17,15 +17,15 @@ from jaxsmw import (
     match_pairs,
     read_mesh,
 )
+from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
-from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
 from jaxsmw.geometry import SurfacePoints, cut_shortcuts, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, diagnose
 from jaxsmw.geometry.shortcuts import points_on_uncut
-from jaxsmw.pair import Pair
-from jaxsmw.presets import PRESETS, Preset
-from jaxsmw.repair.settings import RepairSettings
-from jaxsmw.stage import Stage
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.presets import PRESETS, Preset
+from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.stages import Stage
 
 
 def bent_tube(gap: float, *, spacing: float = 0.08, thickness: float = 0.3) -> Mesh:
@@ -207,7 +207,7 @@ def test_isolated_vertices_receive_the_match_of_their_neighbor(fused, separate, 
     """A vertex that loses all its faces is matched like the nearest other vertex."""
     gone = 100
     holed = replace(fused, faces=fused.faces[(fused.faces != gone).all(axis=1)])
-    monkeypatch.setattr("jaxsmw.pair.cut_shortcuts", lambda mesh: holed if mesh is fused else mesh)
+    monkeypatch.setattr("jaxsmw.matching.pair.cut_shortcuts", lambda mesh: holed if mesh is fused else mesh)
     found = match(fused, separate, preset=REPAIRED, init="shot", mirror="no").pointwise_map
     distance = np.linalg.norm(fused.vertices - fused.vertices[gone], axis=1)
     distance[gone] = np.inf
@@ -217,7 +217,7 @@ def test_isolated_vertices_receive_the_match_of_their_neighbor(fused, separate, 
 def test_presets_fit_the_cut_meshes(fused, separate, monkeypatch):
     """A cut can leave fewer vertices than a stage has samples."""
     holed = replace(fused, faces=fused.faces[(fused.faces > 30).all(axis=1)])
-    monkeypatch.setattr("jaxsmw.pair.cut_shortcuts", lambda mesh: holed)
+    monkeypatch.setattr("jaxsmw.matching.pair.cut_shortcuts", lambda mesh: holed)
     stage = replace(SHORT, number_of_samples=len(fused.vertices) - 5)
     found = match(fused, fused, preset=Preset((stage,), NEVER), init="shot", mirror="no")
     assert found.preset.stages[0].number_of_samples is None

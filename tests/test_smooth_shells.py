@@ -8,16 +8,16 @@ from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
 import jaxsmw
+from jaxsmw.benchmark.datasets import open_data_set
+from jaxsmw.benchmark.opponents import smooth_shells as steps
+from jaxsmw.benchmark.opponents.base import MethodInput
+from jaxsmw.benchmark.opponents.registry import METHODS
+from jaxsmw.benchmark.opponents.smooth_shells import smooth_shells
+from jaxsmw.creature import creature
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation.datasets import open_data_set
-from jaxsmw.evaluation.opponents import smooth_shells as steps
-from jaxsmw.evaluation.opponents.base import MethodInput
-from jaxsmw.evaluation.opponents.registry import METHODS
-from jaxsmw.evaluation.opponents.smooth_shells import smooth_shells
-from jaxsmw.geometry.creature import creature
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.pair import Pair
-from jaxsmw.preparation import prepare
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import prepare
 
 pytestmark = pytest.mark.study
 

@@ -9,8 +9,8 @@ import pytest
 from report_helpers import TALL, ellipsoid, renumbered
 from synthetic import grid_mesh
 
+from jaxsmw.creature import creature_pair
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.creature import creature_pair
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.mesh_files import read_mesh
 from jaxsmw.report.standing import guess_up, placement, stand, stand_pair

@@ -8,16 +8,16 @@ import pytest
 from scipy.spatial import KDTree
 
 from jaxsmw import creature_pair, geodesic_error, make_mesh, match, read_mesh
+from jaxsmw.benchmark.datasets import open_data_set
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation.datasets import open_data_set
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.pair import Pair
-from jaxsmw.presets import Preset
-from jaxsmw.repair.settings import RepairSettings
-from jaxsmw.repair.trimming import trimmed, trimmed_stage
-from jaxsmw.stage import Stage
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.presets import Preset
+from jaxsmw.matching.search.trimming import trimmed, trimmed_stage
+from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.stages import Stage
 
 TRIMMED = Preset(
     (

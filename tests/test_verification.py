@@ -8,9 +8,9 @@ import pytest
 from test_benchmark import scape  # noqa: F401 (a fixture)
 
 from jaxsmw import InputError
+from jaxsmw.benchmark.datasets import open_data_set
+from jaxsmw.benchmark.verification import Comparison, StoredResults
 from jaxsmw.cli.run import run_command
-from jaxsmw.evaluation.datasets import open_data_set
-from jaxsmw.evaluation.verification import Comparison, StoredResults
 from jaxsmw.runtime.journal import Journal
 
 

@@ -118,7 +118,7 @@ def run(options: argparse.Namespace) -> None:
     try:
         import pyarrow  # noqa: F401 (the tables of all pairs need it, and they are written last)
 
-        import jaxsmw.evaluation.benchmark  # noqa: F401
+        import jaxsmw.benchmark.benchmark  # noqa: F401
     except ModuleNotFoundError as error:
         raise InputError(
             f"benchmarks need {error.name}, which is not installed: install it with pip install "
@@ -131,12 +131,12 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _measure(options: argparse.Namespace) -> None:
-    from jaxsmw.evaluation.benchmark import run_benchmark
-    from jaxsmw.evaluation.datasets import choose_pairs, open_data_set
-    from jaxsmw.evaluation.measurement import Settings
-    from jaxsmw.evaluation.opponents.registry import find_methods, suited_methods
-    from jaxsmw.evaluation.protocols import protocol_pairs
-    from jaxsmw.report.tables import markdown_table, write_tables
+    from jaxsmw.benchmark.benchmark import run_benchmark
+    from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
+    from jaxsmw.benchmark.measurement import Settings
+    from jaxsmw.benchmark.opponents.registry import find_methods, suited_methods
+    from jaxsmw.benchmark.protocols import protocol_pairs
+    from jaxsmw.benchmark.tables import markdown_table, write_tables
     from jaxsmw.runtime.files import make_directory
     from jaxsmw.runtime.workers import open_executor
 
@@ -166,10 +166,10 @@ def _measure(options: argparse.Namespace) -> None:
 
 
 def _verify(options: argparse.Namespace) -> None:
-    from jaxsmw.evaluation.datasets import open_data_set
-    from jaxsmw.evaluation.opponents.registry import find_methods, known_methods
-    from jaxsmw.evaluation.verification import StoredResults
-    from jaxsmw.report.tables import markdown
+    from jaxsmw.benchmark.datasets import open_data_set
+    from jaxsmw.benchmark.opponents.registry import find_methods, known_methods
+    from jaxsmw.benchmark.tables import markdown
+    from jaxsmw.benchmark.verification import StoredResults
     from jaxsmw.runtime.workers import open_executor
 
     given = {

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from jaxsmw.correspondence import Correspondence
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
     from jaxsmw.io.landmarks import Landmarks
+    from jaxsmw.matching.correspondence import Correspondence
     from jaxsmw.transfer.registered_mesh import RegisteredMesh
 
 

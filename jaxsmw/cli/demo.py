@@ -56,8 +56,8 @@ def run(options: argparse.Namespace) -> None:
         check_preset(options)
         check_initial_map(options.init)
         _check_output(options)
+        from jaxsmw.creature import creature_pair
         from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
-        from jaxsmw.geometry.creature import creature_pair
         from jaxsmw.io.map_files import write_pointwise_map
         from jaxsmw.io.mesh_files import write_mesh
         from jaxsmw.runtime.files import make_directory

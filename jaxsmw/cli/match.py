@@ -30,7 +30,7 @@ from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxsmw.correspondence import Correspondence
+    from jaxsmw.matching.correspondence import Correspondence
 
 HELP = "match two meshes and write the map"
 
@@ -175,7 +175,7 @@ def _check(options: argparse.Namespace) -> None:
 
     for file in filter(None, (options.output, options.one_to_one)):
         check_map_name(file)
-    import jaxsmw.matching  # noqa: F401 (imported here because loading is timed separately)
+    import jaxsmw.matching.match  # noqa: F401 (imported here because loading is timed separately)
 
 
 def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:

@@ -26,9 +26,9 @@ from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
     from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-    from jaxsmw.correspondence import Correspondence
     from jaxsmw.geometry.mesh import Mesh
-    from jaxsmw.stage import Stage
+    from jaxsmw.matching.correspondence import Correspondence
+    from jaxsmw.matching.stages import Stage
 
 # A dictionary from the name of each solution to its class name and its arguments. The first solution is the
 # solution of the MWP paper.
@@ -205,7 +205,7 @@ def match_meshes(
     """
     import jax
 
-    from jaxsmw.matching import match
+    from jaxsmw.matching.match import match
 
     changes = _changes(options)
     if changes and options.preset is None:
@@ -244,7 +244,7 @@ def _say_hand(correspondence: Correspondence) -> None:
 
 def _changed_stage(options: argparse.Namespace) -> Stage:
     """Return a stage that runs the MWP paper's method with the changes that the options request."""
-    from jaxsmw.stage import Stage
+    from jaxsmw.matching.stages import Stage
 
     settings: dict[str, Any] = {
         "number_of_eigenvectors": options.eigenvectors,

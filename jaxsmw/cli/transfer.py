@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float
 
-    from jaxsmw.correspondence import Correspondence
     from jaxsmw.io.landmarks import Landmarks
     from jaxsmw.io.mesh_data import MeshData
+    from jaxsmw.matching.correspondence import Correspondence
     from jaxsmw.transfer.landmarks import TransferredLandmarks
     from jaxsmw.transfer.registered_mesh import RegisteredMesh
 
@@ -217,7 +217,7 @@ def _check(options: argparse.Namespace) -> None:
         files=[options.registered, options.attributes, options.landmarks_output],
         directories=report_directories(options.report),
     )
-    import jaxsmw.matching  # noqa: F401 (imported here because loading is timed separately)
+    import jaxsmw.matching.match  # noqa: F401 (imported here because loading is timed separately)
 
 
 def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
@@ -261,7 +261,7 @@ def _register(
     If a map is given, the match and the expected error are None. The expected error is also None if neither
     landmarks nor a report need it.
     """
-    from jaxsmw.pair import Pair
+    from jaxsmw.matching.pair import Pair
     from jaxsmw.runtime.threads import one_blas_thread
     from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, points_of_map, register_mesh
 

@@ -11,11 +11,11 @@ from jaxtyping import Int64
 
 from jaxsmw.collection.pairs import refined_starts
 from jaxsmw.collection.shapes import PreparedShape, prepare_pair
-from jaxsmw.correspondence import Correspondence
 from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.matching import match_prepared
-from jaxsmw.preparation import PreparedPair
-from jaxsmw.presets import Preset
+from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.match import match_prepared
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.presets import Preset
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +27,8 @@ class EdgeMap:
     - `forward`: the match of every vertex of X, as `SurfacePoints` on Y with m entries.
     - `backward`: the match of every vertex of Y, as `SurfacePoints` on X with n entries.
     - `expected_error`: the mean expected error, in units of the square root of the area; see
-      `jaxsmw.repair.expected_error`.
-    - `distortion`: the distortion of the map; see `jaxsmw.repair.scores.distortion`.
+      `jaxsmw.matching.scores`.
+    - `distortion`: the distortion of the map; see `jaxsmw.matching.scores.distortion`.
     - `suspicious`: whether the map looks wrong, judged without the maps of other edges.
     """
 

@@ -10,9 +10,9 @@ from jaxtyping import Bool
 from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.graph import choose_edges, shape_distances
 from jaxsmw.collection.shapes import PreparedShape, shape_key
-from jaxsmw.pair import Pair
-from jaxsmw.presets import Preset
-from jaxsmw.repair.chirality import Decision, Hands
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.presets import Preset
+from jaxsmw.matching.search.chirality import Decision, Hands
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress
 
@@ -83,7 +83,7 @@ def compare_hands(
     - `progress`: a function that is called for each edge of the graph. The function is not called if only the
       first pairs are compared.
 
-    **Returns:** The `Decision` of each compared edge; see `jaxsmw.repair.chirality.Hands`.
+    **Returns:** The `Decision` of each compared edge; see `jaxsmw.matching.search.chirality.Hands`.
     """
 
     def decision(edge: Edge) -> Decision:

@@ -10,15 +10,15 @@ import jax
 from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection.consistency import check_pairs
 from jaxsmw.collection.shapes import fitted_preset, prepare_pair, prepare_shapes
-from jaxsmw.correspondence import Correspondence
 from jaxsmw.errors import check_whole_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
-from jaxsmw.matching import match_prepared
-from jaxsmw.pair import Pair
-from jaxsmw.preparation import PreparedPair
-from jaxsmw.presets import Preset, PresetName, choose_preset
-from jaxsmw.repair.batches import refine_batch
-from jaxsmw.repair.outcome import Outcome
+from jaxsmw.matching.batches import refine_batch
+from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.judge import Outcome
+from jaxsmw.matching.match import match_prepared
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.presets import Preset, PresetName, choose_preset
 from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.compilation import release_programs
 

@@ -16,7 +16,6 @@ from jaxtyping import Array, Int, Int64
 
 from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.descriptors import DescriptorAxes, PrincipalAxes, SampledPair, SampledShape, compared_samples
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.creases import crease_eigenvectors
 from jaxsmw.geometry.eigenbasis import choose_eigensolver, compute_spectrum
@@ -24,10 +23,17 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shortcuts import cut_shortcuts
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.initial_maps.nearest import nearest_map
-from jaxsmw.pair import Pair, check_eigenvalues, number_of_usable_vertices
-from jaxsmw.preparation import PreparedPair
-from jaxsmw.presets import Preset
+from jaxsmw.matching.descriptors import (
+    DescriptorAxes,
+    PrincipalAxes,
+    SampledPair,
+    SampledShape,
+    compared_samples,
+)
+from jaxsmw.matching.pair import Pair, check_eigenvalues, number_of_usable_vertices
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.presets import Preset
+from jaxsmw.matching.starts import nearest_map
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress
 

@@ -1,4 +1,4 @@
-"""Readers for data sets and ground truth, geodesic errors of maps, and benchmarks."""
+"""Ground truth, and metrics of maps such as geodesic errors."""
 
 import lazy_loader
 

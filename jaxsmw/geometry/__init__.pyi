@@ -1,6 +1,5 @@
 from .assignment import one_to_one_map
 from .creases import crease_eigenvectors
-from .creature import CreaturePair, creature_pair
 from .eigenbasis import compute_spectrum
 from .geodesics import SurfacePoints, geodesic_distances
 from .mesh import Mesh, diagnose, make_mesh
@@ -12,13 +11,11 @@ from .shot import shot_descriptors
 from .surface_distance import distances_to_surface, nearest_surface_points
 
 __all__ = [
-    "CreaturePair",
     "Mesh",
     "ScaleEstimate",
     "SurfacePoints",
     "compute_spectrum",
     "crease_eigenvectors",
-    "creature_pair",
     "cut_shortcuts",
     "diagnose",
     "distances_to_surface",

@@ -21,13 +21,13 @@ from jaxsmw.core.banks import FilterBank
 from jaxsmw.core.functional_map import Convention, encode
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.correspondence import Correspondence
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.landmarks import Landmarks
-from jaxsmw.pair import Pair, paired_spectra
-from jaxsmw.repair.settings import WITHOUT_REPAIR
+from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.pair import Pair, paired_spectra
+from jaxsmw.matching.settings import WITHOUT_REPAIR
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,

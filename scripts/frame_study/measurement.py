@@ -37,8 +37,8 @@ from jaxsmw.evaluation.metrics import GeodesicError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.pair import Pair
-from jaxsmw.preparation import prepare
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import prepare
 from jaxsmw.runtime.journal import Row
 
 DATA_SETS = ("faust_r", "tosca_r")

@@ -1,0 +1,9 @@
+"""Data sets, published protocols, and the benchmark of this library's methods beside other methods.
+
+Only the command `jaxsmw benchmark` imports this package. The rest of the library does not need it.
+"""
+
+import lazy_loader
+
+# `__init__.pyi` lists the public names. A module is loaded when one of its names is first used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

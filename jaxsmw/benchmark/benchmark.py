@@ -1,0 +1,230 @@
+"""Measures the errors and times of several methods on the pairs of a data set, and stores the results.
+
+If a benchmark was interrupted, a second call of `run_benchmark` with the same arguments measures only the
+remaining shapes and pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+from jaxsmw.benchmark.datasets import DataPair, DataSet
+from jaxsmw.benchmark.measurement import (
+    RESULT_COLUMNS,
+    SHAPE_COLUMNS,
+    Settings,
+    Task,
+    file_digest,
+    measure_pair,
+    measure_shape,
+)
+from jaxsmw.benchmark.opponents.base import Method
+from jaxsmw.benchmark.opponents.registry import MOST_EIGENVECTORS
+from jaxsmw.errors import InputError
+from jaxsmw.runtime.journal import Journal, Row, claimed_directory
+from jaxsmw.runtime.provenance import code_digest, commit, measured_code, versions
+from jaxsmw.runtime.workers import run_tasks
+
+
+class Results(NamedTuple):
+    """The results of a benchmark. All values in `rows` and `shapes` are text.
+
+    **Attributes:**
+
+    - `rows`: a list of dictionaries, each with the keys of `RESULT_COLUMNS`. The list contains one row for
+      each pair and method. A pair is left out if any method has no result for this pair.
+    - `shapes`: a dictionary from the name of each measured shape to a row with the keys of `SHAPE_COLUMNS`.
+    - `failures`: a dictionary of error messages, with one entry per shape or pair that could not be measured.
+      The key is the name of the shape, or the text "SOURCE to TARGET" for a pair.
+    """
+
+    rows: list[Row]
+    shapes: dict[str, Row]
+    failures: dict[str, str]
+
+    def check(self) -> None:
+        """Check that every shape and every pair was measured.
+
+        **Raises:** `InputError` if a measurement failed. The exception has one note for each cause. The note
+        names the cause, and the first three shapes or pairs that failed.
+        """
+        if not self.failures:
+            return
+        causes: dict[str, list[str]] = {}
+        for name, cause in self.failures.items():
+            causes.setdefault(cause, []).append(name)
+        error = InputError(
+            "some shapes or pairs could not be measured: correct these faults, and run the same benchmark "
+            "again (all other results are kept):"
+        )
+        for cause, names in causes.items():
+            error.add_note(f"{_some(names)}: {cause}")
+        raise error
+
+
+def _some(names: Sequence[str]) -> str:
+    """Return a text that contains the first three names and the number of further names."""
+    more = len(names) - _NAMED_FAILURES
+    return ", ".join(names[:_NAMED_FAILURES]) + (f" and {more} more" if more > 0 else "")
+
+
+# For each cause of failures, the error message names at most this many shapes or pairs.
+_NAMED_FAILURES = 3
+
+
+def run_benchmark(
+    data_set: DataSet,
+    pairs: Sequence[DataPair],
+    output: Path,
+    methods: Mapping[str, Method],
+    settings: Settings,
+    executor: Executor,
+    *,
+    quiet: bool = False,
+) -> Results:
+    """Run every method on every pair, and store the errors and times in CSV files.
+
+    If `output` already contains the result of a method on a pair, the method is not run again on this pair.
+    Each new result is stored immediately. If a shape or pair cannot be measured, the benchmark continues with
+    the remaining shapes and pairs.
+
+    **Arguments:**
+
+    - `data_set`: the `DataSet` that contains the pairs.
+    - `pairs`: the pairs to match, each a `DataPair` of `data_set`.
+    - `output`: an existing directory for the files `results.csv`, `shapes.csv` and `provenance.json`.
+    - `methods`: a dictionary from the name of each method to the method, for example `METHODS`. The names are
+      written to the column `method` of `results.csv`.
+    - `settings`: the `Settings` of the benchmark. Results that `output` already contains must have been
+      measured with the same settings.
+    - `executor`: the executor that runs the tasks; see `jaxsmw.runtime.workers.open_executor`.
+    - `quiet`: whether to hide the progress bars.
+
+    **Returns:** The `Results` of these pairs and methods. If a shape or pair cannot be measured,
+    `Results.failures` contains the error message. No error is raised until `Results.check` is called.
+
+    **Raises:** `InputError` if `output` contains damaged results, or results that were measured with other
+    data, settings or software versions. `InputError` is also raised if another process is adding results to
+    `output`, if a method cannot match a pair, or if a file with a map is missing.
+    """
+    for method in methods.values():
+        method.check(pairs)
+    settings.check(pairs)
+    number_of_eigenvectors = _most_eigenvectors(methods)
+    with claimed_directory(output, _origin(settings, number_of_eigenvectors), {"commit": commit()}):
+        store = _Store(output, data_set, pairs)
+        measure = partial(measure_shape, number_of_eigenvectors=number_of_eigenvectors)
+        failed = _measure_all("shapes", measure, store.missing_shapes(), executor, store.shapes, quiet)
+        measure = partial(measure_pair, settings=settings, number_of_eigenvectors=number_of_eigenvectors)
+        failed |= _measure_all("pairs", measure, store.missing_pairs(methods), executor, store.results, quiet)
+        return store.collected(methods, failed)
+
+
+def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
+    """Return the number of eigenvectors to precompute.
+
+    All results in a directory must be measured with the same number of eigenvectors, because the time of the
+    precomputation depends on this number. The returned number is at least `MOST_EIGENVECTORS`, which suffices
+    for all of `METHODS`. A later benchmark of other methods therefore usually has the same number, and can
+    add its results to the same directory.
+    """
+    return max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
+
+
+def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[str, Any]]:
+    """Return the contents of `provenance.json`."""
+    # Only the name of the directory with initial maps is stored, because its path may change.
+    chosen = asdict(settings) | {"init": Path(settings.init).name}
+    return {
+        "settings": chosen | {"number_of_eigenvectors": number_of_eigenvectors},
+        "versions": versions() | {"code": code_digest(measured_code())},
+    }
+
+
+class _Store:
+    """The result files of a benchmark, `results.csv` and `shapes.csv`.
+
+    **Raises:** `InputError` if the files are damaged or belong to another data set, or if a mesh file has
+    changed since it was measured.
+    """
+
+    def __init__(self, output: Path, data_set: DataSet, pairs: Sequence[DataPair]):
+        self.pairs = pairs
+        self.files = {
+            name: file for pair in pairs for name, file in zip(pair.names, pair.meshes, strict=True)
+        }
+        self.results = Journal(output / "results.csv", ["source", "target", "method"], RESULT_COLUMNS)
+        self.shapes = Journal(output / "shapes.csv", ["shape"], SHAPE_COLUMNS)
+        own = data_set.shapes
+        if strangers := [row["shape"] for row in self.shapes.rows if row["shape"] not in own]:
+            raise InputError(
+                f"{output}: contains results of another data set, with a shape {strangers[0]} that is not in "
+                f"{data_set.directory}: give another --output."
+            )
+        for name, file in self.files.items():
+            if (name,) in self.shapes and self.shapes[(name,)]["digest"] != file_digest(file):
+                raise InputError(
+                    f"{file}: has changed since results in {output} were measured: give another --output."
+                )
+
+    def missing_shapes(self) -> dict[str, tuple[str, Path]]:
+        """Return a dictionary from the name of each unmeasured shape to a tuple (name, mesh file)."""
+        return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
+
+    def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, Task]:
+        """Return a dictionary from the name of each unfinished pair to its task.
+
+        The task contains the methods that have no result for this pair.
+        """
+        tasks = {}
+        for pair in self.pairs:
+            missing = {name: methods[name] for name in methods if (*pair.names, name) not in self.results}
+            if missing:
+                tasks[pair.name] = Task(pair, missing)
+        return tasks
+
+    def collected(self, methods: Mapping[str, Method], failed: Mapping[str, BaseException]) -> Results:
+        """Return the results of the pairs for which every method has a result.
+
+        All methods are thus compared on the same pairs.
+        """
+        known = [pair for pair in self.pairs if all((name,) in self.shapes for name in pair.names)]
+        by_pair = [[(*pair.names, name) for name in methods] for pair in known]
+        finished = [keys for keys in by_pair if all(key in self.results for key in keys)]
+        return Results(
+            [self.results[key] for keys in finished for key in keys],
+            {name: self.shapes[(name,)] for name in self.files if (name,) in self.shapes},
+            {name: str(error) or type(error).__name__ for name, error in failed.items()},
+        )
+
+
+def _measure_all(
+    what: str,
+    measure: Callable[[Any], list[Row]],
+    tasks: Mapping[str, Any],
+    executor: Executor,
+    journal: Journal,
+    quiet: bool,
+) -> dict[str, BaseException]:
+    """Run all tasks, show a progress bar, and append the rows of each finished task to a journal.
+
+    **Returns:** A dictionary from the name of each failed task to its exception.
+    """
+    if not tasks:
+        return {}
+    failed: dict[str, BaseException] = {}
+    with tqdm(total=len(tasks), desc=what, unit=what[:-1], smoothing=0, disable=quiet) as progress:
+        for name, result in run_tasks(measure, tasks, executor):
+            if isinstance(result, BaseException):
+                failed[name] = result
+            else:
+                journal.append(result)
+            progress.update()
+    return {name: failed[name] for name in tasks if name in failed}

@@ -1,0 +1,323 @@
+"""The measurements of a benchmark.
+
+`measure_shape` measures the precomputation for one shape. `measure_pair` measures several methods on one
+pair.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.opponents.base import Method, MethodInput
+from jaxsmw.benchmark.opponents.published_maps import PublishedMaps
+from jaxsmw.benchmark.preparation import prepare_pair
+from jaxsmw.core.results import RESULTS, sentence
+from jaxsmw.errors import InputError
+from jaxsmw.evaluation.ground_truth import GroundTruth
+from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.shot import shot_descriptors
+from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.matching.starts import INITIAL_MAPS
+from jaxsmw.runtime.cache import recomputing
+from jaxsmw.runtime.journal import Row
+from jaxsmw.runtime.provenance import machine
+from jaxsmw.runtime.threads import one_blas_thread
+
+CURVE = np.linspace(0, LARGEST_THRESHOLD, 51)
+"""The thresholds of stored correspondence quality curves, in units of the square root of the area of Y."""
+
+FIGURES = (
+    "mean",
+    "median",
+    *(f"within_{threshold}" for threshold in THRESHOLDS),
+    "area_under_curve",
+    "unreachable",
+    "coverage",
+)
+"""The statistics of a map that are stored in addition to its correspondence quality curve.
+
+Geodesic errors and thresholds are in units of the square root of the area of Y.
+"""
+
+
+def read_curve(text: str) -> list[float]:
+    """Parse a correspondence quality curve, as it is stored in `results.csv`.
+
+    **Arguments:**
+
+    - `text`: one share for each threshold in `CURVE`, separated by spaces.
+
+    **Returns:** A list with one number for each threshold in `CURVE`: the share of points whose error is at
+    most the threshold.
+
+    **Raises:** `ValueError` if the text does not contain one number for each threshold.
+    """
+    shares = [float(share) for share in text.split()]
+    if len(shares) != len(CURVE):
+        raise ValueError(f"the curve has {len(shares)} shares instead of {len(CURVE)}")
+    return shares
+
+
+RESULT_COLUMNS: dict[str, Callable[[str], Any]] = {
+    "source": str,
+    "target": str,
+    "method": str,
+    "machine": str,
+    "result": str,
+    "seconds": float,
+    "truth": str,
+    **dict.fromkeys(FIGURES, float),
+    "curve": read_curve,
+}
+"""A dictionary from the name of each column of `results.csv` to the function that parses its values.
+
+The file contains one row for each pair and method. `result` is `successful`, or a sentence that explains why
+the method failed. `seconds` is the wall time from the initial map to the final map, without compilation.
+`truth` is the ground truth with which the errors were computed, `direct` or `mirrored`.
+"""
+
+SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
+    "shape": str,
+    "digest": str,
+    "vertices": int,
+    "seconds_spectrum": float,
+    "seconds_descriptors": float,
+}
+"""A dictionary from the name of each column of `shapes.csv` to the function that parses its values.
+
+The file contains one row for each shape. `digest` is a hash of the mesh file. `seconds_spectrum` and
+`seconds_descriptors` are the wall times of the precomputation.
+"""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings of a benchmark. Results depend only on these settings, the data and the code.
+
+    **Attributes:**
+
+    - `init`: the initial map from which all methods start. It is either a directory with initial maps in
+      files named `X_Y.map`, or the name of an initial map (see `jaxsmw.match`): `"shot"` (default), `"wks"`,
+      `"hks"`, `"wavelet"`, `"functional"` or `"aligned"`.
+    - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. If True,
+      errors are computed for both ground truths, and the errors with the smaller mean are stored. Use this
+      setting for methods and initial maps that do not distinguish left from right.
+    - `evaluated_points`: the number of ground-truth points at which each map is evaluated. The points are the
+      same for all methods. If None, each map is evaluated at all points.
+    - `seed`: the seed of the random draw of these points.
+
+    **Raises:** `InputError` if `init` is neither the name of an initial map nor a directory.
+    """
+
+    init: str = "shot"
+    mirrored: bool = False
+    evaluated_points: int | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
+        if not self.is_descriptor and not os.path.isdir(self.init):
+            raise InputError(
+                f"{self.init!r} is not an initial map: choose from {', '.join(INITIAL_MAPS)}, or give a "
+                "directory with maps X_Y.map."
+            )
+
+    @property
+    def is_descriptor(self) -> bool:
+        """Whether the initial maps are computed, and not read from a directory."""
+        return self.init in INITIAL_MAPS
+
+    def check(self, pairs: Sequence[DataPair]) -> None:
+        """Check that the directory `init` contains a map for every pair.
+
+        If `init` is the name of an initial map, nothing is checked.
+
+        **Raises:** `InputError` if a file with an initial map is missing.
+        """
+        if not self.is_descriptor:
+            PublishedMaps(Path(self.init)).check(pairs)
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task of a benchmark: several methods to run on one pair.
+
+    **Attributes:**
+
+    - `pair`: the pair.
+    - `methods`: a dictionary from the names of the methods to the methods.
+    """
+
+    pair: DataPair
+    methods: dict[str, Method]
+
+
+def file_digest(file: Path) -> str:
+    """Return a short hash of the contents of a file.
+
+    **Raises:** `InputError` if the file cannot be read.
+    """
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+    except OSError as error:
+        raise InputError(
+            f"{file}: cannot be read ({error.strerror}): check the path and its permissions."
+        ) from error
+
+
+def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[Row]:
+    """Compute and cache the spectrum and the SHOT descriptors of a shape, and measure their wall times.
+
+    **Arguments:**
+
+    - `shape`: the name of the shape and its mesh file.
+    - `number_of_eigenvectors`: the number of eigenvectors of the spectrum.
+
+    **Returns:** A list with one row, which has the keys of `SHAPE_COLUMNS`. Times are in seconds.
+
+    **Raises:** `InputError` if the file cannot be read, or if its spectrum or descriptors cannot be computed.
+    """
+    name, file = shape
+    with recomputing():
+        seconds, mesh = {}, read_mesh(file)
+        for what, compute in (
+            ("spectrum", lambda: compute_spectrum(mesh, number_of_eigenvectors)),
+            ("descriptors", lambda: shot_descriptors(mesh)),
+        ):
+            began = time.perf_counter()
+            compute()
+            seconds[f"seconds_{what}"] = f"{time.perf_counter() - began:.4f}"
+    return [{"shape": name, "digest": file_digest(file), "vertices": len(mesh.vertices), **seconds}]
+
+
+def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) -> list[Row]:
+    """Match a pair with every method of a task, and measure the errors of the maps.
+
+    **Arguments:**
+
+    - `task`: the pair and the methods.
+    - `settings`: the settings of the benchmark.
+    - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape. This number must be at
+      least as large as the `number_of_eigenvectors` of every method in the task.
+
+    **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. The statistics
+    of a map that contains -1 are NaN. Most methods return such a map after a failure.
+
+    **Raises:** `InputError` if a file cannot be read, or if the pair cannot be prepared; `ArithmeticError` if
+    the computation of an initial map fails numerically.
+    """
+    data = task.pair
+    mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)
+    truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
+    if settings.mirrored:
+        truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
+    methods = task.methods.values()
+    pair = prepare_pair(
+        data,
+        mesh_x,
+        mesh_y,
+        settings.init,
+        number_of_eigenvectors,
+        number_of_descriptors=max(method.number_of_descriptors for method in methods),
+    )
+    rows = []
+    for name, method in task.methods.items():
+        pointwise_map, result, seconds = _timed(name, method, pair)
+        ending = "successful" if result == RESULTS.successful else sentence(result)
+        figures = _evaluate(mesh_y, pointwise_map[: len(mesh_x.vertices)], truths, settings)
+        identity = {"source": data.source, "target": data.target, "method": name, "machine": machine()}
+        rows.append(identity | {"result": ending, "seconds": f"{seconds:.5f}"} | figures)
+    return rows
+
+
+def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
+    """Run a method, and return its map, its status code (`RESULTS`) and its wall time in seconds.
+
+    The time does not include compilation. For maps that are read from files, the time is NaN.
+    """
+    for _ in range(2):
+        with _CompilationClock() as compilation, one_blas_thread():
+            began = time.perf_counter()
+            pointwise_map, result = jax.block_until_ready(method(pair))
+            seconds = time.perf_counter() - began - compilation.seconds
+        warm = name in _warm and not compilation.seconds
+        _warm.add(name)
+        # The first run of a method takes longer than later runs, for example because of imports, so the
+        # method runs a second time. A long first run is not repeated, because the time for imports is
+        # negligible in comparison.
+        if warm or seconds > _LONG:
+            break
+    return np.asarray(pointwise_map), result, np.nan if isinstance(method, PublishedMaps) else seconds
+
+
+# A run that takes longer than this number of seconds is not repeated.
+_LONG = 60
+# The names of the methods that have run in this process.
+_warm: set[str] = set()
+
+
+class _CompilationClock:
+    """A context manager that adds up the seconds that XLA spends on compilation in this process."""
+
+    def __enter__(self) -> _CompilationClock:
+        self.seconds = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        jax.monitoring.unregister_event_duration_listener(self._listen)
+
+    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            self.seconds += duration_secs
+
+
+def _evaluate(
+    mesh_y: Mesh,
+    pointwise_map: Int[np.ndarray, " m"],
+    truths: Mapping[str, GroundTruth],
+    settings: Settings,
+) -> Row:
+    """Evaluate a map with every ground truth, and return the statistics with the smallest mean error.
+
+    `truths` is a dictionary with the ground truth `"direct"` and, if requested, the ground truth
+    `"mirrored"`. If the map contains -1, all statistics are NaN. Most methods return such a map after a
+    failure.
+    """
+    if (pointwise_map < 0).any():
+        return dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}
+    errors = {
+        name: geodesic_error(
+            mesh_y, pointwise_map, truth, number_of_samples=settings.evaluated_points, seed=settings.seed
+        )
+        for name, truth in truths.items()
+    }
+    nearest = min(errors, key=lambda name: errors[name].mean)
+    error = errors[nearest]
+    figures = (
+        error.mean,
+        error.median,
+        *error.within.values(),
+        error.area_under_curve(),
+        error.unreachable,
+        coverage(mesh_y, pointwise_map),
+    )
+    curve = error.correspondence_quality_curve(CURVE)
+    return {
+        "truth": nearest,
+        **{name: f"{value:.7f}" for name, value in zip(FIGURES, figures, strict=True)},
+        "curve": " ".join(f"{share:.5f}" for share in curve),
+    }

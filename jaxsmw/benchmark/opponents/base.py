@@ -1,0 +1,158 @@
+"""The interface of the compared methods: their input and their output.
+
+All methods receive the same prepared pair, with the same spectra, the same initial map and the same samples.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Array, Int
+
+from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.stages import Stage
+
+MOST_SAMPLES = 1000
+"""The number of samples of each shape in a prepared pair. No method uses more samples.
+
+If a shape has fewer referenced vertices, both shapes have the same smaller number of samples. This is the
+number of referenced vertices of the shape with the fewest.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class MethodInput:
+    """The input of a method: two shapes X and Y, prepared once for all methods.
+
+    **Attributes:**
+
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, with at least as many eigenvectors as any method
+      uses. Spectra and maps may be padded.
+    - `initial_map`: the initial map X -> Y (m,), 0-based vertices of Y.
+    - `samples`: sampled vertices of X (s_x,) and of Y (s_y,) in farthest-point order, for methods that
+      iterate on samples.
+    - `meshes`: the meshes of X and Y, for methods that need edges or faces.
+    - `names`: the names of X and Y, for methods that read maps from files.
+    - `partial`: whether X and Y are a partial pair, that is, one shape is a part of the other shape. The
+      spectra of a partial pair are comparable only in their common range of eigenvalues.
+    - `prepared`: the `PreparedPair` from which this input was created, for methods that run a preset.
+    """
+
+    spectrum_x: Spectrum
+    spectrum_y: Spectrum
+    initial_map: Int[Array, " m"]
+    samples: tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
+    meshes: tuple[Mesh, Mesh] | None = None
+    names: tuple[str, str] = ("X", "Y")
+    partial: bool = False
+    prepared: PreparedPair | None = None
+
+    @classmethod
+    def of(cls, prepared: PreparedPair, names: tuple[str, str]) -> MethodInput:
+        """Create the input of all methods from a prepared pair.
+
+        **Arguments:**
+
+        - `prepared`: the prepared pair that `jaxsmw.matching.preparation.prepare` returns, with samples.
+        - `names`: the names of X and Y.
+        """
+        assert prepared.samples is not None
+        spectrum_x, spectrum_y = prepared.padded
+        return cls(
+            spectrum_x,
+            spectrum_y,
+            prepared.padded_map(prepared.initial_map),
+            prepared.samples,
+            prepared.pair.meshes,
+            names,
+            prepared.pair.partial,
+            prepared,
+        )
+
+    def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
+        """Return both spectra with the eigenvectors and descriptors that a stage uses; see `Stage.view`.
+
+        The spectra of a partial pair are also cut to their common range of eigenvalues.
+        """
+        return stage.view(self.spectrum_x, self.spectrum_y, partial=self.partial)
+
+    def truncated(self, k: int) -> tuple[Spectrum, Spectrum]:
+        """Return both spectra with their first k eigenvectors.
+
+        The spectra of a partial pair are also cut to their common range of eigenvalues.
+        """
+        return self.seen_in(Stage(number_of_eigenvectors=k))
+
+    def sampled(self, count: int | None) -> tuple[Int[Array, " s_x"] | None, Int[Array, " s_y"] | None]:
+        """Return the first `count` samples of X and of Y; (None, None) if `count` is None."""
+        samples_x, samples_y = self.samples
+        return (None, None) if count is None else (samples_x[:count], samples_y[:count])
+
+
+class Method(abc.ABC):
+    """The base class of all compared methods. A method computes a pointwise map from a prepared pair.
+
+    A subclass must define `__call__`, `reference` and `number_of_eigenvectors`. `METHODS` in
+    `jaxsmw.benchmark.opponents.registry` contains the available methods.
+
+    **Attributes:**
+
+    - `reference`: the publication and the settings of the method, as text that is printed with the results.
+    - `number_of_eigenvectors`: the largest number of eigenvectors that the method uses.
+    - `number_of_descriptors`: the largest number of descriptors that the method uses.
+    - `full_only`: whether the method matches only pairs of full shapes.
+    - `partial_only`: whether the method matches only partial pairs.
+    """
+
+    reference: str
+    number_of_eigenvectors: int
+    number_of_descriptors: int = 0
+    full_only: bool = False
+    partial_only: bool = False
+
+    @abc.abstractmethod
+    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
+        """Return the pointwise map X -> Y (m,), 0-based vertices of Y, and the status code (`RESULTS`).
+
+        If the status code is not `RESULTS.successful`, the map is invalid. After a failure, most methods
+        return -1 for all vertices.
+        """
+
+    def check(self, pairs: Sequence[DataPair]) -> None:
+        """Check that the method can match all pairs. A benchmark calls `check` before it matches any pair.
+
+        **Raises:** `InputError` if the method cannot match a pair.
+        """
+        if self.full_only and any(pair.partial for pair in pairs):
+            raise InputError(
+                f"{self.reference}: cannot match partial shapes: remove this method from --methods."
+            )
+        if self.partial_only and not all(pair.partial for pair in pairs):
+            raise InputError(
+                f"{self.reference}: matches partial shapes only: remove this method from --methods."
+            )
+
+    def suits(self, pairs: Sequence[DataPair]) -> bool:
+        """Return whether the method can match all pairs. Unlike `check`, `suits` does not look for files."""
+        partial = [pair.partial for pair in pairs]
+        return not (self.full_only and any(partial)) and not (self.partial_only and not all(partial))
+
+
+def check_spectrum(mesh: Mesh, spectrum: Spectrum) -> None:
+    """Check that a spectrum, padded or not, has a row for every vertex of a mesh.
+
+    **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
+    """
+    rows, n = spectrum.mask.shape[0], len(mesh.vertices)
+    if rows < n:
+        raise InputError(
+            f"{mesh.name}: has {n} vertices, but its spectrum has {rows} rows: give the spectrum of this "
+            "mesh."
+        )

@@ -1,0 +1,401 @@
+"""The result of `match`: a map from X to Y, the spectra, and statistics of the map."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int64
+from numpy.typing import ArrayLike
+
+from jaxsmw.core.refinement import Refinement
+from jaxsmw.core.refiner import Problem, Refiner, State, reverse_map
+from jaxsmw.core.soft_maps import SoftMap, sinkhorn
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.core.triangles import nearest_point_on_candidates
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.assignment import one_to_one_map
+from jaxsmw.geometry.geodesics import SurfacePoints, check_indices
+from jaxsmw.geometry.mesh import Mesh, extend_from
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import program_size
+from jaxsmw.matching.presets import Preset
+from jaxsmw.matching.scores import expected_error, overlap, wrong_probability
+from jaxsmw.matching.settings import WITHOUT_REPAIR, ExpectedErrorSettings
+from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.padding import pad_rows, padded_size
+from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, register_mesh
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Correspondence:
+    """The result of `match`: a map from X to Y, the spectra, and statistics of the map.
+
+    The methods `surface_points`, `one_to_one`, `soft_map`, `expected_error`, `wrong_probability` and others
+    compute further results. The results of `surface_points` and `expected_error` are kept, so further calls
+    cost no time.
+
+    **Attributes:**
+
+    - `pair`: the `Pair` of the source X (m vertices) and the target Y (n vertices).
+    - `pointwise_map`: T: X -> Y (m,), int64. Entry i is the match of vertex i of X, as a 0-based vertex of Y.
+    - `functional_map`: the functional map of the last iteration, a property without unit. Its shape is
+      (k_X, k_Y) for a pullback, which is the usual convention, and (k_Y, k_X) for a pushforward.
+    - `initial_map`: the map from which refinement started (m,), int64, as 0-based vertices of Y.
+    - `init`: the name of the initial map, such as `"shot"`; None if a map or landmarks were given. If repair
+      chose an alternative initial map, `initial_map` is the alternative.
+    - `preset`: the `Preset` with the stages of refinement and the settings of the repair. For small meshes,
+      the stages of a preset differ from the stages in `PRESETS`; see `match`.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. They contain the k_X and k_Y
+      eigenvectors that the last stage uses. Two full shapes are each scaled to area 1. The shapes of a
+      partial pair are scaled by one common factor, so that the larger shape has area 1. If a mesh was cut
+      before it was matched (`jaxsmw.geometry.cut_shortcuts`), or was trimmed
+      (`jaxsmw.matching.search.trimming`), the spectrum belongs to the cut or trimmed mesh. The mask of the
+      spectrum is False for trimmed vertices.
+    - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
+      called with `history=True`.
+    - `iterations`: the total number of iterations of all stages.
+    - `distortion`: the distortion of the map (`jaxsmw.matching.scores.distortion`), a number without unit.
+      The
+      distortion is 1 for isometries and larger for worse maps. The value is None if it was not computed.
+    - `suspicious`: whether the map looks wrong. If the preset has repair, the value is True if limbs still
+      look swapped or the body still looks upside down after repair. If the preset has no repair, the value is
+      True if the distortion is at least 1.25. In both cases, the value is also True if `match` is uncertain
+      whether X or its mirror image corresponds to Y, for example if `mirror_evidence` is between 0 and 0.1.
+    - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
+      hands, such as a left and a right tooth. Entry i of `pointwise_map` is always the match of vertex i of
+      X, even if X was mirrored.
+    - `mirror_evidence`: the evidence that the mirror image of X, and not X itself, corresponds to Y; None if
+      `match` computed no evidence. The evidence is the logarithm of a ratio: the distance error of a coarse
+      map of X itself, divided by the distance error of a coarse map of the mirror image. `match` compares up
+      to two pairs of coarse maps and keeps the smaller evidence (`jaxsmw.matching.search.chirality.Hands`).
+      If X and Y differ enough from their own mirror images, a value of at least 0.05 leads to
+      `mirrored=True`. Most correct decisions with `mirrored=True` have values above 0.3.
+    - `seconds`: a dictionary from the name of each step to its wall time in seconds. If meshes of a certain
+      size are refined for the first time, the time includes compilation.
+    """
+
+    pair: Pair
+    pointwise_map: Int64[np.ndarray, " m"]
+    initial_map: Int64[np.ndarray, " m"]
+    init: str | None
+    preset: Preset
+    spectrum_x: Spectrum
+    spectrum_y: Spectrum
+    refinement: Refinement
+    iterations: int
+    distortion: float | None = None
+    suspicious: bool = False
+    mirrored: bool = False
+    mirror_evidence: float | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        m, n = (len(mesh.vertices) for mesh in self.pair.meshes)
+        judged = "" if self.distortion is None else f", distortion {self.distortion:.3f}"
+        flag = (", mirrored" if self.mirrored else "") + (", suspicious" if self.suspicious else "")
+        return f"Correspondence({self.pair.name}: {m} to {n} vertices{judged}{flag})"
+
+    @property
+    def mesh_x(self) -> Mesh:
+        """The source X."""
+        return self.pair.mesh_x
+
+    @property
+    def mesh_y(self) -> Mesh:
+        """The target Y."""
+        return self.pair.mesh_y
+
+    @property
+    def functional_map(self) -> Float[np.ndarray, "k_out k_in"]:
+        """The functional map of the last iteration, in the convention of the last stage's refiner.
+
+        The map has no unit. The shape is (k_X, k_Y) for a pullback, from functions on Y to functions on X.
+        The shape is (k_Y, k_X) for a pushforward, from functions on X to functions on Y.
+        """
+        return np.asarray(self.refinement.functional_map)
+
+    def surface_points(self) -> SurfacePoints:
+        """Compute the match of every vertex of X as a point on a triangle of Y.
+
+        The last stage embeds X and Y in a common space. In this space, `pointwise_map` gives the vertex of Y
+        that is nearest to a vertex of X. This method searches the triangles around that vertex of Y for the
+        nearest point. For 98 % of the vertices of X, this point is also the nearest point on all triangles of
+        Y. `jaxsmw.functional_maps.decode_to_triangles` searches all triangles, which takes 20 times as long.
+        An unreferenced vertex of X receives the point of the nearest referenced vertex.
+
+        **Returns:** A `SurfacePoints` with m points on Y, one for each vertex of X. Its attribute `faces`
+        (m,) contains 0-based rows of `mesh_y.faces`, and its attribute `weights` (m, 3) contains barycentric
+        weights.
+        """
+        points = self._surface_points
+        return SurfacePoints(points.faces.copy(), points.weights.copy())
+
+    @functools.cached_property
+    def _surface_points(self) -> SurfacePoints:
+        return self._points_near(self.pair, self.pointwise_map, *self._embeddings())
+
+    def reverse_surface_points(self) -> SurfacePoints:
+        """Compute the match of every vertex of Y as a point on a triangle of X.
+
+        The method uses the same embeddings as `surface_points`, so `match` is not called again.
+
+        **Returns:** A `SurfacePoints` with n points on X, one for each vertex of Y. An unreferenced vertex of
+        Y receives the point of the nearest referenced vertex.
+        """
+        embedded_x, embedded_y = self._embeddings()
+        return self._points_near(self.pair.reversed(), self.reverse_map(), embedded_y, embedded_x)
+
+    def reverse_map(self) -> Int64[np.ndarray, " n"]:
+        """Compute the map Y -> X from the embeddings of the last stage, without a second call of `match`.
+
+        **Returns:** The match of every vertex of Y (n,), int64, as a 0-based vertex of X. An unreferenced
+        vertex of Y receives the match of the nearest referenced vertex.
+        """
+        with self._precision():
+            padded = np.asarray(compiled(reverse_map)(*self._last_stage()))
+        found = padded[: len(self.mesh_y.vertices)].astype(np.int64)
+        return extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, found)
+
+    def _points_near(
+        self,
+        pair: Pair,
+        matches: Int64[np.ndarray, " m"],
+        queries: Float[np.ndarray, "m d"],
+        database: Float[np.ndarray, "n d"],
+    ) -> SurfacePoints:
+        """Return, for each embedded source vertex, the nearest point on the triangles around its match."""
+        mesh_x, mesh_y = pair.meshes
+        with self._precision():
+            rows, candidates = mesh_y.faces_around(matches)
+            # Padding lets pairs of similar sizes share compiled programs.
+            padding = padded_size(len(rows)) - len(rows)
+            rows, candidates = (np.pad(values, (0, padding), "edge") for values in (rows, candidates))
+            padded = (
+                pad_rows(queries, program_size(mesh_x)),
+                pad_rows(database, program_size(mesh_y)),
+                pad_rows(mesh_y.faces, padded_size(len(mesh_y.faces))),
+                rows,
+                candidates,
+            )
+            found = compiled(nearest_point_on_candidates)(*jax.device_put(padded))
+        faces, weights = (np.asarray(values)[: len(queries)] for values in found)
+        weights = weights.astype(np.float64)
+        return SurfacePoints(faces.astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
+
+    def registered_mesh(self, *, stiffness: float = DEFAULT_STIFFNESS) -> RegisteredMesh:
+        """Deform X onto Y, guided by `surface_points`; see `jaxsmw.transfer.register_mesh`.
+
+        **Arguments:**
+
+        - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map is smoothed
+          if its wavelength is shorter than the stiffness. The default is 0.005.
+
+        **Returns:** A `RegisteredMesh`, whose attribute `vertices` (m, 3) contains positions on Y, in the
+        unit of Y. `jaxsmw.transfer` transfers landmarks and attributes with a registered mesh.
+
+        **Raises:** `InputError` if the stiffness is not positive and finite; `ArithmeticError` if the
+        deformation does not converge.
+        """
+        return register_mesh(
+            self.mesh_x,
+            self.mesh_y,
+            self.surface_points(),
+            stiffness=stiffness,
+            scale=self.pair.scale if self.pair.partial else None,
+        )
+
+    def one_to_one(self) -> Int64[np.ndarray, " m"]:
+        """Compute a map in which no two referenced vertices of X share a match.
+
+        See `jaxsmw.geometry.one_to_one_map`. The map is intended for shapes with the same triangulation. For
+        shapes with different triangulations, the attribute `pointwise_map` has much smaller errors than the
+        one-to-one map. An unreferenced vertex of X receives the match of the nearest referenced vertex.
+
+        **Returns:** The map X -> Y (m,), int64, as 0-based vertices of Y.
+
+        **Raises:** `InputError` if X has more referenced vertices than Y, or if the product of the numbers of
+        referenced vertices of X and Y is above 20 000².
+        """
+        queries, database = self._embeddings()
+        used = self.mesh_x.referenced_vertices
+        found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.referenced_vertices)
+        return extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, found)
+
+    def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
+        """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
+
+        `SoftMap.pull_back` transfers functions smoothly from Y to X. `SoftMap.pointwise_map` covers more of Y
+        than `Correspondence.pointwise_map`. Both maps were compared on four remeshed FAUST pairs.
+        `SoftMap.pointwise_map` covers 76 to 82 % of Y's vertices, depending on the pair, and
+        `Correspondence.pointwise_map` covers 69 to 75 %. The error of `SoftMap.pointwise_map` is up to 4 %
+        smaller or up to 2 % larger than the error of `Correspondence.pointwise_map`. One iteration takes 0.2
+        seconds for 5000 vertices, and 20 iterations are needed.
+
+        An unreferenced vertex of X is mapped like the nearest referenced vertex. The method issues a
+        `UserWarning` if the iterations end before they reach the tolerance.
+
+        **Arguments:**
+
+        - `temperature`: a positive number; see `jaxsmw.learning.sinkhorn`. The unit of the temperature is the
+          area-weighted mean squared distance from the embedded vertices of X to their nearest embedded
+          vertices of Y. A temperature of 0.1 gives a sharper map than 0.3 and needs more iterations. A
+          temperature of 1 gives a softer map than 0.3.
+        - `iterations`: the maximum number of iterations, an integer of at least 1.
+        - `tolerance`: a number from 0 to 1. The iterations stop when the misplaced area is at most this share
+          of the total area. Misplaced area is the area that vertices of Y receive in excess of their own
+          areas. If X and Y are different bodies, a tolerance below a few hundredths costs further iterations
+          but does not improve the map.
+
+        **Returns:** A `SoftMap` from the m vertices of X to the n vertices of Y. Its method `pull_back` takes
+        p functions on Y (n, p) to functions on X (m, p), and its method `pointwise_map` returns a map X -> Y
+        (m,). Its attribute `converged` is True if the tolerance was reached.
+
+        **Raises:** `InputError` if the temperature or the number of iterations is not positive.
+        """
+        if not temperature > 0 or iterations < 1:
+            raise InputError(
+                f"a soft map cannot have temperature {temperature} and {iterations} iterations: give a "
+                "positive temperature, such as 0.3, and at least 1 iteration."
+            )
+        with self._precision():
+            found = compiled(sinkhorn)(
+                *jax.device_put(self._embeddings()),
+                query_areas=self.spectrum_x.vertex_areas,
+                database_areas=self.spectrum_y.vertex_areas,
+                temperature=jnp.asarray(float(temperature)),
+                iterations=iterations,
+                tolerance=jnp.asarray(float(tolerance)),
+            )
+        if not found.converged:
+            warnings.warn(
+                f"the soft map has not converged: after {iterations} iterations, the share of misplaced area "
+                f"is {float(found.residual):.3g}, which exceeds the tolerance {tolerance:g}: allow more "
+                "iterations, a higher temperature or a larger tolerance.",
+                stacklevel=2,
+            )
+        return found
+
+    def expected_error(self) -> Float[np.ndarray, " m"]:
+        """Estimate the geodesic error of every match without ground truth.
+
+        `jaxsmw.matching.scores` explains the estimate. An unreferenced vertex of X receives the value
+        of the nearest referenced vertex.
+
+        **Returns:** The expected geodesic distance between every match and the true match (m,), divided by
+        the square root of Y's area.
+        """
+        return self._expected_error.copy()
+
+    def overlap(
+        self, reverse_map: ArrayLike | None = None
+    ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
+        """Predict which vertices have a counterpart on the other shape, for partial shapes.
+
+        `jaxsmw.matching.scores` explains the prediction.
+
+        **Arguments:**
+
+        - `reverse_map`: a map Y -> X (n,), 0-based vertices of X. By default, `Correspondence.reverse_map`
+          computes it. The map of a second match, from Y to X, makes the prediction more accurate.
+
+        **Returns:** A mask of the vertices of X (m,) and a mask of the vertices of Y (n,), True for vertices
+        with a counterpart.
+
+        **Raises:** `InputError` if the reverse map does not fit the meshes.
+        """
+        if reverse_map is None:
+            reverse = self.reverse_map()
+        else:
+            name = f"map to {self.mesh_x.name}: vertex"
+            reverse = check_indices(reverse_map, len(self.mesh_x.vertices), name)
+            if len(reverse) != len(self.mesh_y.vertices):
+                raise InputError(
+                    f"{self.mesh_y.name}: the reverse map has {len(reverse)} entries for "
+                    f"{len(self.mesh_y.vertices)} vertices: give one vertex of X for each vertex."
+                )
+        return (
+            overlap(self.pair, self.pointwise_map, reverse),
+            overlap(self.pair.reversed(), reverse, self.pointwise_map),
+        )
+
+    def wrong_probability(self, expected_error: Float[np.ndarray, " m"] | None = None) -> float | None:
+        """Estimate the probability that the map is wrong on a part of the body, without ground truth.
+
+        A map is called wrong if at least 2 % of X's area have errors above 0.25 times the square root of Y's
+        area, for example because limbs are swapped. `jaxsmw.matching.scores` explains the estimate.
+
+        **Arguments:**
+
+        - `expected_error`: the expected error of each match (m,), divided by the square root of Y's area. By
+          default, `Correspondence.expected_error` computes it.
+
+        **Returns:** A probability, from 0 to 1; None if `distortion` is None.
+        """
+        if self.distortion is None:
+            return None
+        expected = self._expected_error if expected_error is None else expected_error
+        return wrong_probability(self.distortion, float(self.mesh_x.average(expected)))
+
+    @functools.cached_property
+    def _expected_error(self) -> Float[np.ndarray, " m"]:
+        return self.estimate_error(ExpectedErrorSettings())
+
+    def estimate_error(self, settings: ExpectedErrorSettings) -> Float[np.ndarray, " m"]:
+        """Estimate the geodesic error of every match (m,) with the given settings; see `expected_error`.
+
+        **Arguments:**
+
+        - `settings`: the `ExpectedErrorSettings`.
+
+        **Returns:** The expected errors (m,), divided by the square root of Y's area.
+        """
+        expected = expected_error(
+            self.pair.mirrored() if self.mirrored else self.pair,
+            self.pointwise_map,
+            self.reverse_map(),
+            self.spectrum_x,
+            self.spectrum_y,
+            settings,
+            (self.preset.repair or WITHOUT_REPAIR).scores,
+        )
+        return extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, expected)
+
+    def _embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
+        """Return the embeddings of X and Y in the last stage.
+
+        The match of a vertex of X is the nearest vertex of Y in these embeddings. A vertex that was not
+        matched, because it is unreferenced or was trimmed, has the embedding of the nearest matched vertex.
+        """
+        with self._precision():
+            padded_x, padded_y = map(np.asarray, compiled(_embeddings)(*self._last_stage()))
+        return (
+            extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, padded_x[: len(self.mesh_x.vertices)]),
+            extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, padded_y[: len(self.mesh_y.vertices)]),
+        )
+
+    def _last_stage(self) -> tuple[Refiner, Problem, State]:
+        """Return the refiner, the problem with padded spectra, and the state of the last stage."""
+        # If the mirror image of X was matched, the state of the refiner belongs to the mirror image.
+        spectrum_x = self.spectrum_x.reflect() if self.mirrored else self.spectrum_x
+        # Padding lets pairs of similar sizes share compiled programs.
+        pad = compiled(Spectrum.pad)
+        padded_x = pad(spectrum_x, program_size(self.mesh_x))
+        padded_y = pad(self.spectrum_y, program_size(self.mesh_y))
+        problem = Problem(padded_x, padded_y, partial=self.pair.partial)
+        return self.preset.stages[-1].refiner, problem, self.refinement.state
+
+    def _precision(self) -> AbstractContextManager[None]:
+        """Return a context manager in which JAX uses the float type of the functional map."""
+        return jax.enable_x64(self.functional_map.dtype == np.float64)
+
+
+def _embeddings(
+    refiner: Refiner, problem: Problem, state: State
+) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+    return refiner.embeddings(refiner.prepare(problem), state)

@@ -1,0 +1,357 @@
+"""The settings of the repair, of the expected error, and of the choice between X and its mirror image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxsmw.errors import InputError, check_number, check_whole_number
+
+
+@dataclass(frozen=True)
+class ScoreSettings:
+    """The settings of `jaxsmw.matching.scores`. Lengths are in units of the square root of the area.
+
+    The tables with numbers R1, R2, … are in `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `vertices_per_eigenvector`: the smallest number of vertices per eigenvector in the computation of
+      Dirichlet energies. With more eigenvectors, the energies on a coarse mesh would depend on the mesh
+      resolution.
+    - `discontinuity_distance`, `discontinuity_ratio`: the limits for discontinuous edges. An edge is
+      discontinuous if the distance between the matches of its ends is at least `discontinuity_distance` and
+      at least `discontinuity_ratio` times the length of the edge. On bodies of 5000 vertices, the distance
+      between the matches of neighbouring vertices is 0.03 times the square root of the area.
+    - `orientation_eigenvectors`: the number of eigenvectors that smooth the density of signed area. The
+      density is projected onto the span of these eigenvectors.
+    - `orientation_threshold`: a map reverses the orientation where the smoothed density of signed area is
+      below this value. For an isometry, the density is 1.
+    - `orientation_weight` (Table R6): the weight of orientation reversal in the distortion. This weight
+      multiplies the share of X's area in which the orientation is reversed.
+    - `area_eigenvectors`: the number of eigenvectors on which the area-based shape difference is computed.
+    """
+
+    vertices_per_eigenvector: int = 10
+    discontinuity_distance: float = 0.1
+    discontinuity_ratio: float = 3.0
+    orientation_eigenvectors: int = 50
+    orientation_threshold: float = -0.2
+    orientation_weight: float = 4.0
+    area_eigenvectors: int = 20
+
+
+@dataclass(frozen=True)
+class ExpectedErrorSettings:
+    """The settings of `jaxsmw.matching.scores`. Lengths are in units of the square root of the area.
+
+    The tables with numbers R1, R2, … are in `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `detour_weight` (Tables R17 and R18): the weight of the detour of a vertex. The detour is the distance
+      between the vertex and its image under the map followed by the reverse map.
+    - `distortion_weight`: the weight of the mean change in length of the edges at a vertex. With all default
+      settings, the mean error of each tested data set is 0.9 to 1.6 times its mean expected error (Table
+      R30).
+    - `misplaced_weight`: the increase of the expected error on a limb that looks swapped, in units of the
+      square root of the limb's area.
+    - `heat_time`: the time of the heat flow that averages over neighbouring vertices, in units of the area.
+      The default value averages over a disk of radius 0.06.
+    - `area_weight`, `isometric_difference` (Table R30): for two full shapes with the area-based shape
+      difference d, the expected error is multiplied by `1 + area_weight * log(d / isometric_difference)`. If
+      d is smaller than `isometric_difference`, the factor is 1.
+    """
+
+    detour_weight: float = 0.5
+    distortion_weight: float = 2.0
+    misplaced_weight: float = 0.5
+    heat_time: float = 1e-3
+    area_weight: float = 0.7
+    isometric_difference: float = 0.09
+
+
+@dataclass(frozen=True)
+class WrongProbabilitySettings:
+    """The coefficients of `jaxsmw.matching.scores`, a logistic regression. (Table R31)
+
+    **Attributes:**
+
+    - `intercept`: the log-odds that a map is wrong if its distortion and its mean expected error are both 1.
+    - `distortion_weight`: the weight of the logarithm of the distortion.
+    - `expected_error_weight`: the weight of the logarithm of the mean expected error.
+    """
+
+    intercept: float = 4.9
+    distortion_weight: float = 2.5
+    expected_error_weight: float = 2.1
+
+
+@dataclass(frozen=True)
+class ExtremitySettings:
+    """The settings of `jaxsmw.matching.search.extremities`. Lengths are in units of the square root of the
+    area.
+
+    **Attributes:**
+
+    - `distance`: the smallest allowed distance between two extremities.
+    - `most`: the largest number of extremities. The number of pairings grows very fast with the number of
+      extremities.
+    """
+
+    distance: float = 0.35
+    most: int = 6
+
+
+@dataclass(frozen=True)
+class AlternativeSettings:
+    """The settings of `jaxsmw.matching.search.alternatives`. Lengths are in units of the square root of the
+    area.
+
+    The tables with numbers R1, R2, … are in `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `samples`: the number of samples of each shape.
+    - `radii`: a tuple with one entry for each initial map from SHOT alone. Each entry is a tuple of radii,
+      which are positive integers in units of 0.06.
+    - `extremities`: the settings of the search for extremities, an `ExtremitySettings`.
+    - `compared_pairings`: the largest number of pairings of extremities in the comparison of features. The
+      most plausible pairings are compared; see `jaxsmw.matching.search.extremities.plausible_pairings`.
+    - `pairings` (Tables R27 and R40): the number of initial maps from pairings of extremities.
+    - `distance_weight`: the weight of the distances to extremities in the search for initial maps. SHOT has
+      the weight 1.
+    - `position_weight`: the weight of the positions along the principal axes in the same search.
+    - `levels`, `descriptors`: the levels and the number of descriptors of the feature regression that refines
+      the initial maps.
+    - `crease_eigenvectors` (Table R45): the number of crease eigenvectors in the second attempt, at least 0.
+      The second attempt refines the same initial maps with these further features. It runs if the first
+      attempt ends with a map that looks wrong, and the area-based shape difference of two full shapes is
+      below `RepairSettings.non_isometric`. With 0, there is no second attempt.
+    - `repaired`: the number of refined maps whose faults are repaired. For each fault of such a map, the map
+      is refined again without the faulty vertices.
+    - `fine_levels` (Table R40): the levels of a second refinement, which only promising maps receive. If
+      there are as many levels as in `levels`, no further program is compiled.
+    - `coarse_margin`: a map is promising if its score exceeds the best score by at most this number.
+    - `promising`: the largest number of promising maps, at least 1.
+    - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
+    - `patch_radius` (Table R28): the radius of the patches on which the deformation is measured.
+    - `different_distance`: two maps differ at a sample if the distance between its two matches along the
+      surface exceeds this value. Between connected components, the Euclidean distance counts.
+    - `different_areas` (Table R27): a tuple of shares of X's area, each above 0. An alternative map must
+      differ from all earlier alternative maps on a minimum share. The entries of the tuple are the minimum
+      shares for the second map, the third map, and so on. The last entry also applies to all further maps.
+    - `margin` (Table R28): the largest difference of scores between the best map and a returned map, after
+      the second refinement. Several maps are returned, because a wrong map can have the best score.
+
+    **Raises:** `InputError` if a number is out of its range, or if a tuple is empty.
+    """
+
+    samples: int = 1000
+    radii: tuple[tuple[int, ...], ...] = ((1,), (1, 2, 4), (2, 4))
+    extremities: ExtremitySettings = ExtremitySettings()
+    compared_pairings: int = 64
+    pairings: int = 12
+    distance_weight: float = 2.25
+    position_weight: float = 10.0
+    levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20, 26, 35)
+    descriptors: int = 30
+    crease_eigenvectors: int = 20
+    repaired: int = 3
+    fine_levels: tuple[int, ...] = (20, 20, 26, 26, 35, 35, 35, 35, 35, 35)
+    coarse_margin: float = 1.5
+    promising: int = 6
+    eigenvectors: int = 50
+    patch_radius: float = 0.2
+    different_distance: float = 0.2
+    different_areas: tuple[float, ...] = (0.03, 0.03, 0.2)
+    margin: float = 1.5
+
+    def __post_init__(self) -> None:
+        least = {"samples": 1, "pairings": 0, "crease_eigenvectors": 0, "repaired": 0, "promising": 1}
+        for name, number in least.items():
+            check_whole_number(name, getattr(self, name), number)
+        for name in ("levels", "fine_levels", "different_areas"):
+            values = getattr(self, name)
+            if not values or min(values) <= 0:
+                raise InputError(f"{name} is {values}: give at least one number, and only positive numbers.")
+
+
+@dataclass(frozen=True)
+class RepairSettings:
+    """The settings that determine when a map looks wrong, and how the map is repaired.
+
+    The settings are passed as `Preset(stages, repair=RepairSettings(...))` and take effect in `jaxsmw.match`.
+    A map is judged by its distortion and by its faults. The distortion is 1 for isometries and larger for
+    worse maps. There are two kinds of faults: vertices where the map reverses the orientation, and parts of X
+    that discontinuous edges separate from the rest.
+
+    Tables and entries R1, R2, … are in `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `stage`: the stage that repair repeats, as a 0-based position in the stages of the preset. The refiner
+      of this stage must have levels.
+    - `final_stages` (Table R42): the number of last stages that repair and further passes do not repeat, at
+      least 0. These stages run once, after the map has been repaired.
+    - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
+      value is suspicious and is repaired. Correct maps between poses of one body have a distortion below this
+      value.
+    - `compared` (Table R40): a positive number, usually above 1. A map of two full shapes with a distortion
+      of at least this value is compared with alternative maps, even if it is not suspicious. If `compared` is
+      at least `suspicious`, only suspicious maps are compared.
+    - `suspicious_area` (Table R28): a share of X's area, from 0 to 1. A map is also suspicious if a fault
+      covers at least this share.
+    - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
+      value. A value below `suspicious` has no effect. Between non-isometric shapes, some correct maps have
+      distortions up to this value.
+    - `negligible_area`: a share of X's area, from 0 to 1. A fault that covers at most this share is not
+      repaired. Small faults, such as at fingertips, appear and disappear by chance.
+    - `excessive_area`: a share of X's area, from 0 to 1. A fault that covers at least this share is not
+      repaired. If most of a body is mapped upside down, the rest of the map does not suffice to find the
+      correct map.
+    - `rounds` (Table R5): the largest number of rounds of repair, at least 0. Each round runs the repeated
+      stage and all later stages.
+    - `finalists`: the largest number of alternative maps that are refined at all vertices, at least 0.
+    - `uncertainty_weight` (Table R28): the weight of the feature regression's uncertainty in the score, at
+      least 0. The logarithm of the distortion has the weight 1. Upside-down maps have a higher uncertainty
+      than correct maps, and mirrored maps have a higher distortion.
+    - `deformation_weight` (Table R28): the weight of the deformation in the score, at least 0. Upside-down
+      maps and mirrored maps have larger deformations than right maps.
+    - `non_isometric` (Table R29): a number of at least 0. If the final map of two full shapes has an
+      area-based shape difference of at least this value, the map is refined further, even if it looks right.
+      The difference is smaller between poses of one body.
+    - `passes` (Table R29): the number of usual passes, at least 0. In a usual pass, the repeated stage and
+      all later stages run again. Maps between non-isometric shapes need further passes, because such maps
+      converge more slowly than maps between poses of one body.
+    - `pass_tolerance` (Table R40): a number of at least 0. If all passes together increase the score without
+      the deformation by more than this value, the map before the passes is kept.
+    - `rival_margin` (entries R36 and R48): a number of at least 0. An outcome of repair whose score is worse
+      by at most this value is a rival of the map. If the map looks right, only outcomes that look right are
+      rivals. The passes also run from each rival. The rival replaces the map if its score after the passes is
+      better. If the map still looks wrong after repair, the score must be better by more than this value.
+    - `without_creases_from` (entry R47): a number of at least 0. If the area-based shape difference is at
+      least this value, the passes do not use crease eigenvectors.
+    - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
+      value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
+      effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
+      run (entry R24).
+    - `coarse_levels` (Table R32): the levels of the last repeated stage in each coarse pass, as one tuple per
+      pass. Tuples with the same length and the same maximum share a compiled program. If the refiner of this
+      stage has no levels, each coarse pass is the same as a usual pass.
+    - `aligned_preference` (entry R24): a number of at least 0. With `init="auto"`, asymmetric shapes are
+      matched from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean
+      expected error is below this multiple of the other map's mean expected error. Both expected errors are
+      computed without `ExpectedErrorSettings.area_weight`, and before further passes.
+    - `cut_shortcuts` (Table R41): whether a mesh is cut before it is matched, where its surface is fused with
+      another part of itself, for example a hand with a hip. See `jaxsmw.geometry.cut_shortcuts`.
+    - `trims` (Table R46): the number of times that the larger shape of a partial pair is trimmed to the
+      region of the smaller shape and matched again by the last stage, at least 0.
+    - `trimmed_from` (Table R46): a positive number. A pair is trimmed if the larger area is at least this
+      multiple of the smaller area. If the areas of two partial shapes are more similar, each shape often
+      lacks a part of the other shape.
+    - `trimmed_area` (Table R46): a positive number. The larger shape is trimmed to this multiple of the
+      smaller area. The faces at the boundary of the kept region add to this area.
+    - `trimmed_levels` (Table R46): the levels of the last stage on a trimmed pair. If the refiner of this
+      stage has no levels, the stage is not changed.
+    - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
+    - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
+
+    **Raises:** `InputError` if a number is out of its range. `Preset` raises `InputError` if the stage at
+    position `stage` does not exist or has a refiner without levels.
+    """
+
+    stage: int = 1
+    final_stages: int = 0
+    suspicious: float = 1.12
+    compared: float = 1.05
+    suspicious_area: float = 0.02
+    doubtful: float = 1.15
+    negligible_area: float = 0.002
+    excessive_area: float = 0.5
+    rounds: int = 4
+    finalists: int = 4
+    uncertainty_weight: float = 30.0
+    deformation_weight: float = 5.0
+    non_isometric: float = 0.14
+    passes: int = 2
+    pass_tolerance: float = 0.35
+    rival_margin: float = 0.35
+    without_creases_from: float = 0.18
+    coarse_from: float = 0.3
+    coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
+    aligned_preference: float = 0.9
+    cut_shortcuts: bool = True
+    trims: int = 2
+    trimmed_from: float = 1.25
+    trimmed_area: float = 1.05
+    trimmed_levels: tuple[int, ...] = (10, 30, 80, 200)
+    alternatives: AlternativeSettings = AlternativeSettings()
+    scores: ScoreSettings = ScoreSettings()
+
+    def __post_init__(self) -> None:
+        for name in ("stage", "final_stages", "rounds", "finalists", "passes", "trims"):
+            check_whole_number(name, getattr(self, name), 0)
+        for name in ("suspicious_area", "negligible_area", "excessive_area"):
+            check_number(name, getattr(self, name), most=1.0)
+        for name in (
+            "uncertainty_weight",
+            "deformation_weight",
+            "non_isometric",
+            "pass_tolerance",
+            "rival_margin",
+            "without_creases_from",
+            "coarse_from",
+            "aligned_preference",
+        ):
+            check_number(name, getattr(self, name))
+        for name in ("suspicious", "compared", "doubtful", "trimmed_from", "trimmed_area"):
+            check_number(name, getattr(self, name), positive=True)
+        if not isinstance(self.cut_shortcuts, bool):
+            raise InputError(f"cut_shortcuts is {self.cut_shortcuts!r}: give True or False.")
+
+
+WITHOUT_REPAIR = RepairSettings(suspicious=1.25, suspicious_area=1.0, doubtful=1.25)
+"""The settings by which `match` judges the map of a preset that has no repair. (Entry R25)"""
+
+
+@dataclass(frozen=True)
+class ChiralitySettings:
+    """The settings of `jaxsmw.matching.search.chirality`, which decides whether X or its mirror image matches
+    Y.
+
+    The evidence is the logarithm of a ratio of distance errors; see `jaxsmw.matching.search.chirality.Hands`.
+    Entries R20 and R21 are in `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `samples`: the approximate number of evenly spread samples of each shape.
+    - `fewest_samples`: if a shape has fewer samples, X itself is matched without a comparison. Fewer samples
+      would not suffice for a regression with 50 features.
+    - `radii` (entry R20): the sets of radii of SHOT, in units of 0.06 times the square root of the area. For
+      each set, coarse maps are computed both from X and from its mirror image. With the usual radius alone,
+      descriptors hardly distinguish a tooth from its mirror image.
+    - `descriptors`, `levels`: the number of descriptors and the levels of the feature regression
+      that refines coarse maps.
+    - `asymmetry_radii` (entry R23): the radii of SHOT when the asymmetry is computed, in the unit of
+      `radii`.
+    - `asymmetric_from` (entry R23): shapes are asymmetric if the mean asymmetry of X and Y is at least this
+      value. If the mean asymmetry is smaller, X itself is matched.
+    - `asymmetry_doubt` (entry R23): evidence is computed if the mean asymmetry is at least
+      `asymmetric_from - asymmetry_doubt`. For shapes that are not asymmetric, the decision is doubtful if the
+      evidence supports the mirror image.
+    - `mirrored_from` (entry R21): for asymmetric shapes, the mirror image of X is matched if the evidence is
+      at least this value.
+    - `doubt` (entry R21): for asymmetric shapes, the decision is doubtful if the difference between the
+      evidence and `mirrored_from` is below this value.
+    """
+
+    samples: int = 1000
+    fewest_samples: int = 100
+    radii: tuple[tuple[int, ...], ...] = ((2, 4, 8), (4, 8))
+    descriptors: int = 30
+    levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20)
+    asymmetry_radii: tuple[int, ...] = (3, 6)
+    asymmetric_from: float = 0.61
+    asymmetry_doubt: float = 0.04
+    mirrored_from: float = 0.05
+    doubt: float = 0.05
