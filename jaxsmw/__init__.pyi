@@ -22,7 +22,8 @@ from .io.map_files import read_pointwise_map, write_pointwise_map
 from .io.mesh_files import read_mesh, write_mesh
 from .matching.correspondence import Correspondence
 from .matching.match import match
-from .matching.pair import Pair, paired_spectra
+from .matching.pair import Pair
+from .matching.preparation import paired_spectra
 from .matching.presets import PRESETS, Preset
 from .matching.settings import RepairSettings
 from .matching.stages import Stage

@@ -16,7 +16,7 @@ from jaxsmw.core.solutions import (
     Solution,
 )
 from jaxsmw.core.triangles import nearest_point_on_triangles
-from jaxsmw.matching.descriptors import describe
+from jaxsmw.matching.preparation import describe
 
 __all__ = [
     "DescriptorPair",

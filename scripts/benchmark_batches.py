@@ -6,7 +6,7 @@
   `jax.lax.map`, `jax.vmap` with several batch sizes, and `jaxsmw.refine_pairs`. The time of `refine_pairs`
   includes the transfer of initial maps and results.
 - `accurate`: all stages of the preset `"accurate"` in float32, without repair. The candidates are several
-  batch sizes of `refine_batch`, which includes the transfer of initial maps and results. The last row is
+  batch sizes of `run`, which includes the transfer of initial maps and results. The last row is
   `jaxsmw.match_pairs`, which also computes initial maps and scores, and repairs maps, on the host.
 
 The candidates of a table take turns in one process. The lower bound is the time of all matrix products of a
@@ -39,15 +39,14 @@ from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Int
 
-from jaxsmw.collection.pairs import match_pairs
-from jaxsmw.collection.shapes import prepare_pair, prepare_shapes
+from jaxsmw.collection.pairs import match_pairs, prepare_task
+from jaxsmw.collection.shapes import prepare_described_shapes
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.mesh_files import read_mesh
-from jaxsmw.matching.batches import refine_batch
-from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.executor import Start, padded_map, run
 from jaxsmw.matching.presets import PRESETS, PresetName
 from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
 
@@ -230,11 +229,11 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
     """Yield the pairs per second of the preset `"accurate"`, and the agreement with maps of the CPU."""
     shapes = chosen_shapes(options)
     preset, count = PRESETS["accurate"], len(shapes.pairs)
-    prepared = prepared_pairs(shapes, "accurate")
+    starts = prepared_starts(shapes, "accurate")
     preset = preset.fitted(min(len(mesh.vertices) for mesh in shapes.meshes))
 
     def in_batches_of(size: int) -> Callable[[], object]:
-        return lambda: [one.pointwise_map for one in refine_batch(prepared, preset.stages, batch_size=size)]
+        return lambda: [one.pointwise_map for one in run(preset.stages, starts, batch_size=size)]
 
     candidates = {f"batches of {size}": in_batches_of(size) for size in (1, *options.batch_sizes)}
     seconds = medians(candidates, options.repeats)
@@ -250,12 +249,10 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
     )
     products: Counter[MatrixProduct] = Counter()
     for stage in preset.stages:
-        spectra = prepared[0].view(stage)
-        start = prepared[0].padded_map(prepared[0].initial_map)
-        samples = None
-        if stage.number_of_samples is not None and prepared[0].samples is not None:
-            samples = tuple(rows[: stage.number_of_samples] for rows in prepared[0].samples)
-        products += matrix_products(partial(refine, samples=samples, **stage.settings), *spectra, start)
+        seen = starts[0].spectra.padded.seen_by(stage)
+        start = padded_map(starts[0].pointwise_map)
+        traced = partial(refine, samples=seen.samples, **stage.settings)
+        products += matrix_products(traced, *seen.both, start)
     floor = time_of_products(products, count, options.repeats)
     yield (
         "Preset accurate",
@@ -278,16 +275,9 @@ def agreement(options: argparse.Namespace) -> Iterator[Part]:
         rows[0] += ["error x10^-3", "error of the CPU"]
     names: tuple[PresetName, ...] = ("paper", "accurate")
     for name in names:
-        prepared = prepared_pairs(shapes, name)
+        starts = prepared_starts(shapes, name)
         maps = [
-            [
-                outcome.unpadded_map(one.pair)
-                for one, outcome in zip(
-                    prepared,
-                    refine_batch(prepared, PRESETS[name].stages, devices=[device]),
-                    strict=True,
-                )
-            ]
+            [outcome.pointwise_map for outcome in run(PRESETS[name].stages, starts, devices=[device])]
             for device in (jax.devices()[0], jax.devices("cpu")[0])
         ]
         equal = [float(np.mean(ours == its)) for ours, its in zip(*maps, strict=True)]
@@ -312,10 +302,10 @@ def errors_of(data: Path, shapes: Shapes, maps: Sequence[np.ndarray]) -> list[fl
     return [truth.error(one, truth.meshes[1]) for truth, one in zip(truths, maps, strict=True)]
 
 
-def prepared_pairs(shapes: Shapes, preset: PresetName) -> list[PreparedPair]:
-    """Return the prepared pairs of the shapes, with initial maps from SHOT."""
-    found, _ = prepare_shapes(shapes.meshes, PRESETS[preset])
-    return [prepare_pair(found[i], found[j]) for i, j in shapes.pairs]
+def prepared_starts(shapes: Shapes, preset: PresetName) -> list[Start]:
+    """Return the starts of all pairs, with initial maps from SHOT."""
+    found, _ = prepare_described_shapes(shapes.meshes, PRESETS[preset])
+    return [prepare_task(found[i], found[j])[1][0] for i, j in shapes.pairs]
 
 
 PARTS = {"paper": paper, "accurate": accurate, "agreement": agreement}

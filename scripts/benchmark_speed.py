@@ -79,7 +79,7 @@ from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.preparation import paired_spectra
 from jaxsmw.matching.presets import PresetName
 from jaxsmw.matching.stages import Stage
 from jaxsmw.matching.starts import initial_map
@@ -722,7 +722,8 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
         for file, mesh in zip(files, truth.meshes, strict=True):
             write_mesh(Path(file), mesh)
         # The initial map is computed here, so the times of other libraries do not include its computation.
-        first = prepare(Pair(*map(read_mesh, files)), number_of_eigenvectors=EIGENVECTORS).initial_map
+        pair = Pair(*map(read_mesh, files))
+        first = initial_map(pair, *paired_spectra(pair, EIGENVECTORS))
         runs: dict[str, Callable[[list[str]], tuple[np.ndarray, float]]] = {
             "ours": ours_from_files,
             "ours, search in patches": partial(ours_from_files, search="patches"),

@@ -69,6 +69,8 @@ from jaxsmw import (
     Spectrum,
     WaveletPreservation,
     compute_spectrum,
+    initial_map,
+    paired_spectra,
     read_mesh,
 )
 from jaxsmw.benchmark.datasets import DataPair
@@ -79,7 +81,6 @@ from jaxsmw.functional_maps import nearest_neighbor
 from jaxsmw.geometry import farthest_point_samples, shot_descriptors
 from jaxsmw.geometry.shot import SHOT_DIMENSION
 from jaxsmw.learning import WaveletPreservationLayer
-from jaxsmw.matching.preparation import prepare
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, LAYER_EIGENVECTORS, LEARNING_RATE, LARGEST_GRADIENT = 1000, 60, 2e-3, 1.0
@@ -358,8 +359,9 @@ def descriptor_errors(
     x, y = described(mesh_x), described(mesh_y)
     m = len(mesh_x.vertices)
     spectra = x.with_descriptors(None), y.with_descriptors(None)
-    prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
-    initial_maps = {REFERENCE: prepared.initial_map}
+    pair_of_meshes = Pair(mesh_x, mesh_y)
+    first = initial_map(pair_of_meshes, *paired_spectra(pair_of_meshes, EIGENVECTORS))
+    initial_maps = {REFERENCE: first}
     for name, network in networks.items():
         initial_maps[name] = np.asarray(nearest_descriptors(network, x, y))[:m].astype(np.int64)
     maps = {f"{name}{START}": found for name, found in initial_maps.items()}

@@ -71,7 +71,6 @@ from jaxsmw.core.banks import FilterBank, Power, Warped
 from jaxsmw.core.soft_maps import Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.geometry import farthest_point_samples
 from jaxsmw.learning import refine_softly
-from jaxsmw.matching.preparation import prepare
 from jaxsmw.runtime.files import atomic_write
 
 SAMPLES, KNOTS, FILTERS = 1000, 32, 6
@@ -183,8 +182,9 @@ def load(path: Path) -> FilterBank:
 def refinement_errors(pair: DataPair, banks: Mapping[str, FilterBank], seed: int) -> dict[str, float]:
     """Return a dictionary from the name of each bank to the mean geodesic error x 10³ after refinement."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
-    prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=EIGENVECTORS)
-    spectra, initial = (prepared.spectrum_x, prepared.spectrum_y), prepared.initial_map
+    both = Pair(mesh_x, mesh_y)
+    spectra = paired_spectra(both, EIGENVECTORS)
+    initial = initial_map(both, *spectra)
     maps = {name: refined(spectra, initial, WaveletPreservation(bank)) for name, bank in banks.items()}
     return errors(pair, mesh_x, mesh_y, maps, seed)
 

@@ -83,8 +83,8 @@ def test_asymmetric_shapes_are_matched_from_both_initial_maps(monkeypatch):
     each = {init: match(LUMP, target, init=init, mirror="no") for init in ("shot", "aligned")}
     from_shot = _expected(each["shot"]) < RepairSettings().aligned_preference * _expected(each["aligned"])
     best = each["shot" if from_shot else "aligned"]
-    estimates = _count_calls(monkeypatch, "jaxsmw.matching.correspondence.expected_error")
-    descriptors = _count_calls(monkeypatch, "jaxsmw.matching.descriptors.shot_descriptors")
+    estimates = _count_calls(monkeypatch, "jaxsmw.matching.judge.expected_error")
+    descriptors = _count_calls(monkeypatch, "jaxsmw.matching.shapes.shot_descriptors")
     for mirror in ("auto", "no"):
         estimates.clear()
         descriptors.clear()

@@ -17,15 +17,18 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
-from jaxsmw.matching.judge import Judge, Outcome
+from jaxsmw.matching.executor import Outcome
+from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
-from jaxsmw.matching.presets import PRESETS
+from jaxsmw.matching.presets import PRESETS, Preset
 from jaxsmw.matching.search.alternatives import Alternatives
 from jaxsmw.matching.search.proxies import Proxy, deformation, distance_error, map_difference
-from jaxsmw.matching.search.rounds import refine_in_stages
+from jaxsmw.matching.search.repair import refine_and_repair
 from jaxsmw.matching.settings import AlternativeSettings
+from jaxsmw.matching.shapes import Sizes
 from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.starts import make_start
 
 REPAIR = PRESETS["accurate"].repair
 # Fewer samples and levels, which compile faster.
@@ -40,6 +43,9 @@ def pair():
     return found.source, found.target, found.truth.nearest_corners(found.target)
 
 
+TWO_STAGES = Preset((Stage(FeatureRegression((20,))),), (Stage(FeatureRegression((20, 40))),))
+
+
 def reduced(mesh, number=300):
     samples = SurfaceSamples.along_surface(mesh, farthest_point_samples(mesh, number))
     return Proxy(mesh, compute_spectrum(mesh, 4), samples, mesh.area**0.5)
@@ -49,13 +55,8 @@ def moved(mesh, rotation, shift=2.0):
     return Mesh(mesh.vertices @ rotation.as_matrix().T + shift, mesh.faces, mesh.name)
 
 
-def prepared(mesh_x, mesh_y, **options):
-    return prepare(
-        Pair.make(mesh_x, mesh_y, **options),
-        number_of_eigenvectors=60,
-        number_of_descriptors=30,
-        number_of_samples=500,
-    )
+def prepared(mesh_x, mesh_y, *, creases=0, **options):
+    return prepare(Pair.make(mesh_x, mesh_y, **options), Sizes(60, creases, 500)).describe(30)
 
 
 def mean_error(mesh, found, truth):
@@ -179,7 +180,7 @@ def test_outcomes_with_nearly_the_same_map_are_no_rivals(pair):
     slightly_different[:10] = upside_down[:10]
     start = prepared(mesh_x, mesh_y)
     right, similar, wrong, again = (
-        Outcome([], start.padded_map(one)) for one in (truth, slightly_different, upside_down, upside_down)
+        Scored(Outcome(one), 1.0) for one in (truth, slightly_different, upside_down, upside_down)
     )
     found = Alternatives(start, REPAIR).different(right, [similar, wrong, again])
     assert len(found) == 1 and found[0] is wrong
@@ -208,29 +209,26 @@ def test_maps_that_look_right_are_compared(
         yield truth
 
     monkeypatch.setattr(Alternatives, "best", best)
-    monkeypatch.setattr(Judge, "score", lambda self, outcome: -float(len(outcome.refinements) == 1))
-    settings = replace(
-        REPAIR, stage=1, suspicious=100.0, suspicious_area=1.0, compared=compared, finalists=finalists
-    )
-    stages = [Stage(FeatureRegression((20,))), Stage(FeatureRegression((20, 40)))]
-    start = prepared(mesh_x, mesh_y, partial=is_partial)
-    found = refine_in_stages(replace(start, init=init), stages, settings)
+    monkeypatch.setattr(Judge, "score", lambda self, scored: -float(len(scored.outcome.refinements) == 1))
+    settings = replace(REPAIR, suspicious=100.0, suspicious_area=1.0, compared=compared, finalists=finalists)
+    pair = prepared(mesh_x, mesh_y, partial=is_partial)
+    start = make_start(pair, "shot")._replace(origin=init)
+    found = refine_and_repair(pair, start, replace(TWO_STAGES, repair=settings))
     assert asked == [True] * compares and not found.suspicious
-    assert len(found.refinements) == (1 if compares else 2)
+    assert len(found.outcome.refinements) == (1 if compares else 2)
 
 
 def test_creased_alternatives_are_right_and_use_other_features(pair, monkeypatch):
     mesh_x, mesh_y, truth = pair
-    creased = prepared(mesh_x, mesh_y).with_crease_eigenvectors(12)
+    creased = prepared(mesh_x, mesh_y, creases=12)
     found = Alternatives(creased, REPAIR)
     numbers = []
     refined = Alternatives._refined
 
-    def recorded(self, step, *arguments):
-        numbers.append(
-            [0 if s.crease_eigenvectors is None else s.crease_eigenvectors.shape[1] for s in step[1:]]
-        )
-        return refined(self, step, *arguments)
+    def recorded(self, stage, *arguments):
+        seen = self._spectra.seen_by(stage).both
+        numbers.append([0 if s.crease_eigenvectors is None else s.crease_eigenvectors.shape[1] for s in seen])
+        return refined(self, stage, *arguments)
 
     monkeypatch.setattr(Alternatives, "_refined", recorded)
     assert mean_error(mesh_y, next(found.best(np.zeros_like(truth), creased=True)), truth) < 0.08
@@ -263,17 +261,15 @@ def test_a_second_attempt_uses_crease_eigenvectors(
         yield from [truth] * creased
 
     monkeypatch.setattr(Alternatives, "best", best)
-    monkeypatch.setattr(Judge, "score", lambda self, outcome: score * (len(outcome.refinements) == 1))
+    monkeypatch.setattr(Judge, "score", lambda self, scored: score * (len(scored.outcome.refinements) == 1))
     settings = replace(
-        REPAIR, stage=1, suspicious=0.1, doubtful=0.1, non_isometric=non_isometric, finalists=1, rounds=0
+        REPAIR, suspicious=0.1, doubtful=0.1, non_isometric=non_isometric, finalists=1, rounds=0
     )
-    stages = [Stage(FeatureRegression((20,))), Stage(FeatureRegression((20, 40)))]
-    start = prepared(mesh_x, mesh_y, partial=is_partial)
-    start = start.with_crease_eigenvectors(creases) if creases else start
-    found = refine_in_stages(start, stages, settings)
+    pair = prepared(mesh_x, mesh_y, partial=is_partial, creases=creases)
+    found = refine_and_repair(pair, make_start(pair, "shot"), replace(TWO_STAGES, repair=settings))
     assert [creased for _, creased in asked] == [False] + [True] * tried
     assert all(known == asked[0][0] for known, _ in asked)  # both attempts also start from the usual map
-    assert len(found.refinements) == (1 if replaced else 2)
+    assert len(found.outcome.refinements) == (1 if replaced else 2)
     assert found.suspicious
 
 
@@ -352,22 +348,21 @@ def test_animals_are_matched_in_any_position(shared, names, looks_right):
     meshes = [read_mesh(file) for file in pair.meshes]
     truth = pair.ground_truth(*meshes)
     preset = PRESETS["accurate"]
-    wrong = refine_in_stages(
-        prepare(
-            Pair.make(*meshes),
-            number_of_eigenvectors=preset.number_of_eigenvectors,
-            number_of_descriptors=preset.number_of_descriptors,
-            number_of_samples=preset.number_of_samples,
+    sizes = preset.sizes._replace(number_of_crease_eigenvectors=0)
+    unrepaired = prepare(Pair.make(*meshes), sizes).describe(preset.number_of_descriptors)
+    wrong = refine_and_repair(
+        unrepaired,
+        make_start(unrepaired, "shot"),
+        Preset(
+            preset.first, preset.repeated + preset.final, repair=replace(preset.repair, finalists=0, rounds=0)
         ),
-        preset.stages,
-        replace(preset.repair, finalists=0, rounds=0),
     )
     assert wrong.suspicious != looks_right
 
     def mean_error(found):
         return geodesic_error(meshes[1], found, truth, number_of_samples=300).mean
 
-    assert mean_error(np.asarray(wrong.pointwise_map)[: len(meshes[0].vertices)].astype(np.int64)) > 0.1
+    assert mean_error(wrong.pointwise_map) > 0.1
     turned = [moved(mesh, Rotation.random(random_state=seed)) for seed, mesh in enumerate(meshes)]
     found, again = (match(*shapes).pointwise_map for shapes in (meshes, turned))
     assert max(mean_error(found), mean_error(again)) < 0.035

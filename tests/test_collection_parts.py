@@ -24,7 +24,8 @@ from jaxsmw.collection import (
     synchronize,
 )
 from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, find_outliers, triangles
-from jaxsmw.collection.shapes import prepare_pair, prepare_shape, prepare_shapes, preset_key
+from jaxsmw.collection.pairs import prepare_task
+from jaxsmw.collection.shapes import prepare_described_shapes, prepare_shape, preset_key
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
 from jaxsmw.core.banks import LowPass
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -32,7 +33,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.surface_distance import nearest_surface_points
-from jaxsmw.matching.batches import refine_batch
+from jaxsmw.matching.executor import SpectralPair, Start, run
 from jaxsmw.matching.presets import PRESETS, Preset
 from jaxsmw.matching.search.chirality import Decision
 from jaxsmw.matching.stages import Stage
@@ -53,8 +54,8 @@ def test_a_coarse_mesh_is_named_once_with_advice_that_fits():
     bodies = [replace(creature("biped", vertices=500, seed=seed), name=f"body {seed}") for seed in range(2)]
     with warnings.catch_warnings(record=True) as issued:
         warnings.simplefilter("always")
-        shapes, _ = prepare_shapes(bodies, PRESETS["fast"])
-        prepare_pair(*shapes)
+        shapes, _ = prepare_described_shapes(bodies, PRESETS["fast"])
+        prepare_task(*shapes)
     texts = [str(warning.message) for warning in issued]
     assert [text.split(":")[0] for text in texts] == ["body 0", "body 1"]
     assert all(text.endswith("use a finer mesh.") for text in texts)
@@ -365,7 +366,8 @@ def test_batches_are_not_refined_a_second_time(three, monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("a stage ran on a single pair")
 
-    monkeypatch.setattr(Stage, "run", refuse)
+    monkeypatch.setattr("jaxsmw.matching.executor._run_one", refuse)
+    monkeypatch.setattr("jaxsmw.matching.search.repair.run", refuse)
     found = match_pairs(three, PAIRS, preset="paper", batch_size=3)
     assert len(dict(found)) == len(PAIRS)
 
@@ -373,9 +375,10 @@ def test_batches_are_not_refined_a_second_time(three, monkeypatch):
 def test_the_first_failure_of_a_batch_is_reported(three, monkeypatch):
     """Later stages start from the map of the failure, and must not hide its reason."""
     shape = prepare_shape(three[0], PRESETS["paper"])
-    prepared = prepare_pair(shape, shape)
-    broken = replace(prepared.spectrum_y, eigenvectors=prepared.spectrum_y.eigenvectors.at[0, 0].set(jnp.nan))
-    (outcome,) = refine_batch([replace(prepared, spectrum_y=broken)], [Stage(), Stage()])
+    eigenvectors = shape.spectrum.eigenvectors.at[0, 0].set(jnp.nan)
+    broken = SpectralPair(shape.spectrum, replace(shape.spectrum, eigenvectors=eigenvectors))
+    identity = np.arange(len(three[0].vertices))
+    (outcome,) = run([Stage(), Stage()], [Start(broken, identity)], batch_size=1)
     assert [found.result == RESULTS.nonfinite_spectrum for found in outcome.refinements] == [True]
 
 

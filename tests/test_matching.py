@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.functional_map import encode, multiscale_kernel
 from jaxsmw.core.refinement import refine
-from jaxsmw.core.refiner import State, reverse_map
+from jaxsmw.core.refiner import State
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -26,17 +26,17 @@ from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import descriptors
+from jaxsmw.matching import preparation, shapes
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.descriptors import describe
+from jaxsmw.matching.executor import reverse_map
 from jaxsmw.matching.match import match
-from jaxsmw.matching.pair import Pair, paired_spectra
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import describe, paired_spectra
 from jaxsmw.matching.presets import PRESETS, Preset, choose_preset
-from jaxsmw.matching.search.rounds import refine_in_stages
+from jaxsmw.matching.search.repair import refine_and_repair
 from jaxsmw.matching.stages import Stage
 from jaxsmw.matching.starts import initial_map
 from jaxsmw.runtime import threads as threads_module
-from jaxsmw.runtime.compilation import compiled
 
 STAGE = Stage(WaveletPreservation(bank=Meyer(4)), number_of_eigenvectors=30)
 OPTIONS = {"preset": STAGE, "mirror": "no"}
@@ -80,7 +80,7 @@ def test_invalid_arguments_are_refused_before_eigenbases_are_computed(pair, opti
     def refuse(*_, **__):
         raise AssertionError("eigenpairs were computed")
 
-    monkeypatch.setattr("jaxsmw.matching.pair.eigenpairs", refuse)
+    monkeypatch.setattr("jaxsmw.matching.shapes.eigenpairs", refuse)
     mesh_x, mesh_y, _ = pair
     if options == {"partial": True}:
         mesh_y = make_mesh(1000 * mesh_y.vertices, mesh_y.faces)
@@ -108,8 +108,8 @@ def test_initial_maps_of_large_meshes_use_samples(pair, init, monkeypatch):
     if not isinstance(init, str):
         init = np.array([[i, truth[i]] for i, _ in init])
     spectra = paired_spectra(Pair(mesh_x, mesh_y), 30)
-    monkeypatch.setattr(descriptors, "_COMPARED", 1200)
-    monkeypatch.setattr(descriptors, "_COMPARED_FROM", 1000)
+    monkeypatch.setattr(shapes, "_COMPARED", 1200)
+    monkeypatch.setattr(shapes, "_COMPARED_FROM", 1000)
     start = initial_map(Pair(mesh_x, mesh_y), *spectra, init=init)
     compared = np.unique(start)
     assert 100 < len(compared) < 1500
@@ -163,7 +163,7 @@ def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samp
         ("fast", 1),
         ("accurate", 4),
         # The last two stages for large meshes differ only in their levels, and share a program.
-        (PRESETS["accurate"].large_stages, 3),
+        (PRESETS["accurate"].large.stages, 3),
         (replace(STAGE, stop_when_unchanged=True), 1),
     ],
     ids=["fast", "accurate", "large", "stopped"],
@@ -197,8 +197,7 @@ def test_the_reverse_map_of_registration_compares_all_columns():
     queries, database = (np.asarray(points) for points in found._embeddings())
     assert database.shape[1] > found.functional_map.shape[0]
     with found._precision():
-        padded = compiled(reverse_map)(*found._last_stage())
-        reverse = np.asarray(padded)[: len(found.mesh_y.vertices)]
+        reverse = reverse_map(found._refiner, found._spectra, found.refinement.state)
     _, nearest = KDTree(queries[found.mesh_x.referenced_vertices]).query(database)
     expected = np.flatnonzero(found.mesh_x.referenced_vertices)[nearest]
     agree = reverse == expected
@@ -221,8 +220,7 @@ def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, search):
     points = [np.asarray(p) for p in found._embeddings()]
     # Registration also compares columns that are not eigenvectors.
     assert (points[1].shape[1] > found.functional_map.shape[0]) == (refiner is Registration)
-    padded = compiled(reverse_map)(*found._last_stage())
-    reverse = np.asarray(padded)[: len(found.mesh_y.vertices)]
+    reverse = reverse_map(found._refiner, found._spectra, found.refinement.state)
     np.testing.assert_array_equal(found.pointwise_map, KDTree(points[1]).query(points[0])[1])
     np.testing.assert_array_equal(reverse, KDTree(points[0]).query(points[1])[1])
 
@@ -352,10 +350,10 @@ def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
 
     def watched(*arguments, **options):
         meanwhile.append(threads())
-        return refine_in_stages(*arguments, **options)
+        return refine_and_repair(*arguments, **options)
 
     meanwhile: list[list[int]] = []
-    monkeypatch.setattr("jaxsmw.matching.match.refine_in_stages", watched)
+    monkeypatch.setattr("jaxsmw.matching.match.refine_and_repair", watched)
     threads_module._libraries.cache_clear()  # other tests load libraries that bring their own BLAS
     with threadpool_limits(2, user_api="blas"):
         before = threads()
@@ -370,7 +368,7 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
     monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", False)
     with caplog.at_level(logging.INFO, "jaxsmw"):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=100))
-    steps = ["eigenbases", "mirror test", "initial map", "samples", "refinement"]
+    steps = ["eigenbases", "mirror test", "initial map", "refinement"]
     assert caplog.messages == [f"{step} ..." for step in steps]
 
 
@@ -438,7 +436,7 @@ def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):
     mesh_x, mesh_y, truth = pair
     spectra = paired_spectra(Pair(mesh_x, mesh_y), 30)
     described = describe(Pair(mesh_x, mesh_y), *spectra, 60)
-    monkeypatch.setattr(descriptors, "_FINE", 10**6)
+    monkeypatch.setattr(preparation, "FINE_FROM", 10**6)
     coarse = describe(Pair(mesh_x, mesh_y), *spectra, 60)
     assert described[0].descriptors.shape == coarse[0].descriptors.shape == (len(truth), 60)
     for x, y in (described, coarse):  # the mean square over both shapes is 1
@@ -484,9 +482,9 @@ def test_presets_match_a_copy_accurately(pair, usual):
     assert accurate.iterations == 3 + 4 + 4 + 4 and accurate.functional_map.shape == (200, 200)
     assert len(accurate.preset.stages) == 4 != len(usual.preset.stages) and accurate.distortion < 1.05
     assert paper.functional_map.shape == (100, 100) != usual.functional_map.shape
-    steps = ["eigenbases", "mirror test", "initial map", "descriptors", "samples"]
+    steps = ["eigenbases", "mirror test", "initial map", "descriptors", "refinement"]
     # The body differs from its mirror image, so the better of two maps was chosen.
-    assert list(accurate.seconds) == [*steps, "crease eigenvectors", "refinement", "expected error"]
+    assert list(accurate.seconds) == [*steps, "expected error", "final stages"]
     assert accurate.expected_error().mean() < 0.002
     points = accurate.surface_points()
     distances = np.linalg.norm(points.positions(mesh_y) - mesh_y.vertices[truth], axis=1)
@@ -495,11 +493,11 @@ def test_presets_match_a_copy_accurately(pair, usual):
 
 def test_large_meshes_have_stages_of_their_own():
     accurate, large = PRESETS["accurate"], PRESETS["accurate"].fitted(15_000).stages
-    assert accurate.fitted(14_999).stages == accurate.stages != large == accurate.large_stages
+    assert accurate.fitted(14_999).stages == accurate.stages != large == accurate.large.stages
     assert large[1].ends_on_samples and large[2].starts_on_samples
     assert large[0].number_of_samples == 1000 and accurate.stages[0].number_of_samples is None
     assert accurate.without_descriptors().fitted(15_000).number_of_descriptors == 0
-    small = replace(accurate, stages=large).fitted(900).stages
+    small = accurate.large.fitted(900).stages
     assert not any(
         stage.starts_on_samples or stage.ends_on_samples or stage.number_of_samples for stage in small
     )
@@ -508,8 +506,8 @@ def test_large_meshes_have_stages_of_their_own():
 @pytest.mark.slow
 def test_the_stages_for_large_meshes_are_as_accurate(pair, usual):
     mesh_x, mesh_y, truth = pair
-    preset = Preset(PRESETS["accurate"].large_stages)
-    found = match(mesh_x, mesh_y, preset=preset)
+    large = Preset(PRESETS["accurate"].large.stages)
+    found = match(mesh_x, mesh_y, preset=large)
     assert mean_error(mesh_y, found.pointwise_map, truth) < 0.002
     assert found.iterations == 3 + 4 + 4 + 4 and (found.pointwise_map >= 0).all()
 
@@ -659,7 +657,7 @@ def test_surface_points_and_expected_errors_are_computed_once(pair, monkeypatch)
     points, expected = found.surface_points(), found.expected_error()
     copies = points.weights.copy(), expected.copy()
     points.faces[:], points.weights[:], expected[:] = -1, -1, -1  # a caller may change the results
-    for name in ("expected_error", "nearest_point_on_candidates"):
+    for name in ("estimate_error", "nearest_points"):
         monkeypatch.delattr(f"jaxsmw.matching.correspondence.{name}")
     again = found.surface_points()
     np.testing.assert_array_equal(again.weights, copies[0])

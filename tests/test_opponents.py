@@ -19,8 +19,10 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.matching.executor import Start
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.preparation import pair_up
+from jaxsmw.matching.shapes import PreparedShape
 
 pytestmark = pytest.mark.study
 
@@ -91,8 +93,12 @@ def test_all_methods_repair_a_noisy_initial_map():
     initial_map = np.where(generator.random(n) < 0.1, generator.integers(0, n, n), order)
     samples = generator.choice(n, 550, replace=False)
     on_both = jnp.asarray(np.argsort(order)[samples]), jnp.asarray(samples)
-    prepared = PreparedPair(Pair(mesh_x, mesh_y), x, y, initial_map, initial_map, on_both)
-    pair = MethodInput.of(prepared, ("X", "Y"))
+    shapes = (
+        PreparedShape(mesh, spectrum, samples=s)
+        for mesh, spectrum, s in zip((mesh_x, mesh_y), (x, y), on_both, strict=True)
+    )
+    prepared = pair_up(Pair(mesh_x, mesh_y), *shapes)
+    pair = MethodInput.of(prepared, Start(prepared.spectra, initial_map), ("X", "Y"))
     for name, method in METHODS.items():
         if method.partial_only or isinstance(method, SmoothShells):
             continue  # tested in files of their own

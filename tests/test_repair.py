@@ -14,21 +14,23 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
+from jaxsmw.matching import executor
+from jaxsmw.matching.executor import Outcome, Start, run
 from jaxsmw.matching.judge import Judge
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.presets import PRESETS, Preset
 from jaxsmw.matching.scores import detours, distortion, overlap
-from jaxsmw.matching.search.rounds import refine_further, refine_in_stages
+from jaxsmw.matching.search.repair import refine_and_repair, refine_further
 from jaxsmw.matching.settings import RepairSettings
 from jaxsmw.matching.stages import Stage
 from jaxsmw.report.summary import summarize
-from jaxsmw.runtime import padding
 
 LEVELS = (20, 20, 40, 40)
 STAGE = Stage(FeatureRegression(LEVELS))
-REPAIR = RepairSettings(stage=0)
+REPAIR = RepairSettings()
+UNREPAIRED = Preset(repeated=(STAGE,))
 SAMPLED = replace(STAGE, number_of_samples=90)
 ENDING = replace(SAMPLED, ends_on_samples=True)
 
@@ -59,16 +61,21 @@ def identity(body):
     return np.arange(len(body[0].vertices))
 
 
-def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), init=None, **options):
-    """Return the share of the area that has wrong matches, and the outcome of the stages."""
+def prepared_body(body, initial_map, origin="map"):
+    """Return the prepared pair of the body and itself, and the start from a map."""
     mesh, spectrum = body
-    init = initial_map if init is None else init
-    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, init, initial_map)
-    found = refine_in_stages(prepared, stages, repair, **options)
-    found = refine_further(prepared, stages, repair, found)
+    prepared = PreparedPair.of(Pair(mesh, mesh), spectrum, spectrum)
+    return prepared, Start(prepared.spectra, np.asarray(initial_map, np.int64), origin)
+
+
+def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), init=None, **options):
+    """Return the share of the area that has wrong matches, and the scored map."""
+    prepared, start = prepared_body(body, initial_map, "map" if init is None else init)
+    preset, mesh = Preset(repeated=tuple(stages), repair=repair), body[0]
+    found = refine_and_repair(prepared, start, preset, **options)
+    found = refine_further(prepared, start.origin, preset, found)
     assert found.successful
-    n = len(mesh.vertices)
-    wrong = np.asarray(found.pointwise_map)[:n] != np.arange(n)
+    wrong = found.pointwise_map != np.arange(len(mesh.vertices))
     return mesh.vertex_areas[wrong].sum() / mesh.area, found
 
 
@@ -79,12 +86,12 @@ def test_swapped_limbs_are_repaired(body, swapped):
 
 def test_padding_changes_nothing(body, swapped, monkeypatch):
     _, found = outcome(body, swapped)
-    n = len(swapped)
-    padded_size = padding.padded_size
-    monkeypatch.setattr("jaxsmw.matching.preparation.padded_size", lambda size: padded_size(size) + 20)
+    padded_size = executor.padded_size
+    monkeypatch.setattr(executor, "padded_size", lambda size: padded_size(size) + 20)
     _, more = outcome(body, swapped)
-    assert more.pointwise_map.shape[0] == found.pointwise_map.shape[0] + 20
-    np.testing.assert_array_equal(more.pointwise_map[:n], found.pointwise_map[:n])
+    padded, padded_more = (one.outcome.last.pointwise_map.shape[0] for one in (found, more))
+    assert padded_more == padded + 20
+    np.testing.assert_array_equal(more.pointwise_map, found.pointwise_map)
 
 
 @pytest.mark.slow
@@ -94,8 +101,7 @@ def test_an_alternative_initial_map_helps_where_a_single_round_does_not(body, sw
     repair = replace(REPAIR, rounds=1)
     assert distortion(Pair(mesh, mesh), mirrored, spectrum) > 1.3
     wrong, found = outcome(body, mirrored, repair, alternatives=[swapped, identity])
-    n = len(mirrored)
-    assert wrong < 0.02 and not np.array_equal(found.initial_map[:n], mirrored) and not found.suspicious
+    assert wrong < 0.02 and not np.array_equal(found.outcome.initial_map, mirrored) and not found.suspicious
     wrong, alone = outcome(body, mirrored, repair)
     assert wrong > 0.5 and alone.suspicious and alone.distortion > 1.3
 
@@ -137,11 +143,10 @@ def test_stages_run_again_for_shapes_that_differ_in_form(body, init, non_isometr
     _, found = outcome(body, start, settings, [stage], init)
     expected = once
     for levels in passes:
-        following = np.asarray(expected.pointwise_map)[: len(start)].astype(np.int64)
-        _, expected = outcome(body, following, None, [stage.with_levels(levels)])
+        _, expected = outcome(body, expected.pointwise_map, None, [stage.with_levels(levels)])
     np.testing.assert_array_equal(found.pointwise_map, expected.pointwise_map)
     assert not found.suspicious
-    changed = bool(np.any(np.asarray(found.pointwise_map) != np.asarray(once.pointwise_map)))
+    changed = bool(np.any(found.pointwise_map != once.pointwise_map))
     assert changed == bool(passes)
 
 
@@ -150,12 +155,13 @@ def test_passes_do_not_clear_the_suspicion(body, identity):
     settings = replace(
         REPAIR, suspicious=1.001, suspicious_area=1.0, doubtful=10.0, non_isometric=0.0, passes=1
     )
-    mesh, spectrum = body
-    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, identity, identity)
-    once = refine_in_stages(prepared, [STAGE], None)
+    prepared, start = prepared_body(body, identity)
+    once = refine_and_repair(prepared, start, UNREPAIRED)
+    preset = replace(UNREPAIRED, repair=settings)
     for suspicious in (True, False):
-        found = refine_further(prepared, [STAGE], settings, once._replace(suspicious=suspicious))
-        assert found.suspicious == suspicious and len(found.refinements) == 1 and found.distortion < 10
+        found = refine_further(prepared, "map", preset, replace(once, suspicious=suspicious))
+        assert found.suspicious == suspicious and found.distortion < 10
+        assert len(found.outcome.refinements) == 1
 
 
 @pytest.mark.parametrize(("limit", "used"), [(0.0, False), (10.0, True)])
@@ -169,51 +175,54 @@ def test_passes_use_crease_eigenvectors_only_for_similar_shapes(body, limit, use
     first, after = [], []
     for creases in (jnp.asarray(random), jnp.zeros_like(random)):
         creased = spectrum.with_crease_eigenvectors(creases)
-        prepared = PreparedPair(Pair(mesh, mesh), creased, creased, start, start)
-        once = refine_in_stages(prepared, [stage], None)
-        first.append(once.unpadded_map(prepared.pair))
-        once = once._replace(refinements=[], initial_map=prepared.padded_map(start))
-        after.append(refine_further(prepared, [stage], settings, once).unpadded_map(prepared.pair))
+        prepared, begin = prepared_body((mesh, creased), start)
+        preset = Preset(repeated=(stage,))
+        once = refine_and_repair(prepared, begin, preset)
+        first.append(once.pointwise_map)
+        once = replace(once, outcome=Outcome(begin.pointwise_map))
+        found = refine_further(prepared, "map", replace(preset, repair=settings), once)
+        after.append(found.pointwise_map)
     assert np.any(first[0] != first[1])
     assert np.any(after[0] != after[1]) == used
 
 
 def test_passes_that_worsen_the_score_are_undone(body, monkeypatch):
-    mesh, spectrum = body
+    mesh, _ = body
     noise = np.random.default_rng(0).normal(scale=0.3, size=mesh.vertices.shape)
     start = KDTree(mesh.vertices).query(mesh.vertices + noise)[1]
     settings = replace(REPAIR, non_isometric=0.0, coarse_from=10.0, passes=1, pass_tolerance=1.0)
-    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, start, start)
-    once = refine_in_stages(prepared, [Stage(FeatureRegression((30,)))], None)
-    further = partial(refine_further, prepared, [STAGE], settings)
+    prepared, begin = prepared_body(body, start)
+    once = refine_and_repair(prepared, begin, Preset(repeated=(Stage(FeatureRegression((30,))),)))
+    preset = replace(UNREPAIRED, repair=settings)
+    further = partial(refine_further, prepared, "map", preset)
 
-    def score(self, outcome, *, after):
-        return after if np.any(outcome.pointwise_map != once.pointwise_map) else 0.0
+    def score(self, scored, *, after):
+        return after if np.any(scored.pointwise_map != once.pointwise_map) else 0.0
 
-    assert refine_further(prepared, [STAGE], replace(settings, passes=0), once) is once
+    assert refine_further(prepared, "map", replace(preset, repair=replace(settings, passes=0)), once) is once
     for after, kept in ((-1.0, False), (0.9, False), (1.1, True), (np.nan, True)):
         monkeypatch.setattr(Judge, "score", partialmethod(score, after=after))
         assert (further(once) is once) == kept
 
 
 def test_a_rival_replaces_the_map_if_its_score_is_better_after_the_passes(body, mirrored, identity):
-    mesh, spectrum = body
     settings = replace(REPAIR, non_isometric=0.0, passes=1)
-    prepared = PreparedPair(Pair(mesh, mesh), spectrum, spectrum, identity, identity)
-    right = refine_in_stages(prepared, [STAGE], None)
-    wrong = refine_in_stages(replace(prepared, initial_map=mirrored), [STAGE], None)
+    prepared, start = prepared_body(body, identity)
+    right = refine_and_repair(prepared, start, UNREPAIRED)
+    wrong = refine_and_repair(prepared, start._replace(pointwise_map=mirrored), UNREPAIRED)
     for first, rival, margin, expected in (
         (wrong, right, 0.35, identity),
         (right, wrong, 0.35, identity),
         (wrong, right, 100.0, mirrored),
     ):
-        chosen = replace(settings, rival_margin=margin)
-        found = refine_further(prepared, [STAGE], chosen, first._replace(suspicious=True, rivals=(rival,)))
-        np.testing.assert_array_equal(np.asarray(found.pointwise_map)[: len(identity)], expected)
+        chosen = replace(UNREPAIRED, repair=replace(settings, rival_margin=margin))
+        rivalled = replace(first, suspicious=True, rivals=(rival,))
+        found = refine_further(prepared, "map", chosen, rivalled)
+        np.testing.assert_array_equal(found.pointwise_map, expected)
         assert found.suspicious
         # If the map looks right, so does its rival, and the better score decides.
-        found = refine_further(prepared, [STAGE], chosen, first._replace(suspicious=False, rivals=(rival,)))
-        np.testing.assert_array_equal(np.asarray(found.pointwise_map)[: len(identity)], identity)
+        found = refine_further(prepared, "map", chosen, replace(rivalled, suspicious=False))
+        np.testing.assert_array_equal(found.pointwise_map, identity)
         assert not found.suspicious
 
 
@@ -236,14 +245,14 @@ def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, ide
 
     wrong, found = outcome(body, identity, alternatives=none())
     assert wrong < 0.02
-    np.testing.assert_array_equal(found.initial_map[: len(identity)], identity)
+    np.testing.assert_array_equal(found.outcome.initial_map, identity)
     outcome(body, swapped, None, alternatives=none())
 
 
 @pytest.mark.slow
 def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
     mesh, _ = body
-    preset = Preset((STAGE,), REPAIR)
+    preset = Preset(repeated=(STAGE,), repair=REPAIR)
     with pytest.warns(
         UserWarning,
         match=r"limbs may be swapped or mirrored.* reverses the orientation of 100% .* separates 0%",
@@ -273,7 +282,7 @@ def test_maps_of_presets_without_repair_are_judged(body, mirrored, identity):
 
 def test_default_repair_settings_are_those_of_the_preset_and_documented():
     settings = RepairSettings()
-    assert replace(settings, final_stages=1) == PRESETS["accurate"].repair
+    assert settings == PRESETS["accurate"].repair == PRESETS["accurate"].large.repair
     for field in fields(settings):
         assert f"`{field.name}`" in RepairSettings.__doc__
 
@@ -282,31 +291,17 @@ def test_default_repair_settings_are_those_of_the_preset_and_documented():
     ("make", "fault"),
     [
         (lambda: Preset(()), "at least one stage"),
+        (lambda: Preset((STAGE,), repair=REPAIR), "repair has no stage to repeat"),
+        (lambda: Preset((STAGE,), final=(STAGE,), repair=REPAIR), "repair has no stage to repeat"),
+        (lambda: Preset(final=(STAGE,)), "no map to judge"),
         (
-            lambda: Preset((STAGE,), RepairSettings()),
-            "repair repeats stage 1, but it can repeat only the stages 0 to 0",
+            lambda: Preset(repeated=(ENDING,), final=(replace(SAMPLED, starts_on_samples=True),)),
+            "before the final stages ends on samples, but its map is judged",
         ),
-        (
-            lambda: Preset((STAGE, STAGE), RepairSettings(stage=1, final_stages=1)),
-            "can repeat only the stages 0 to 0",
-        ),
-        (
-            lambda: Preset((STAGE,), RepairSettings(stage=0, final_stages=1)),
-            "1 final stages, but there are 1",
-        ),
-        (
-            lambda: Preset(
-                (ENDING, replace(SAMPLED, starts_on_samples=True)), RepairSettings(stage=0, final_stages=1)
-            ),
-            "stage 0 ends on samples, but its map is judged",
-        ),
-        (lambda: RepairSettings(final_stages=-1), "final_stages is -1"),
-        (lambda: Preset((Stage(),), REPAIR), "WaveletPreservation has no levels"),
+        (lambda: Preset(repeated=(Stage(),), repair=REPAIR), "WaveletPreservation, which has no levels"),
+        (lambda: Preset((STAGE,), large=(STAGE,)), "large is .*: give a Preset or None"),
         (lambda: Preset((SAMPLED, ENDING)), "the last stage ends on samples"),
-        (
-            lambda: Preset((STAGE,), large_stages=(ENDING, SAMPLED)),
-            "stage 0 matches only 90 samples: let stage 1",
-        ),
+        (lambda: Preset((ENDING,), (SAMPLED,)), "stage 0 matches only 90 samples: let stage 1"),
         (
             lambda: Preset((ENDING, replace(SAMPLED, number_of_samples=91, starts_on_samples=True))),
             "at most as",
@@ -331,21 +326,19 @@ def test_final_stages_run_once_after_repair(body, swapped, identity, monkeypatch
     """Repair and passes repeat only the stages before the final stage."""
     mesh, _ = body
     final = Stage(FeatureRegression((30, 40)))
-    repair = replace(REPAIR, final_stages=1, non_isometric=0.0, coarse_from=1e3, passes=1, suspicious=1.0)
-    preset = Preset((STAGE, final), repair)
-    assert preset.judged_stages == (STAGE,) and preset.final_stages == (final,)
-    assert Preset((STAGE, final)).final_stages == ()
+    repair = replace(REPAIR, non_isometric=0.0, coarse_from=1e3, passes=1, suspicious=1.0)
+    preset = Preset(repeated=(STAGE,), final=(final,), repair=repair)
     ran = []
-    run = Stage.run
-    monkeypatch.setattr(
-        Stage, "run", lambda self, *args, **options: ran.append(self) or run(self, *args, **options)
-    )
+
+    def watched(stages, starts, **options):
+        ran.extend(stages)
+        return run(stages, starts, **options)
+
+    monkeypatch.setattr("jaxsmw.matching.search.repair.run", watched)
     found = match(mesh, mesh, preset=preset, init=swapped, mirror="no", history=True)
     assert ran.count(final) == 1 and ran[-1] == final and ran.count(STAGE) > 2
     assert found.refinement.history.energy.shape[0] == 2
-    before = match(
-        mesh, mesh, preset=Preset((STAGE,), replace(repair, final_stages=0)), init=swapped, mirror="no"
-    )
+    before = match(mesh, mesh, preset=replace(preset, final=()), init=swapped, mirror="no")
     after = match(mesh, mesh, preset=Preset((final,)), init=before.pointwise_map, mirror="no")
     assert np.array_equal(found.pointwise_map, after.pointwise_map)
     assert found.distortion == pytest.approx(after.distortion)

@@ -14,7 +14,8 @@ from jaxsmw.creature import creature_pair
 from jaxsmw.geometry import estimate_scale
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.scale import ScaleSettings
-from jaxsmw.matching.pair import Pair, paired_spectra
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import paired_spectra
 from jaxsmw.matching.scores import distortion
 
 PRESET = "paper"

@@ -174,8 +174,8 @@ def test_components_without_loops_do_no_harm(fused):
 
 SHORT = Stage(FeatureRegression((10, 15, 20)), number_of_descriptors=20)
 # Repair that changes no map.
-NEVER = RepairSettings(stage=0, suspicious=1e3, compared=1e3, non_isometric=1e3)
-REPAIRED = Preset((SHORT,), NEVER)
+NEVER = RepairSettings(suspicious=1e3, compared=1e3, non_isometric=1e3)
+REPAIRED = Preset(repeated=(SHORT,), repair=NEVER)
 
 
 def test_match_cuts_both_meshes_if_the_preset_repairs(fused, separate):
@@ -190,7 +190,7 @@ def test_match_cuts_both_meshes_if_the_preset_repairs(fused, separate):
     assert Pair(separate, separate).without_shortcuts().mesh_x is separate
     found = {}
     for cuts in (True, False):
-        preset = Preset((SHORT,), replace(NEVER, cut_shortcuts=cuts))
+        preset = replace(REPAIRED, repair=replace(NEVER, cut_shortcuts=cuts))
         found[cuts] = match(fused, separate, preset=preset, init="shot", mirror="no")
         assert found[cuts].mesh_x is fused
         assert found[cuts].pointwise_map.shape == (len(fused.vertices),)
@@ -219,7 +219,7 @@ def test_presets_fit_the_cut_meshes(fused, separate, monkeypatch):
     holed = replace(fused, faces=fused.faces[(fused.faces > 30).all(axis=1)])
     monkeypatch.setattr("jaxsmw.matching.pair.cut_shortcuts", lambda mesh: holed)
     stage = replace(SHORT, number_of_samples=len(fused.vertices) - 5)
-    found = match(fused, fused, preset=Preset((stage,), NEVER), init="shot", mirror="no")
+    found = match(fused, fused, preset=replace(REPAIRED, repeated=(stage,)), init="shot", mirror="no")
     assert found.preset.stages[0].number_of_samples is None
 
 

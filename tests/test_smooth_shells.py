@@ -18,6 +18,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.shapes import Sizes
+from jaxsmw.matching.starts import make_start
 
 pytestmark = pytest.mark.study
 
@@ -93,10 +95,8 @@ def test_the_rigid_deformation_lowers_its_energy(surface):
 def test_a_turned_copy_is_recovered_exactly():
     body = creature("biped", vertices=800)
     copy, order = turned_copy(body)
-    prepared = prepare(
-        Pair(copy, body), number_of_eigenvectors=30, number_of_descriptors=15, number_of_samples=100
-    )
-    descriptors = [np.asarray(spectrum.descriptors)[: len(order)] for spectrum in prepared.padded]
+    prepared = prepare(Pair(copy, body), Sizes(30)).describe(15)
+    descriptors = [np.asarray(spectrum.descriptors) for spectrum in prepared.spectra.both]
     found = smooth_shells(copy, body, *descriptors, number_of_eigenvectors=60, proposals=30)
     np.testing.assert_array_equal(found, order)
     again = smooth_shells(copy, body, *descriptors, number_of_eigenvectors=60, proposals=30)
@@ -129,13 +129,10 @@ def test_the_error_is_at_most_the_error_of_the_authors_program(shared):
     mesh_x, mesh_y = map(jaxsmw.read_mesh, pair.meshes)
     truth = pair.ground_truth(mesh_x, mesh_y)
     method = METHODS["smooth-shells"]
-    prepared = prepare(
-        Pair(mesh_x, mesh_y),
-        number_of_eigenvectors=30,
-        number_of_descriptors=method.number_of_descriptors,
-        number_of_samples=100,
-    )
-    found, _ = replace(method, last_level=200)(MethodInput.of(prepared, pair.names))
+    prepared = prepare(Pair(mesh_x, mesh_y), Sizes(30, number_of_samples=100))
+    prepared = prepared.describe(method.number_of_descriptors)
+    start = make_start(prepared, "shot")
+    found, _ = replace(method, last_level=200)(MethodInput.of(prepared, start, pair.names))
     theirs = np.loadtxt(shared / "oracle/smooth_shells/tr_reg_000__tr_reg_004.txt", dtype=int)
     mean = {
         program: jaxsmw.geodesic_error(mesh_y, pointwise_map, truth, number_of_samples=200).mean

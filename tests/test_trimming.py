@@ -20,12 +20,12 @@ from jaxsmw.matching.settings import RepairSettings
 from jaxsmw.matching.stages import Stage
 
 TRIMMED = Preset(
-    (
+    repeated=(
         Stage(FeatureRegression((10, 20, 30)), number_of_descriptors=20),
         Stage(Registration((30, 60))),
-        Stage(Registration((60, 60))),
     ),
-    RepairSettings(stage=0, final_stages=1, suspicious=10.0, suspicious_area=1.0),
+    final=(Stage(Registration((60, 60))),),
+    repair=RepairSettings(suspicious=10.0, suspicious_area=1.0),
 )
 WHOLE = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=0))
 
@@ -141,11 +141,12 @@ def test_all_vertices_have_matches_after_trimming(pose, part):
 
 def test_the_trimmed_stage_is_the_last_stage_with_lower_levels(pose, part):
     pair, repair = Pair(part, pose[0], True), replace(TRIMMED.repair, trimmed_levels=(20, 40, 200))
-    stage = trimmed_stage(pair, TRIMMED.stages, repair)
+    stage = trimmed_stage(pair, replace(TRIMMED, repair=repair))
     # No level exceeds the number of eigenvectors of the last stage.
     assert stage == TRIMMED.stages[-1].with_levels((20, 40, 60))
-    unchanged = trimmed_stage(pair, [Stage(number_of_eigenvectors=40)], repair)
-    assert unchanged == Stage(number_of_eigenvectors=40)
+    without_levels = Stage(number_of_eigenvectors=40)
+    unchanged = trimmed_stage(pair, replace(TRIMMED, final=(without_levels,), repair=repair))
+    assert unchanged == without_levels
     share = 1.001 * pose[0].area / part.area
     for other, settings in (
         (pair, None),
@@ -153,7 +154,7 @@ def test_the_trimmed_stage_is_the_last_stage_with_lower_levels(pose, part):
         (pair, replace(repair, trimmed_from=share)),
         (replace(pair, partial=False), repair),
     ):
-        assert trimmed_stage(other, TRIMMED.stages, settings) is None
+        assert trimmed_stage(other, replace(TRIMMED, repair=settings)) is None
 
 
 def test_full_shapes_and_parts_of_similar_area_are_not_trimmed(pose, part):
@@ -170,7 +171,7 @@ def test_all_trims_share_one_program_that_is_compiled_ahead(pose, part, compilat
     twice = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=2))
     jax.clear_caches()
     found = match(part, target, partial=True, preset=twice, init=rough(target, truth))
-    assert len(found.preset.judged_stages) == 2
+    assert len(found.preset.judged) == 2
     assert compilations.count("jit(refine)") == 3
 
 

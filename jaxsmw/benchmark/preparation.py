@@ -13,7 +13,8 @@ from jaxsmw.benchmark.opponents.published_maps import read_published_map
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
-from jaxsmw.matching.starts import INITIAL_MAPS
+from jaxsmw.matching.shapes import Sizes
+from jaxsmw.matching.starts import INITIAL_MAPS, make_start
 
 
 def prepare_pair(
@@ -43,14 +44,13 @@ def prepare_pair(
     no valid map X -> Y; `ArithmeticError` if the computation of an initial map fails numerically.
     """
     pair = Pair(mesh_x, mesh_y, data.partial)
-    prepared = prepare(
-        pair,
-        number_of_eigenvectors=number_of_eigenvectors,
-        number_of_descriptors=number_of_descriptors,
-        number_of_samples=min(MOST_SAMPLES, pair.fewest_vertices()),
-        init=_init(init, data.names, pair),
-    )
-    return MethodInput.of(prepared, data.names)
+    start = _init(init, data.names, pair)
+    samples = min(MOST_SAMPLES, pair.fewest_vertices())
+    prepared = prepare(pair, Sizes(number_of_eigenvectors, number_of_samples=samples))
+    first = make_start(prepared, start)
+    if number_of_descriptors:
+        prepared = prepared.describe(number_of_descriptors)
+    return MethodInput.of(prepared, first, data.names)
 
 
 def _init(init: str, names: tuple[str, str], pair: Pair) -> str | Int64[np.ndarray, " m"]:

@@ -12,9 +12,9 @@ from jaxsmw.collection.consistency import Edge, estimate_edge_errors
 from jaxsmw.collection.edges import EdgeMap
 from jaxsmw.collection.result import MatchedEdge
 from jaxsmw.collection.settings import CollectionSettings
-from jaxsmw.collection.shapes import PreparedShape
 from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
 from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.matching.shapes import PreparedShape
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,13 +9,11 @@ import jax
 import numpy as np
 from jaxtyping import Int64
 
-from jaxsmw.collection.pairs import refined_starts
-from jaxsmw.collection.shapes import PreparedShape, prepare_pair
+from jaxsmw.collection.pairs import match_many, prepare_task
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.match import match_prepared
-from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.presets import Preset
+from jaxsmw.matching.shapes import PreparedShape
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +86,6 @@ class EdgeTask:
     init: Int64[np.ndarray, " m"] | None = None
     aligned: bool = False
 
-    def starts(self) -> list[PreparedPair]:
-        """Return one copy of the prepared pair for each initial map."""
-        first = prepare_pair(self.x, self.y, self.init)
-        return [first, first.started_from("aligned")] if self.aligned and self.init is None else [first]
-
 
 def match_edges(
     tasks: Iterable[EdgeTask], preset: Preset, devices: Sequence[jax.Device] | None = None
@@ -111,9 +104,10 @@ def match_edges(
     **Returns:** An iterator with one `EdgeMap` per edge, in the order of `tasks`. If the refinement of an
     edge fails numerically, the iterator yields an `ArithmeticError` for this edge instead.
     """
-    for starts, fitted, refined in refined_starts((task.starts() for task in tasks), preset, devices=devices):
+    prepared = (prepare_task(task.x, task.y, init=task.init, aligned=task.aligned) for task in tasks)
+    matched = match_many(prepared, preset, False, devices=devices)
+    for found in matched:
         try:
-            found = match_prepared(starts[0].pair, starts, fitted, refined=refined, alternatives=False)
-            yield EdgeMap.of(found.correspondence)
+            yield found if isinstance(found, ArithmeticError) else EdgeMap.of(found)
         except ArithmeticError as error:
             yield error

@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 
 from jaxsmw.collection.consistency import Edge, check_pairs
 from jaxsmw.collection.settings import CollectionSettings
-from jaxsmw.collection.shapes import PreparedShape
 from jaxsmw.errors import InputError, check_number, check_whole_number
+from jaxsmw.matching.shapes import PreparedShape
 from jaxsmw.runtime.cache import Store
 
 # Low eigenvalues describe the proportions of a body. High eigenvalues depend on the mesh.

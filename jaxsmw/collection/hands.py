@@ -9,10 +9,11 @@ from jaxtyping import Bool
 
 from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.graph import choose_edges, shape_distances
-from jaxsmw.collection.shapes import PreparedShape, shape_key
+from jaxsmw.collection.shapes import shape_key
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.presets import Preset
 from jaxsmw.matching.search.chirality import Decision, Hands
+from jaxsmw.matching.shapes import PreparedShape
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress
 

@@ -19,12 +19,13 @@ from jaxsmw.collection.graph import extended_graph
 from jaxsmw.collection.hands import choose_hands, compare_hands
 from jaxsmw.collection.result import Collection
 from jaxsmw.collection.settings import CollectionSettings
-from jaxsmw.collection.shapes import PreparedShape, describe_shapes, prepare_usable_shapes
+from jaxsmw.collection.shapes import describe_shapes, prepare_usable_shapes
 from jaxsmw.errors import InputError, check_choice, check_number, check_whole_number
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
 from jaxsmw.geometry.shortcuts import points_on_uncut
 from jaxsmw.matching.presets import Preset, PresetName, choose_preset
+from jaxsmw.matching.shapes import PreparedShape
 from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress, timed

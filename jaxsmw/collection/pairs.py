@@ -1,24 +1,28 @@
-"""The function `match_pairs`, which matches any pairs of several shapes."""
+"""Matches any pairs of several shapes, in batches on accelerators."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import jax
+import numpy as np
+from jaxtyping import Int64
 
 from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection.consistency import check_pairs
-from jaxsmw.collection.shapes import fitted_preset, prepare_pair, prepare_shapes
+from jaxsmw.collection.shapes import fitted_preset, prepare_described_shapes, warned_already
 from jaxsmw.errors import check_whole_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
-from jaxsmw.matching.batches import refine_batch
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.judge import Outcome
+from jaxsmw.matching.executor import Outcome, Start, run, runs_in_batches
 from jaxsmw.matching.match import match_prepared
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.preparation import PreparedPair, pair_up
 from jaxsmw.matching.presets import Preset, PresetName, choose_preset
+from jaxsmw.matching.shapes import PreparedShape
+from jaxsmw.matching.starts import make_start
 from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.compilation import release_programs
 
@@ -64,54 +68,102 @@ def match_pairs(
     if batch_size is not None:
         check_whole_number("batch_size", batch_size, 1)
     chosen = choose_preset(preset)
-    shapes, _ = prepare_shapes(given, chosen)
+    shapes, _ = prepare_described_shapes(given, chosen)
 
     def results() -> Iterator[tuple[int, Correspondence]]:
-        prepared = ([prepare_pair(shapes[i], shapes[j])] for i, j in checked)
-        outcomes = refined_starts(prepared, chosen, batch_size=batch_size, devices=devices)
-        for number, (starts, fitted, refined) in enumerate(outcomes):
-            i, j = checked[number]
-            pair = Pair(given[i], given[j])
-            found = match_prepared(pair, starts, fitted, refined=refined, alternatives=alternatives)
-            yield number, found.correspondence
+        tasks = (prepare_task(shapes[i], shapes[j], given=Pair(given[i], given[j])) for i, j in checked)
+        matched = match_many(tasks, chosen, alternatives, batch_size=batch_size, devices=devices)
+        for number, found in enumerate(matched):
+            if isinstance(found, ArithmeticError):
+                raise found
+            yield number, found
 
     return results()
 
 
-def refined_starts(
-    starts: Iterator[list[PreparedPair]],
-    preset: Preset,
+Task = tuple[PreparedPair, list[Start]]
+"""A prepared pair and the starts from which it is matched."""
+
+
+def prepare_task(
+    x: PreparedShape,
+    y: PreparedShape,
     *,
-    batch_size: int | None = None,
-    devices: Sequence[jax.Device] | None = None,
-) -> Iterator[tuple[list[PreparedPair], Preset, list[Outcome]]]:
-    """Refine the initial maps of many pairs in batches, if batches save time on the given devices.
+    given: Pair | None = None,
+    init: Int64[np.ndarray, " m"] | None = None,
+    aligned: bool = False,
+) -> Task:
+    """Return the prepared pair of two full shapes, and its starts.
 
     **Arguments:**
 
-    - `starts`: for each pair, a list with one `PreparedPair` for each initial map.
-    - `preset`: the preset with the stages of refinement. For each pair, the preset is adapted to small
-      meshes.
-    - `batch_size`, `devices`: see `refine_pairs`.
+    - `x`, `y`: the source X (m vertices) and the target Y, with descriptors in common axes.
+    - `given`: the pair to whose vertices the result refers. The default is the meshes of the shapes.
+    - `init`: the initial map X -> Y (m,), as 0-based vertices of Y; None for `"shot"`.
+    - `aligned`: whether a pair without an initial map also starts from `"aligned"`.
+    """
+    pair = Pair(x.mesh, y.mesh)
+    prepared = replace(pair_up(pair, x, y), given=given or pair)
+    with warned_already():
+        starts = [make_start(prepared, "shot" if init is None else init)]
+        if aligned and init is None:
+            starts.append(make_start(prepared, "aligned"))
+    return prepared, starts
 
-    **Returns:** An iterator over tuples, one for each pair in the given order. A tuple contains the prepared
-    pairs, the adapted preset, and the outcomes before repair. On one CPU there are no outcomes, because
-    `match_prepared` then runs the stages itself.
+
+def match_many(
+    tasks: Iterable[Task],
+    preset: Preset,
+    alternatives: bool,
+    *,
+    batch_size: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+) -> Iterator[Correspondence | ArithmeticError]:
+    """Match many prepared pairs. The stages run in batches if batches save time on the given devices.
+
+    **Arguments:**
+
+    - `tasks`: each prepared pair with its starts; see `match_prepared`.
+    - `preset`: the stages and the repair. For each pair, the preset is adapted to small meshes.
+    - `alternatives`: whether repair tries alternative maps.
+    - `batch_size`, `devices`: see `jaxsmw.refine_pairs`.
+
+    **Returns:** An iterator over the results in the order of the tasks. If the refinement of a pair fails
+    numerically, its result is the `ArithmeticError`.
     """
     devices = jax.devices() if devices is None else devices
-    fitted = ((one, fitted_preset(preset, *one[0].pair.meshes)) for one in starts)
-    if len(devices) == 1 and devices[0].platform == "cpu" and batch_size is None:
-        for one, own in fitted:
+    batched = runs_in_batches(batch_size, devices)
+
+    def fitted() -> Iterator[tuple[Preset, PreparedPair, list[Start]]]:
+        for prepared, starts in tasks:
+            own = fitted_preset(preset, *prepared.pair.meshes)
+            described = prepared.x.spectrum.descriptors is not None
+            yield own if described else own.without_descriptors(), prepared, starts
+
+    if not batched:
+        for own, prepared, starts in fitted():
             release_programs()
-            yield one, own, []
+            yield _matched(prepared, starts, own, (), alternatives)
         return
     # All pairs of a batch run the same stages.
-    for own, group in itertools.groupby(fitted, key=lambda pair: pair[1]):
-        while waiting := [one for one, _ in itertools.islice(group, _PAIRS_PER_DEVICE * len(devices))]:
-            flat = [start for one in waiting for start in one]
+    for own, group in itertools.groupby(fitted(), key=lambda task: task[0]):
+        while waiting := list(itertools.islice(group, _PAIRS_PER_DEVICE * len(devices))):
             release_programs()
-            described = flat[0].spectrum_x.descriptors is not None
-            stages = (own if described else own.without_descriptors()).judged_stages
-            outcomes = iter(refine_batch(flat, stages, batch_size=batch_size, devices=devices))
-            for one in waiting:
-                yield one, own, [next(outcomes) for _ in one]
+            flat = (one._replace(spectra=pair.spectra) for _, pair, starts in waiting for one in starts)
+            outcomes = run(own.judged, list(flat), batch_size=batch_size, devices=devices)
+            for _, prepared, starts in waiting:
+                of_pair = list(itertools.islice(outcomes, len(starts)))
+                yield _matched(prepared, starts, own, of_pair, alternatives)
+
+
+def _matched(
+    prepared: PreparedPair,
+    starts: Sequence[Start],
+    preset: Preset,
+    outcomes: Sequence[Outcome],
+    alternatives: bool,
+) -> Correspondence | ArithmeticError:
+    try:
+        return match_prepared(prepared, starts, preset, outcomes=outcomes, alternatives=alternatives)
+    except ArithmeticError as error:
+        return error

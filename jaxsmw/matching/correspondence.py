@@ -7,28 +7,31 @@ import warnings
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int64
+from jaxtyping import Bool, Float, Int64
 from numpy.typing import ArrayLike
 
 from jaxsmw.core.refinement import Refinement
-from jaxsmw.core.refiner import Problem, Refiner, State, reverse_map
+from jaxsmw.core.refiner import Refiner
+from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.core.triangles import nearest_point_on_candidates
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices
-from jaxsmw.geometry.mesh import Mesh, extend_from
+from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
+from jaxsmw.matching.executor import SpectralPair, Start, embeddings, nearest_points, reverse_map
+from jaxsmw.matching.judge import Scored, estimate_error
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import program_size
+from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.presets import Preset
-from jaxsmw.matching.scores import expected_error, overlap, wrong_probability
+from jaxsmw.matching.scores import overlap, wrong_probability
 from jaxsmw.matching.settings import WITHOUT_REPAIR, ExpectedErrorSettings
+from jaxsmw.matching.starts import INITIAL_MAPS
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, register_mesh
 
 
@@ -95,6 +98,40 @@ class Correspondence:
     mirror_evidence: float | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
+    @classmethod
+    def of(cls, prepared: PreparedPair, start: Start, preset: Preset, scored: Scored) -> Correspondence:
+        """Make the result of `match`, which refers to the vertices of the given meshes.
+
+        **Raises:** `ArithmeticError` if a stage failed.
+        """
+        pair, outcome = prepared.given, scored.outcome
+        last = outcome.last.unpadded(len(pair.mesh_x.vertices))
+        if last.result != RESULTS.successful:
+            cure = (
+                ' If the units of length differ, set scale="unknown" (--scale unknown).'
+                if pair.partial
+                else ""
+            )
+            raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
+        found = extend_to_unreferenced(prepared.pair.mesh_x, outcome.pointwise_map)
+        seen = prepared.spectra.seen_by(preset.stages[-1])
+        return cls(
+            pair=pair,
+            pointwise_map=found,
+            initial_map=outcome.initial_map,
+            init=start.origin if start.origin in INITIAL_MAPS else None,
+            preset=preset,
+            spectrum_x=seen.x.reflect() if prepared.mirrored else seen.x,
+            spectrum_y=seen.y,
+            refinement=eqx.tree_at(
+                lambda tree: tree.pointwise_map, last, jax.device_put(found.astype(np.int32))
+            ),
+            iterations=sum(int(refinement.iterations) for refinement in outcome.refinements),
+            distortion=scored.distortion,
+            suspicious=scored.suspicious,
+            mirrored=prepared.mirrored,
+        )
+
     def __repr__(self) -> str:
         m, n = (len(mesh.vertices) for mesh in self.pair.meshes)
         judged = "" if self.distortion is None else f", distortion {self.distortion:.3f}"
@@ -158,8 +195,7 @@ class Correspondence:
         vertex of Y receives the match of the nearest referenced vertex.
         """
         with self._precision():
-            padded = np.asarray(compiled(reverse_map)(*self._last_stage()))
-        found = padded[: len(self.mesh_y.vertices)].astype(np.int64)
+            found = reverse_map(self._refiner, self._spectra, self.refinement.state)
         return extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, found)
 
     def _points_near(
@@ -170,23 +206,11 @@ class Correspondence:
         database: Float[np.ndarray, "n d"],
     ) -> SurfacePoints:
         """Return, for each embedded source vertex, the nearest point on the triangles around its match."""
-        mesh_x, mesh_y = pair.meshes
+        mesh_y = pair.mesh_y
         with self._precision():
             rows, candidates = mesh_y.faces_around(matches)
-            # Padding lets pairs of similar sizes share compiled programs.
-            padding = padded_size(len(rows)) - len(rows)
-            rows, candidates = (np.pad(values, (0, padding), "edge") for values in (rows, candidates))
-            padded = (
-                pad_rows(queries, program_size(mesh_x)),
-                pad_rows(database, program_size(mesh_y)),
-                pad_rows(mesh_y.faces, padded_size(len(mesh_y.faces))),
-                rows,
-                candidates,
-            )
-            found = compiled(nearest_point_on_candidates)(*jax.device_put(padded))
-        faces, weights = (np.asarray(values)[: len(queries)] for values in found)
-        weights = weights.astype(np.float64)
-        return SurfacePoints(faces.astype(np.int64), weights / weights.sum(axis=1, keepdims=True))
+            faces, weights = nearest_points(queries, database, mesh_y.faces, rows, candidates)
+        return SurfacePoints(faces, weights / weights.sum(axis=1, keepdims=True))
 
     def registered_mesh(self, *, stiffness: float = DEFAULT_STIFFNESS) -> RegisteredMesh:
         """Deform X onto Y, guided by `surface_points`; see `jaxsmw.transfer.register_mesh`.
@@ -355,16 +379,16 @@ class Correspondence:
 
         **Returns:** The expected errors (m,), divided by the square root of Y's area.
         """
-        expected = expected_error(
-            self.pair.mirrored() if self.mirrored else self.pair,
-            self.pointwise_map,
-            self.reverse_map(),
-            self.spectrum_x,
-            self.spectrum_y,
-            settings,
-            (self.preset.repair or WITHOUT_REPAIR).scores,
-        )
-        return extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, expected)
+        with self._precision():
+            return estimate_error(
+                self.pair.mirrored() if self.mirrored else self.pair,
+                self.pointwise_map,
+                self._spectra,
+                self._refiner,
+                self.refinement.state,
+                settings,
+                (self.preset.repair or WITHOUT_REPAIR).scores,
+            )
 
     def _embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
         """Return the embeddings of X and Y in the last stage.
@@ -373,29 +397,22 @@ class Correspondence:
         matched, because it is unreferenced or was trimmed, has the embedding of the nearest matched vertex.
         """
         with self._precision():
-            padded_x, padded_y = map(np.asarray, compiled(_embeddings)(*self._last_stage()))
+            of_x, of_y = embeddings(self._refiner, self._spectra, self.refinement.state)
         return (
-            extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, padded_x[: len(self.mesh_x.vertices)]),
-            extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, padded_y[: len(self.mesh_y.vertices)]),
+            extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, of_x),
+            extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, of_y),
         )
 
-    def _last_stage(self) -> tuple[Refiner, Problem, State]:
-        """Return the refiner, the problem with padded spectra, and the state of the last stage."""
-        # If the mirror image of X was matched, the state of the refiner belongs to the mirror image.
+    @property
+    def _refiner(self) -> Refiner:
+        return self.preset.stages[-1].refiner
+
+    @functools.cached_property
+    def _spectra(self) -> SpectralPair:
+        """The spectra that the last stage has seen: those of the mirror image of X if it was matched."""
         spectrum_x = self.spectrum_x.reflect() if self.mirrored else self.spectrum_x
-        # Padding lets pairs of similar sizes share compiled programs.
-        pad = compiled(Spectrum.pad)
-        padded_x = pad(spectrum_x, program_size(self.mesh_x))
-        padded_y = pad(self.spectrum_y, program_size(self.mesh_y))
-        problem = Problem(padded_x, padded_y, partial=self.pair.partial)
-        return self.preset.stages[-1].refiner, problem, self.refinement.state
+        return SpectralPair(spectrum_x, self.spectrum_y, partial=self.pair.partial)
 
     def _precision(self) -> AbstractContextManager[None]:
         """Return a context manager in which JAX uses the float type of the functional map."""
         return jax.enable_x64(self.functional_map.dtype == np.float64)
-
-
-def _embeddings(
-    refiner: Refiner, problem: Problem, state: State
-) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    return refiner.embeddings(refiner.prepare(problem), state)

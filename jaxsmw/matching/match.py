@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 import logging
-import time
 import warnings
-from collections.abc import Sequence
-from concurrent.futures import Future, wait
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import NamedTuple
 
 import jax
-import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxsmw.choices import (
@@ -26,22 +24,22 @@ from jaxsmw.choices import (
     Mirror,
     Scale,
 )
-from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.errors import check_choice
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.judge import Outcome
-from jaxsmw.matching.pair import Pair, paired_spectra
-from jaxsmw.matching.preparation import PreparedPair, prepare, program_size
+from jaxsmw.matching.executor import Outcome, Start, compile_stage
+from jaxsmw.matching.judge import Scored, estimate_error
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import PreparedPair, prepare
 from jaxsmw.matching.presets import Preset, PresetName, choose_preset
 from jaxsmw.matching.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.matching.search.chirality import Decision, Hands
-from jaxsmw.matching.search.rounds import refine_in_stages
+from jaxsmw.matching.search.repair import refine_and_repair
 from jaxsmw.matching.search.trimming import complete, trimmed_stage
-from jaxsmw.matching.settings import WITHOUT_REPAIR, ExpectedErrorSettings, RepairSettings
+from jaxsmw.matching.settings import WITHOUT_REPAIR, ExpectedErrorSettings
 from jaxsmw.matching.stages import Stage
-from jaxsmw.matching.starts import check_initial_map
+from jaxsmw.matching.starts import check_initial_map, make_start
 from jaxsmw.runtime.memory import return_free_memory
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.threads import one_blas_thread
@@ -155,230 +153,141 @@ def match(
     fewest = surfaces.fewest_vertices()
     if adapts:
         chosen = chosen.fitted(fewest)
-
     automatic = isinstance(init, str) and init == "auto"
     first_init = DEFAULT_INITIAL_MAP if automatic else init
     check_initial_map(pair, first_init)  # the check runs before the slow computation of the eigenbases
     if isinstance(first_init, SurfacePoints):
         first_init = first_init.nearest_corners(pair.mesh_y)  # cut meshes have other face numbers
-    compiling = _compile_ahead(pair, chosen, history)
+    _compile_ahead(pair, chosen, history)
+
     seconds: dict[str, float] = {}
-    with timed("eigenbases", seconds):
-        spectra = paired_spectra(
-            surfaces, chosen.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
-        )
+    step = functools.partial(timed, seconds=seconds)
+    with step("eigenbases"):
+        prepared = prepare(surfaces, chosen.sizes, given=pair, laplacian=laplacian, eigensolver=eigensolver)
     decision = Decision(mirror == "yes")
     aligns = automatic and chosen.repair is not None  # "aligned" is used only for asymmetric shapes
     if (mirror == "auto" or aligns) and not partial:
-        with timed("mirror test", seconds):
-            decision = Hands(surfaces, *spectra).decide(mirror)
+        with step("mirror test"):
+            decision = Hands(surfaces, *prepared.spectra.both).decide(mirror)
         if decision.mirrored and mirror == "auto":
             logger.info("%s: the mirror image of the source is matched", pair.name)
-    prepared = prepare(
-        surfaces.mirrored() if decision.mirrored else surfaces,
-        number_of_eigenvectors=chosen.number_of_eigenvectors,
-        number_of_descriptors=chosen.number_of_descriptors,
-        number_of_crease_eigenvectors=chosen.number_of_crease_eigenvectors,
-        number_of_samples=chosen.number_of_samples,
-        init=first_init,
-        laplacian=laplacian,
-        eigensolver=eigensolver,
-        descriptors_required=not adapts,
-        spectra=(spectra[0].reflect(), spectra[1]) if decision.mirrored else spectra,
+    if decision.mirrored:
+        prepared = prepared.mirror()
+    with step("initial map"):
+        starts = [make_start(prepared, first_init)]
+        if aligns and decision.asymmetric:
+            starts.append(make_start(prepared, "aligned"))
+    if chosen.number_of_descriptors:
+        with step("descriptors"):
+            prepared = prepared.describe(chosen.number_of_descriptors, required=not adapts)
+    found = match_prepared(prepared, starts, chosen, history=history, step=step)
+    if found.suspicious:
+        warnings.warn(_warning(found, landmarks=starts[0].origin == "landmarks"), stacklevel=2)
+    if decision.doubtful:
+        warnings.warn(_doubt(pair, decision), stacklevel=2)
+    return replace(
+        found,
+        suspicious=found.suspicious or decision.doubtful,
+        mirror_evidence=decision.evidence,
+        seconds=seconds,
     )
-    seconds |= prepared.seconds
-    starts = [prepared]
-    if aligns and decision.asymmetric:
-        starts.append(prepared.started_from("aligned"))
-        _add_seconds(starts[-1], seconds)
-    found = match_prepared(
-        pair, starts, chosen, decision, history=history, seconds=seconds, compiling=compiling
-    )
-    found.warn_if_suspicious()
-    return found.correspondence
 
 
-class Match(NamedTuple):
-    """A correspondence, and the data from which its warnings are made.
-
-    **Attributes:**
-
-    - `correspondence`: the `Correspondence`.
-    - `prepared`: the prepared pair from which the map was refined. If the mirror image of X was matched, the
-      prepared pair contains the mirror image.
-    - `outcome`: the `Outcome` of refinement and repair.
-    - `decision`: the `Decision` between X and its mirror image.
-    """
-
-    correspondence: Correspondence
-    prepared: PreparedPair
-    outcome: Outcome
-    decision: Decision
-
-    def warn_if_suspicious(self) -> None:
-        """Issue a `UserWarning` if the map looks wrong, or if the hand of X is doubtful."""
-        if self.outcome.suspicious:
-            repair = self.correspondence.preset.repair
-            warning = _warning(self.prepared, repair, self.outcome, mirrored=self.decision.mirrored)
-            warnings.warn(warning, stacklevel=3)
-        if self.decision.doubtful:
-            warnings.warn(_doubt(self.prepared.pair, self.decision), stacklevel=3)
+Step = Callable[[str], AbstractContextManager[None]]
+"""A function that takes the name of a step and returns the context in which the step runs."""
 
 
 def match_prepared(
-    pair: Pair,
-    starts: Sequence[PreparedPair],
+    prepared: PreparedPair,
+    starts: Sequence[Start],
     preset: Preset,
-    decision: Decision = Decision(False),  # noqa: B008 (immutable)
     *,
-    history: bool = False,
-    seconds: dict[str, float] | None = None,
-    compiling: Sequence[Future[object]] = (),
+    outcomes: Sequence[Outcome] = (),
     alternatives: bool = True,
-    refined: Sequence[Outcome | None] = (),
-) -> Match:
-    """Refine the initial maps of a prepared pair, and return the better match.
+    history: bool = False,
+    step: Step = lambda name: nullcontext(),
+) -> Correspondence:
+    """Run all stages and the repair from each start, and return the better map.
 
     **Arguments:**
 
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `starts`: a prepared pair for each initial map. If there are two initial maps, the first is `"shot"` and
-      the second is `"aligned"`. If `decision.mirrored` is True, the prepared pairs contain the mirror image
-      of X instead of X.
+    - `prepared`: the prepared pair. If it has no descriptors, the stages use none.
+    - `starts`: the initial maps. If there are two, the first is `"shot"` and the second is `"aligned"`.
     - `preset`: the stages and the repair.
-    - `decision`: the decision between X and its mirror image.
-    - `history`: whether to record a `History` of the last stage.
-    - `seconds`: a dictionary to which the times of the steps are added. With None, the steps are not timed,
-      and no progress is reported.
-    - `compiling`: background compilations that refinement waits for.
+    - `outcomes`: the outcome of `preset.judged` for each start, if these stages have already run.
     - `alternatives`: whether repair tries alternative maps.
-    - `refined`: one entry for each element of `starts`; see `jaxsmw.matching.batches`. The entry is the
-      outcome
-      of all stages, or None if the stages have not run yet. An empty sequence (the default) means that no
-      stages have run yet.
+    - `history`: whether to record a `History` of the last stage.
+    - `step`: reports and measures the steps. By default, nothing is reported.
 
-    **Returns:** The `Match`.
+    **Returns:** The `Correspondence`.
 
-    **Raises:** `ArithmeticError` if refinement fails numerically from every initial map.
+    **Raises:** `ArithmeticError` if refinement fails numerically from every start.
     """
-    if starts[0].spectrum_x.descriptors is None:
+    if prepared.x.spectrum.descriptors is None:
         preset = preset.without_descriptors()
+    starts = [start._replace(spectra=prepared.spectra) for start in starts]
     return_free_memory()
-    with _step("refinement", seconds), one_blas_thread():
-        if not starts[0].pair.partial:
-            wait(compiling)
-        outcomes = [
-            refine_in_stages(
+    with step("refinement"), one_blas_thread():
+        repaired = [
+            refine_and_repair(
+                prepared,
                 start,
-                preset.judged_stages,
-                preset.repair,
+                preset,
+                outcome=outcome,
                 alternatives=None if alternatives else (),
                 history=history,
-                refined=known,
             )
-            for start, known in zip(starts, refined or [None] * len(starts), strict=True)
+            for start, outcome in itertools.zip_longest(starts, outcomes)
         ]
-        jax.block_until_ready([outcome.refinements[-1] for outcome in outcomes])
-    times = {} if seconds is None else seconds
-
-    def found(start: PreparedPair, outcome: Outcome, used: Preset) -> Match:
-        return Match(_correspondence(pair, start, used, outcome, times, decision), start, outcome, decision)
-
-    candidates = [one for one in zip(starts, outcomes, strict=True) if one[1].successful]
-    start, outcome = candidates[0] if candidates else (starts[0], outcomes[0])
-    if len(candidates) > 1:
-        assert preset.repair is not None
-        with _step("expected error", seconds):
-            judged = replace(
-                preset, stages=preset.judged_stages, repair=replace(preset.repair, final_stages=0)
-            )
-            from_shot, from_aligned = (_inconsistency(found(*one, judged)) for one in candidates)
-        start, outcome = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
-    begin = time.perf_counter()
-    wait(compiling)  # for a partial pair, only the program that runs after trimming is compiled in advance
-    with one_blas_thread():
-        start, outcome = complete(
-            start, preset.judged_stages, preset.final_stages, preset.repair, outcome, history=history
-        )
-        jax.block_until_ready(outcome.refinements[-1])
-    if seconds is not None:
-        seconds["refinement"] += time.perf_counter() - begin
-    return found(start, outcome, preset)
+    candidates = [one for one in zip(starts, repaired, strict=True) if one[1].successful]
+    start, scored = candidates[0] if candidates else (starts[0], repaired[0])
+    if len(candidates) > 1 and preset.repair is not None:
+        with step("expected error"):
+            from_shot, from_aligned = (_inconsistency(prepared, preset, one) for _, one in candidates)
+        start, scored = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
+    last = step("final stages") if preset.final or preset.repair else nullcontext()
+    with last, one_blas_thread():
+        prepared, scored = complete(prepared, start.origin, preset, scored, history=history)
+        jax.block_until_ready(scored.outcome.last)
+    return Correspondence.of(prepared, start, preset, scored)
 
 
-def _inconsistency(found: Match) -> float:
+def _inconsistency(prepared: PreparedPair, preset: Preset, scored: Scored) -> float:
     """Return the mean expected error of a map, with `area_weight` 0.
 
     With a positive `area_weight`, the expected error would contain a factor that depends on the shapes, not
     on the quality of the map. (Entry R24 of docs/research_log.md)
     """
-    settings = ExpectedErrorSettings(area_weight=0.0)
-    return float(found.correspondence.mesh_x.average(found.correspondence.estimate_error(settings)))
+    stage, repair = preset.judged[-1], preset.repair or WITHOUT_REPAIR
+    expected = estimate_error(
+        prepared.given.mirrored() if prepared.mirrored else prepared.given,
+        scored.pointwise_map,
+        prepared.spectra.seen_by(stage),
+        stage.refiner,
+        scored.outcome.last.state,
+        ExpectedErrorSettings(area_weight=0.0),
+        repair.scores,
+    )
+    return float(prepared.given.mesh_x.average(expected))
 
 
-def _step(name: str, seconds: dict[str, float] | None) -> AbstractContextManager[None]:
-    return nullcontext() if seconds is None else timed(name, seconds)
-
-
-def _add_seconds(prepared: PreparedPair, seconds: dict[str, float]) -> None:
-    """Add the times of the steps of a preparation to `seconds`."""
-    seconds |= {step: seconds[step] + time for step, time in prepared.seconds.items()}
-
-
-def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> list[Future[object]]:
+def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> None:
     """Compile in the background the programs of all stages, or of the trimmed stage of a partial pair.
 
     The other programs of a partial pair are not compiled, because its numbers of eigenvectors are not known
-    yet. If a mesh has too few vertices for the preset, nothing is compiled, because `paired_spectra` then
-    raises an error.
+    yet. If a mesh has too few vertices for the preset, nothing is compiled, because `prepare` then raises an
+    error.
     """
-    if preset.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
-        return []
+    if preset.sizes.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
+        return
     # The last stage is compiled first, because its compilation takes the longest time.
     stages = [*reversed(preset.stages)]
     if pair.partial:
-        trimmed = trimmed_stage(pair, preset.stages, preset.repair)
+        trimmed = trimmed_stage(pair, preset)
         stages = [] if trimmed is None else [trimmed]
-    sizes = program_size(pair.mesh_x), program_size(pair.mesh_y)
-    return [stage.compile_ahead(*sizes, partial=pair.partial, history=history) for stage in stages]
-
-
-def _correspondence(
-    pair: Pair,
-    prepared: PreparedPair,
-    preset: Preset,
-    outcome: Outcome,
-    seconds: dict[str, float],
-    decision: Decision,
-) -> Correspondence:
-    """Make the result of `match`.
-
-    **Raises:** `ArithmeticError` if refinement failed.
-    """
-    m = len(pair.mesh_x.vertices)
-    last = outcome.refinements[-1].unpadded(m)
-    if last.result != RESULTS.successful:
-        cure = (
-            ' If the units of length differ, set scale="unknown" (--scale unknown).' if pair.partial else ""
-        )
-        raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
-    spectrum_x, spectrum_y = prepared.view(preset.stages[-1], padded=False)
-    return Correspondence(
-        pair=pair,
-        pointwise_map=np.asarray(last.pointwise_map).astype(np.int64),
-        initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
-        init=prepared.init if isinstance(prepared.init, str) else None,
-        preset=preset,
-        spectrum_x=spectrum_x.reflect() if decision.mirrored else spectrum_x,
-        spectrum_y=spectrum_y,
-        refinement=last,
-        iterations=sum(int(refinement.iterations) for refinement in outcome.refinements),
-        distortion=outcome.distortion,
-        suspicious=outcome.suspicious or decision.doubtful,
-        mirrored=decision.mirrored,
-        mirror_evidence=decision.evidence,
-        seconds=seconds,
-    )
+    numbers = [len(mesh.vertices) for mesh in pair.meshes]
+    for stage in stages:
+        compile_stage(stage, *numbers, partial=pair.partial, history=history)
 
 
 def _doubt(pair: Pair, decision: Decision) -> str:
@@ -395,26 +304,21 @@ def _doubt(pair: Pair, decision: Decision) -> str:
 _MOSTLY = 0.5
 
 
-def _warning(
-    prepared: PreparedPair, repair: RepairSettings | None, outcome: Outcome, *, mirrored: bool
-) -> str:
-    """Return the text of the warning that a map looks wrong.
-
-    `mirrored` is True if the mirror image of X was matched.
-    """
-    pair, spectrum_x, init = prepared.pair, prepared.spectrum_x, prepared.init
+def _warning(found: Correspondence, *, landmarks: bool) -> str:
+    """Return the text of the warning that a map looks wrong. `landmarks` is True if landmarks were given."""
+    pair, repair = found.pair, found.preset.repair
     settings = repair or WITHOUT_REPAIR
-    found = outcome.unpadded_map(pair)
-    reversed_ = pair.mesh_x.average(orientation_reversal(pair, found, spectrum_x, settings.scores))
-    cut_off = pair.mesh_x.average(discontinuous_parts(pair, found, settings.scores))
-    more = not isinstance(init, str | SurfacePoints) and np.ndim(init) == 2
-    cure = f"use {'more' if more else 'a few'} landmarks as the initial map"
+    matched = pair.mirrored() if found.mirrored else pair
+    reversed_ = orientation_reversal(matched, found.pointwise_map, found.spectrum_x, settings.scores)
+    cut_off = discontinuous_parts(matched, found.pointwise_map, settings.scores)
+    reversed_share, cut_off_share = (pair.mesh_x.average(fault) for fault in (reversed_, cut_off))
+    cure = f"use {'more' if landmarks else 'a few'} landmarks as the initial map"
     if repair is None:
         cure = f'use preset="accurate" (--preset accurate), which repairs such maps, or {cure}'
-    if reversed_ > _MOSTLY:
+    if reversed_share > _MOSTLY:
         cure += (
             '; if both meshes are of the same hand, set mirror="no" (--mirror no)'
-            if mirrored
+            if found.mirrored
             else '; if one mesh is a mirror image of the other, set mirror="yes" (--mirror yes)'
         )
     if pair.partial:
@@ -426,10 +330,11 @@ def _warning(
         cure += "; if one mesh is a partial shape, set partial=True (--partial)"
     return (
         f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down. The map has "
-        f"distortion {outcome.distortion:.3f}, reverses the orientation of {reversed_:.0%} of the source's "
-        f"area, and separates {cut_off:.0%} of the source's area by discontinuities. Correct maps between "
-        f"poses of one body have distortions up to {settings.suspicious}. Correct maps can have larger "
-        "distortions between non-isometric shapes, with topological noise, or if one shape is mirrored. "
+        f"distortion {found.distortion:.3f}, reverses the orientation of {reversed_share:.0%} of the "
+        f"source's area, and separates {cut_off_share:.0%} of the source's area by discontinuities. Correct "
+        f"maps between poses of one body have distortions up to {settings.suspicious}. Correct maps can have "
+        "larger distortions between non-isometric shapes, with topological noise, or if one shape is "
+        "mirrored. "
         "Look at the map with the option --report or, in Python, with jaxsmw.report.summary.write_report. If "
         f"the map is wrong, {cure}."
     )

@@ -1,4 +1,4 @@
-"""A pair of meshes to be matched, and their spectra in comparable units."""
+"""A pair of meshes to be matched, and the units in which they are compared."""
 
 from __future__ import annotations
 
@@ -8,29 +8,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jaxsmw.choices import Eigensolver, Laplacian, Scale
-from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.choices import Scale
 from jaxsmw.errors import InputError, check_choice, check_number
-from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.geometry.scale import estimate_scale, relative_boundary
 from jaxsmw.geometry.shortcuts import cut_shortcuts
-from jaxsmw.runtime.threads import side_by_side
 
 logger = logging.getLogger("jaxsmw")
 
 # A preset uses at most one eigenvector per two vertices. With fewer vertices, a preset would use fewer than
 # two eigenvectors.
 _FEWEST_VERTICES = 4
-# In a partial pair, the smaller area must be at least this share of the larger area. A part with less than a
-# thousandth of a body's area shows too little of the body's shape.
-_SMALLEST_PART = 1e-3
 # The area of a closed full shape must be at least this share of the area of the part. The area of a body
 # changes by a few per cent between poses.
 _SMALLEST_FULL_SHAPE = 0.8
-# If a mesh has at least this number of vertices, the eigenbases of a pair are computed one after the other,
-# which takes half of the memory.
-_ONE_BY_ONE_FROM = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,100 +192,3 @@ def number_of_usable_vertices(mesh: Mesh) -> int:
             f"at least {_FEWEST_VERTICES} vertices, or hundreds for a meaningful result."
         )
     return number
-
-
-def paired_spectra(
-    pair: Pair,
-    number_of_eigenvectors: int,
-    *,
-    laplacian: Laplacian = "auto",
-    eigensolver: Eigensolver = "auto",
-    common_limit: bool = True,
-) -> tuple[Spectrum, Spectrum]:
-    """Compute the spectra of the two meshes of a pair in comparable units.
-
-    Two full shapes are each scaled to area 1, which compensates for a difference in size. The shapes of a
-    partial pair are scaled by one common factor, so that the larger shape has area 1. For a partial pair, the
-    spectra are then cut at a common limit. The limit is the largest eigenvalue of X or the largest eigenvalue
-    of Y, whichever is smaller. Eigenpairs with eigenvalues above this limit are removed, so k_X and k_Y
-    usually differ for a partial pair.
-
-    **Arguments:**
-
-    - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
-    - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh. It must be at
-      least 1, and less than the number of referenced vertices of each mesh.
-    - `laplacian`: the discretization of the Laplacian. `"cotangent"` is the usual discretization. `"robust"`
-      also handles non-manifold and badly shaped meshes. `"auto"` chooses `"robust"` for a mesh with
-      degenerate triangles or edges with more than two faces, else `"cotangent"`.
-    - `eigensolver`: `"exact"`, or `"approximate"`, which takes less time on large meshes. `"auto"` chooses
-      `"approximate"` for both meshes if one mesh has at least 50 000 referenced vertices, else `"exact"`.
-    - `common_limit`: whether the spectra of a partial pair are cut at the common limit.
-
-    **Returns:** Two spectra, each a `Spectrum` with positions and normals, in `Pair.units_of_length`. The
-    spectrum of X has m vertices and k_X eigenvectors. The spectrum of Y has n vertices and k_Y eigenvectors.
-    For two full shapes, and without the common limit, k_X = k_Y = k.
-
-    **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if all
-    eigenvalues of a mesh are zero. For a partial pair, `InputError` is also raised if the area of one mesh is
-    less than a thousandth of the other area.
-    """
-    if min(pair.areas) < _SMALLEST_PART:
-        raise InputError(
-            f"{pair.mesh_x.name} has area {pair.mesh_x.area * pair.scale**2:.3g} and {pair.mesh_y.name} has "
-            f"area {pair.mesh_y.area:.3g}, so their units of length probably differ: scale one of the "
-            'meshes, or set scale="unknown" (--scale unknown).'
-        )
-    if eigensolver == "auto":  # both shapes need the same eigensolver, because the spectra are compared
-        eigensolver = choose_eigensolver(*pair.meshes)
-
-    def compute(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
-
-    if max(len(mesh.vertices) for mesh in pair.meshes) < _ONE_BY_ONE_FROM:
-        eigenpairs_x, eigenpairs_y = side_by_side(compute, *pair.meshes)
-        # `as_spectrum` runs outside of the threads, because threads do not inherit `jax.enable_x64`.
-        spectrum_x = as_spectrum(pair.mesh_x, *eigenpairs_x)
-        spectrum_y = as_spectrum(pair.mesh_y, *eigenpairs_y)
-    else:
-        spectrum_x, spectrum_y = (as_spectrum(mesh, *compute(mesh)) for mesh in pair.meshes)
-    for mesh, spectrum in zip(pair.meshes, (spectrum_x, spectrum_y), strict=True):
-        check_eigenvalues(mesh, spectrum)
-    if not pair.partial:
-        return spectrum_x, spectrum_y
-    area_x, area_y = pair.areas
-    spectrum_x, spectrum_y = spectrum_x.scale(area_x), spectrum_y.scale(area_y)
-    return common_range(spectrum_x, spectrum_y) if common_limit else (spectrum_x, spectrum_y)
-
-
-def check_eigenvalues(mesh: Mesh, spectrum: Spectrum) -> None:
-    """Check that a spectrum has an eigenvalue above zero.
-
-    **Raises:** `InputError` if all eigenvalues are zero.
-    """
-    if np.asarray(spectrum.eigenvalues)[-1] == 0:
-        raise InputError(
-            f"{mesh.name}: the largest of the {len(spectrum.eigenvalues)} eigenvalues is zero, so the "
-            "eigenvectors only distinguish connected components: compute more eigenvectors than the mesh has "
-            "components, or join vertices at the same position (weld=True, on the command line --weld)."
-        )
-
-
-def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
-    """Cut two spectra at a common limit.
-
-    The limit is the largest eigenvalue of X or the largest eigenvalue of Y, whichever is smaller. Eigenpairs
-    with eigenvalues above this limit are removed. The MWP paper truncates the spectra of partial shapes in
-    the same way.
-
-    **Arguments:**
-
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`, in the same unit of length.
-
-    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors, in the same unit. One of the spectra is
-    unchanged.
-    """
-    spectra = spectrum_x, spectrum_y
-    last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)
-    cut = [s.truncate(int((np.asarray(s.eigenvalues) <= last).sum())) for s in spectra]
-    return cut[0], cut[1]

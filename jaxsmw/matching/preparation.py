@@ -1,223 +1,253 @@
-"""Prepares a pair for refinement: computes its spectra, initial map, descriptors and samples."""
+"""Pairs two prepared shapes: brings their spectra to comparable units, and computes joint descriptors."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property
 
-import jax
 import numpy as np
-from jaxtyping import Array, Int, Int64
-from numpy.typing import ArrayLike
+from jaxtyping import Float
 
 from jaxsmw.choices import Eigensolver, Laplacian
-from jaxsmw.core.refiner import Samples
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.creases import crease_eigenvectors
-from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.sampling import farthest_point_samples
-from jaxsmw.matching.descriptors import SampledPair, describe, sample_pair
-from jaxsmw.matching.pair import Pair, paired_spectra
-from jaxsmw.matching.stages import Stage
-from jaxsmw.matching.starts import InitialMap, check_initial_map, initial_map
-from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
-from jaxsmw.runtime.progress import timed
+from jaxsmw.geometry.shot import SHOT_RADIUS
+from jaxsmw.matching.descriptors import (
+    FINE_FROM,
+    FINE_RADIUS,
+    check_number_of_descriptors,
+    principal_components,
+    weights,
+    with_descriptors,
+)
+from jaxsmw.matching.executor import SpectralPair, common_range
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.shapes import PreparedShape, Sizes, prepare_shapes
 from jaxsmw.runtime.threads import side_by_side
 
-# Meshes with more vertices than this number are not padded, because padding would need too much memory.
-_PADDED_UP_TO = 50_000
-
-
-def program_size(mesh: Mesh) -> int:
-    """Return the number of vertices to which a mesh is padded.
-
-    Meshes of similar sizes are padded to the same number, so they share compiled programs. Meshes with more
-    than 50 000 vertices are not padded.
-    """
-    n = len(mesh.vertices)
-    return n if n > _PADDED_UP_TO else padded_size(n)
+# In a partial pair, the smaller area must be at least this share of the larger area. A part with less than a
+# thousandth of a body's area shows too little of the body's shape.
+_SMALLEST_PART = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedPair:
-    """The result of `prepare`, which contains the data that refinement needs.
+    """A pair with everything that stages need.
 
     **Attributes:**
 
-    - `pair`: the `Pair` of the source X (m vertices) and the target Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum` in `Pair.units_of_length`, without
-      padding. The spectra contain descriptors and crease eigenvectors if they were requested.
-    - `init`: the argument `init` of `prepare`, from which the initial map was computed.
-    - `initial_map`: T: X -> Y (m,), int64, as 0-based vertices of Y.
-    - `samples`: the samples of X (s,) and of Y (s,), a pair of arrays of 0-based vertices in farthest-point
-      order; None if no samples were requested.
-    - `sampled`: the `SampledPair` with the vertices at which descriptors are compared; None if `init` is not
-      a name and no descriptors were requested.
-    - `seconds`: a dictionary from the name of each step of the preparation to its wall time in seconds.
-    - `laplacian`, `eigensolver`: the arguments of `prepare`.
+    - `given`: the `Pair` as it was given, to whose vertices the result refers.
+    - `pair`: the `Pair` that is matched. Its meshes may be cut, mirrored or trimmed, but have the same
+      vertices.
+    - `x`, `y`: the shapes X (m vertices) and Y (n vertices), each a `PreparedShape` in
+      `Pair.units_of_length`.
+    - `mirrored`: whether the mirror image of X is matched instead of X.
     - `trimmed`: whether the larger shape of a partial pair was trimmed; see
-      `jaxsmw.matching.search.trimming`. The
-      spectra of such a pair have equal numbers of eigenvectors.
+      `jaxsmw.matching.search.trimming`.
+      The spectra of such a pair have equal numbers of eigenvectors, and need no common limit.
+    - `laplacian`, `eigensolver`: how the spectra were computed; see `jaxsmw.compute_spectrum`.
     """
 
+    given: Pair
     pair: Pair
-    spectrum_x: Spectrum
-    spectrum_y: Spectrum
-    init: InitialMap | ArrayLike | SurfacePoints
-    initial_map: Int64[np.ndarray, " m"]
-    samples: Samples | None = None
-    sampled: SampledPair | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
+    x: PreparedShape
+    y: PreparedShape
+    mirrored: bool = False
+    trimmed: bool = False
     laplacian: Laplacian = "auto"
     eigensolver: Eigensolver = "auto"
-    trimmed: bool = False
 
-    def started_from(self, init: InitialMap) -> PreparedPair:
-        """Return the prepared pair with another initial map.
+    @classmethod
+    def of(cls, pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> PreparedPair:
+        """Return the prepared pair of meshes whose spectra are known.
 
-        The `seconds` of the result contain only the time of the new initial map.
-
-        **Raises:** `InputError` or `ArithmeticError` if `jaxsmw.initial_map` cannot compute the map.
+        **Raises:** `InputError` if a spectrum and its mesh have different numbers of vertices.
         """
-        seconds: dict[str, float] = {}
-        with timed("initial map", seconds):
-            start = initial_map(self.pair, self.spectrum_x, self.spectrum_y, init=init, sampled=self.sampled)
-        return replace(self, init=init, initial_map=start, seconds=seconds)
+        x, y = PreparedShape.of(pair.mesh_x, spectrum_x), PreparedShape.of(pair.mesh_y, spectrum_y)
+        return cls(pair, pair, x, y)
 
-    def with_crease_eigenvectors(self, number: int) -> PreparedPair:
-        """Return the prepared pair with crease eigenvectors in its spectra.
-
-        The `seconds` of the result also contain the time of the crease eigenvectors.
-
-        **Arguments:**
-
-        - `number`: the number of crease eigenvectors of each shape, at least 1; see
-          `jaxsmw.geometry.crease_eigenvectors`.
-
-        **Raises:** `InputError` if the crease eigenvectors cannot be computed.
-        """
-        seconds = dict(self.seconds)
-        with timed("crease eigenvectors", seconds):
-            of_x, of_y = side_by_side(lambda mesh: crease_eigenvectors(mesh, number), *self.pair.meshes)
-        return replace(
-            self,
-            spectrum_x=self.spectrum_x.with_crease_eigenvectors(jax.device_put(of_x)),
-            spectrum_y=self.spectrum_y.with_crease_eigenvectors(jax.device_put(of_y)),
-            seconds=seconds,
-        )
+    @property
+    def shapes(self) -> tuple[PreparedShape, PreparedShape]:
+        """The shapes X and Y."""
+        return self.x, self.y
 
     @cached_property
-    def padded(self) -> tuple[Spectrum, Spectrum]:
-        """Both spectra, padded to the sizes that `program_size` returns."""
-        pad = compiled(Spectrum.pad)
-        return (
-            pad(self.spectrum_x, program_size(self.pair.mesh_x)),
-            pad(self.spectrum_y, program_size(self.pair.mesh_y)),
-        )
+    def spectra(self) -> SpectralPair:
+        """The spectra and samples of both shapes, on which stages run."""
+        samples = None
+        if self.x.samples is not None and self.y.samples is not None:
+            samples = self.x.samples, self.y.samples
+        partial = self.pair.partial
+        return SpectralPair(self.x.spectrum, self.y.spectrum, samples, partial, partial and not self.trimmed)
 
-    def padded_map(self, pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
-        """Return a map of X's vertices (m,) as a JAX array (p,), padded with zeros to `program_size`."""
-        # The map is converted to int32, the type that refinement returns. For another type, JAX would compile
-        # a second program.
-        padded = pad_rows(pointwise_map, program_size(self.pair.mesh_x)).astype(np.int32)
-        return jax.device_put(padded)
+    @cached_property
+    def shot(self) -> tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]:
+        """SHOT of X and Y at the compared vertices, with the usual radius."""
+        return self._shot(SHOT_RADIUS)
 
-    def view(self, stage: Stage, *, padded: bool = True) -> tuple[Spectrum, Spectrum]:
-        """Return the spectra, restricted to the data that a stage uses; see `Stage.view`.
+    def _shot(self, radius: float) -> tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]:
+        """Compute SHOT of both shapes, with a radius in `Pair.units_of_length`."""
+
+        def of_one(argument: tuple[PreparedShape, float]) -> Float[np.ndarray, "a d"]:
+            shape, unit = argument
+            return shape.shot(radius * unit / shape.mesh.area**0.5)
+
+        return side_by_side(of_one, *zip(self.shapes, self.pair.units_of_length, strict=True))
+
+    def mirror(self) -> PreparedPair:
+        """Return the prepared pair with the mirror image of X in place of X. There are no descriptors yet."""
+        return replace(self, pair=self.pair.mirrored(), x=self.x.mirrored(), mirrored=not self.mirrored)
+
+    def describe(self, number_of_descriptors: int, *, required: bool = False) -> PreparedPair:
+        """Return the prepared pair with descriptors of both shapes in the same axes.
 
         **Arguments:**
 
-        - `stage`: the stage.
-        - `padded`: whether the spectra are padded to the sizes that `program_size` returns.
+        - `number_of_descriptors`: the number d of descriptors, from 1 to 352.
+        - `required`: whether to raise `InputError` if a mesh is too coarse for descriptors. If False, the
+          function issues a `UserWarning` instead, and the result has no descriptors.
         """
-        spectra = self.padded if padded else (self.spectrum_x, self.spectrum_y)
-        # The spectra of a trimmed pair have equal numbers of eigenvectors, so they need no common limit.
-        return stage.view(*spectra, partial=self.pair.partial and not self.trimmed)
+        check_number_of_descriptors(number_of_descriptors)
+        try:
+            shot = [self.shot]
+        except InputError as error:
+            if required:
+                raise
+            warnings.warn(f"refinement continues without descriptors: {error}", stacklevel=3)
+            return self
+        if min(len(shape.mesh.vertices) for shape in self.shapes) >= FINE_FROM:
+            with suppress(InputError), warnings.catch_warnings():
+                # A mesh that is too coarse for the smaller radius still has descriptors of the usual radius.
+                warnings.simplefilter("ignore")
+                shot.append(self._shot(FINE_RADIUS))
+        dtype = self.x.spectrum.eigenvectors.dtype
+        rows = np.hstack([np.concatenate(both) for both in shot], dtype=dtype)
+        weight = np.concatenate(weights(self.shapes)).astype(dtype)
+        components = principal_components(rows, weight, number_of_descriptors)
+        of_x, of_y = np.split(components, [len(self.shot[0])])
+        described = replace(self, x=with_descriptors(self.x, of_x), y=with_descriptors(self.y, of_y))
+        vars(described)["shot"] = self.shot  # the surfaces are the same, so SHOT need not be computed again
+        return described
 
 
 def prepare(
     pair: Pair,
+    sizes: Sizes,
     *,
-    number_of_eigenvectors: int,
-    number_of_descriptors: int = 0,
-    number_of_crease_eigenvectors: int = 0,
-    number_of_samples: int = 0,
-    init: InitialMap | ArrayLike | SurfacePoints = "shot",
+    given: Pair | None = None,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
-    descriptors_required: bool = False,
-    spectra: tuple[Spectrum, Spectrum] | None = None,
 ) -> PreparedPair:
-    """Compute the spectra, the initial map, the descriptors and the samples of a pair.
+    """Prepare both shapes of a pair, and pair them.
 
     **Arguments:**
 
-    - `pair`: a `Pair` of the source X (m vertices) and the target Y (n vertices).
-    - `number_of_eigenvectors`: the largest number of eigenvectors that a stage uses, at least 1.
-    - `number_of_descriptors`: the largest number of descriptors that a stage uses, from 0 to 352. With 0, no
-      descriptors are computed.
-    - `number_of_crease_eigenvectors`: the largest number of crease eigenvectors that a stage uses. With 0, no
-      crease eigenvectors are computed.
-    - `number_of_samples`: the largest number of samples of each shape that a stage uses. With 0, no samples
-      are computed.
-    - `init`: the initial map; see `match`. The argument is `"shot"`, `"wks"`, `"hks"`, `"wavelet"`,
-      `"functional"`, `"aligned"`, a pointwise map (m,) of 0-based vertices of Y, a `SurfacePoints` with m
-      points on Y, or an array (l, 2) of landmarks. Each row of landmarks contains a vertex of X and the
-      matching vertex of Y, both 0-based.
-    - `laplacian`: `"cotangent"`, `"robust"` or `"auto"`; see `jaxsmw.compute_spectrum`.
-    - `eigensolver`: `"exact"`, `"approximate"` or `"auto"`; see `jaxsmw.compute_spectrum`.
-    - `descriptors_required`: whether to raise `InputError` if a mesh is too coarse for descriptors. If False,
-      the function issues a `UserWarning` instead, and the spectra contain no descriptors.
-    - `spectra`: the result of `jaxsmw.matching.pair.paired_spectra` for this pair, if it was already
-      computed.
+    - `pair`: the source X (m vertices) and the target Y (n vertices).
+    - `sizes`: the numbers of eigenvectors, crease eigenvectors and samples of each shape.
+    - `given`: the pair to whose vertices the result refers, if `pair` is cut; by default `pair`.
+    - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
 
-    **Returns:** A `PreparedPair` with the attributes `spectrum_x`, `spectrum_y`, `initial_map` (m,) and
-    `samples`. The spectra are in `Pair.units_of_length`. The initial map contains 0-based vertices of Y. The
-    attribute `samples` is a pair of arrays (s,), with 0-based vertices of X and of Y. If no samples were
-    requested, `samples` is None.
+    **Returns:** A `PreparedPair` without descriptors.
 
-    **Raises:** `InputError` if a spectrum cannot be computed, if all requested eigenvalues of a mesh are
-    zero, if `init` is unknown or does not fit the meshes, or if a mesh is too coarse for required
-    descriptors. `ArithmeticError` if the initial map cannot be computed.
+    **Raises:** `InputError` if a shape cannot be prepared (see `prepare_shapes`). For a partial pair,
+    `InputError` is also raised if the area of one mesh is less than a thousandth of the other area.
     """
-    seconds: dict[str, float] = {}
-    if spectra is None:
-        # The check runs before the slow computation of the eigenbases.
-        check_initial_map(pair, init)
-        with timed("eigenbases", seconds):
-            spectra = paired_spectra(
-                pair, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver
-            )
-    sampled = None
-    with timed("initial map", seconds):
-        if isinstance(init, str) or number_of_descriptors:
-            sampled = sample_pair(pair, *spectra)
-        start = initial_map(pair, *spectra, init=init, sampled=sampled)
-    if number_of_descriptors:
-        with timed("descriptors", seconds):
-            try:
-                spectra = describe(pair, *spectra, number_of_descriptors, sampled=sampled)
-            except InputError as error:
-                if descriptors_required:
-                    raise
-                warnings.warn(f"refinement continues without descriptors: {error}", stacklevel=3)
-    samples = None
-    if number_of_samples:
-        with timed("samples", seconds):
-            samples = paired_samples(pair, number_of_samples)
-    prepared = PreparedPair(
-        pair, *spectra, init, start, samples, sampled, seconds, laplacian=laplacian, eigensolver=eigensolver
-    )
-    if number_of_crease_eigenvectors:
-        return prepared.with_crease_eigenvectors(number_of_crease_eigenvectors)
-    return prepared
+    if min(pair.areas) < _SMALLEST_PART:
+        raise InputError(
+            f"{pair.mesh_x.name} has area {pair.mesh_x.area * pair.scale**2:.3g} and {pair.mesh_y.name} has "
+            f"area {pair.mesh_y.area:.3g}, so their units of length probably differ: scale one of the "
+            'meshes, or set scale="unknown" (--scale unknown).'
+        )
+    x, y = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver)
+    prepared = pair_up(pair, x, y)
+    return replace(prepared, given=given or pair, laplacian=laplacian, eigensolver=eigensolver)
 
 
-def paired_samples(pair: Pair, number: int) -> Samples:
-    """Return samples of X and of Y, a pair of arrays (s,) of 0-based vertices in farthest-point order."""
-    of_x, of_y = side_by_side(lambda mesh: farthest_point_samples(mesh, number), *pair.meshes)
-    return jax.device_put(of_x), jax.device_put(of_y)
+def pair_up(pair: Pair, x: PreparedShape, y: PreparedShape, *, trimmed: bool = False) -> PreparedPair:
+    """Return the prepared pair of two prepared shapes.
+
+    Two full shapes keep their own units, in which each has area 1. The shapes of a partial pair are scaled by
+    one common factor, so that the larger shape has area 1. Their spectra are then cut at a common limit; see
+    `common_range`.
+
+    **Arguments:**
+
+    - `pair`: the meshes X (m vertices) and Y (n vertices).
+    - `x`, `y`: the shapes, each a `PreparedShape` in units in which its area is 1.
+    - `trimmed`: whether the larger shape of a partial pair was trimmed. Both shapes then cover nearly the
+      same
+      region, so they have about as many eigenvalues below any limit, and need no common limit.
+    """
+    if pair.partial:
+        area_x, area_y = pair.areas
+        scaled = x.spectrum.scale(area_x), y.spectrum.scale(area_y)
+        of_x, of_y = scaled if trimmed else common_range(*scaled)
+        x, y = replace(x, spectrum=of_x), replace(y, spectrum=of_y)
+    return PreparedPair(pair, pair, x, y, trimmed=trimmed)
+
+
+def paired_spectra(
+    pair: Pair,
+    number_of_eigenvectors: int,
+    *,
+    laplacian: Laplacian = "auto",
+    eigensolver: Eigensolver = "auto",
+) -> tuple[Spectrum, Spectrum]:
+    """Compute the spectra of the two meshes of a pair in comparable units.
+
+    Two full shapes are each scaled to area 1, which compensates for a difference in size. The shapes of a
+    partial pair are scaled by one common factor, so that the larger shape has area 1. For a partial pair, the
+    spectra are then cut at a common limit. The limit is the largest eigenvalue of X or the largest eigenvalue
+    of Y, whichever is smaller. Eigenpairs with eigenvalues above this limit are removed, so k_X and k_Y
+    usually differ for a partial pair.
+
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
+    - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh. It must be at
+      least 1, and less than the number of referenced vertices of each mesh.
+    - `laplacian`: the discretization of the Laplacian. `"cotangent"` is the usual discretization. `"robust"`
+      also handles non-manifold and badly shaped meshes. `"auto"` chooses `"robust"` for a mesh with
+      degenerate triangles or edges with more than two faces, else `"cotangent"`.
+    - `eigensolver`: `"exact"`, or `"approximate"`, which takes less time on large meshes. `"auto"` chooses
+      `"approximate"` for both meshes if one mesh has at least 50 000 referenced vertices, else `"exact"`.
+
+    **Returns:** Two spectra, each a `Spectrum` with positions and normals, in `Pair.units_of_length`. The
+    spectrum of X has m vertices and k_X eigenvectors. The spectrum of Y has n vertices and k_Y eigenvectors.
+    For two full shapes, k_X = k_Y = k.
+
+    **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if all
+    eigenvalues of a mesh are zero. For a partial pair, `InputError` is also raised if the area of one mesh is
+    less than a thousandth of the other area.
+    """
+    prepared = prepare(pair, Sizes(number_of_eigenvectors), laplacian=laplacian, eigensolver=eigensolver)
+    return prepared.x.spectrum, prepared.y.spectrum
+
+
+def describe(
+    pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum, number_of_descriptors: int
+) -> tuple[Spectrum, Spectrum]:
+    """Add vertex descriptors, which are principal components of SHOT, to the spectra of both shapes.
+
+    SHOT is computed with a radius of 0.06 times the square root of the area. If both meshes have at least
+    2000 vertices and are fine enough for a smaller radius, SHOT is also computed with two thirds of this
+    radius. The principal components are computed for both shapes together. Each component is scaled so that
+    its mean square over the areas of both shapes is 1.
+
+    **Arguments:**
+
+    - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum` from `paired_spectra`.
+    - `number_of_descriptors`: the number d of components, from 1 to 352. The d components of largest variance
+      are used.
+
+    **Returns:** The spectra of X and Y, with dimensionless `descriptors` of shapes (m, d) and (n, d). The
+    function issues a `UserWarning` if a mesh is too coarse for SHOT at more than 1 % of its vertices.
+
+    **Raises:** `InputError` if `number_of_descriptors` is not from 1 to 352, if a mesh is too coarse for SHOT
+    at more than half of its vertices, or if a spectrum and its mesh have different numbers of vertices.
+    """
+    prepared = PreparedPair.of(pair, spectrum_x, spectrum_y).describe(number_of_descriptors, required=True)
+    return prepared.x.spectrum, prepared.y.spectrum

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import get_args
@@ -12,6 +12,7 @@ from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.errors import InputError
 from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.shapes import Sizes
 from jaxsmw.matching.stages import Stage
 
 
@@ -19,70 +20,92 @@ from jaxsmw.matching.stages import Stage
 class Preset:
     """Stages of refinement and settings of the repair, for the argument `preset` of `jaxsmw.match`.
 
+    The stages run in the order `first`, `repeated`, `final`, and each stage starts from the map of the
+    previous stage. A map is judged before the final stages run. Repair runs the repeated stages again.
     `jaxsmw.PRESETS` contains three ready presets.
 
     **Attributes:**
 
-    - `stages`: a tuple of at least one `Stage`. The stages run in this order, and each stage starts from the
-      map of the previous stage.
+    - `first`: a tuple of stages that run once, before the repeated stages. Without repair, these can be all
+      stages.
+    - `repeated`: a tuple of stages that repair runs again. Without repair, they run once.
+    - `final`: a tuple of stages that run once, after repair (Table R42).
     - `repair`: the `RepairSettings` that determine when and how a map is repaired; None (the default) for no
       repair.
-    - `large_stages`: the stages that run instead of `stages` if both meshes have at least 15 000 vertices;
-      None (the default) to run `stages` on meshes of any size. `repair.stage` and `repair.final_stages` count
-      these stages as well.
+    - `large`: the preset that is used instead if both meshes have at least 15 000 vertices; None (the
+      default) to use this preset for meshes of any size.
 
-    **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if no stage before
-    the final stages has the position `repair.stage`. `InputError` is also raised if one of these rules is
-    broken. The last stage, and the last stage before the final stages, must not end on samples. If a stage
-    ends on samples, the next stage must start on samples, and must not have more samples. The stage that
-    repair repeats must have levels.
+    **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if there is repair,
+    but no repeated stage. `InputError` is also raised if one of these rules is broken. The last stage, and
+    the last stage before the final stages, must not end on samples. If a stage ends on samples, the next
+    stage must start on samples, and must not have more samples. The first repeated stage must have levels.
     """
 
-    stages: tuple[Stage, ...]
+    first: tuple[Stage, ...] = ()
+    repeated: tuple[Stage, ...] = ()
+    final: tuple[Stage, ...] = ()
     repair: RepairSettings | None = None
-    large_stages: tuple[Stage, ...] | None = None
+    large: Preset | None = None
 
     def __post_init__(self) -> None:
+        for name in ("first", "repeated", "final"):
+            stages = getattr(self, name)
+            if not isinstance(stages, tuple) or not all(isinstance(stage, Stage) for stage in stages):
+                raise InputError(f"{name} is {stages!r}: give a tuple of stages.")
         if self.repair is not None and not isinstance(self.repair, RepairSettings):
             raise InputError(f"repair is {self.repair!r}: give RepairSettings or None.")
-        _check_stages("stages", self.stages, self.repair)
-        if self.large_stages is not None:
-            _check_stages("large_stages", self.large_stages, self.repair)
+        if self.large is not None and not isinstance(self.large, Preset):
+            raise InputError(f"large is {self.large!r}: give a Preset or None.")
+        _check_order(self.stages)
+        if self.final:
+            if not self.judged:
+                raise InputError("a preset of final stages has no map to judge: add stages before them.")
+            if self.judged[-1].ends_on_samples:
+                raise InputError(
+                    "the last stage before the final stages ends on samples, but its map is judged at all "
+                    "vertices: use the default."
+                )
+        if self.repair is None:
+            return
+        if not self.repeated:
+            raise InputError("repair has no stage to repeat: give the preset repeated stages.")
+        if not self.repeated[0].refiner.levels:
+            raise InputError(
+                f"repair repeats a stage of {type(self.repeated[0].refiner).__name__}, which has no levels: "
+                "let the repeated stages begin with FeatureRegression or Registration."
+            )
+
+    @property
+    def stages(self) -> tuple[Stage, ...]:
+        """All stages, in the order in which they run."""
+        return self.first + self.repeated + self.final
+
+    @property
+    def judged(self) -> tuple[Stage, ...]:
+        """The stages before the final stages, whose map is judged and repaired."""
+        return self.first + self.repeated
 
     def fitted(self, number_of_vertices: int) -> Preset:
         """Return the preset for meshes of a given size.
 
-        With at least 15 000 vertices, the `stages` of the result are the `large_stages` of this preset, if
-        there are any. For a small number of vertices, every stage is adapted; see `Stage.fitted`.
+        With at least 15 000 vertices, the result is made from `large`, if there is such a preset. For a small
+        number of vertices, every stage is adapted; see `Stage.fitted`.
 
         **Arguments:**
 
         - `number_of_vertices`: the number of referenced vertices of the smaller mesh.
         """
-        stages = self.stages
-        if self.large_stages is not None and number_of_vertices >= _LARGE_FROM:
-            stages = self.large_stages
-        return Preset(tuple(stage.fitted(number_of_vertices) for stage in stages), self.repair)
+        if self.large is not None and number_of_vertices >= _LARGE_FROM:
+            return self.large.fitted(number_of_vertices)
+        return self._with_stages(lambda stage: stage.fitted(number_of_vertices))
 
     def without_descriptors(self) -> Preset:
         """Return the preset with stages that use no descriptors."""
+        return self._with_stages(Stage.without_descriptors)
 
-        def without(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
-            return tuple(stage.without_descriptors() for stage in stages)
-
-        large = None if self.large_stages is None else without(self.large_stages)
-        return replace(self, stages=without(self.stages), large_stages=large)
-
-    @property
-    def judged_stages(self) -> tuple[Stage, ...]:
-        """The stages whose map is judged and repaired; see `final_stages`."""
-        return self.stages[: len(self.stages) - len(self.final_stages)]
-
-    @property
-    def final_stages(self) -> tuple[Stage, ...]:
-        """The stages that run once, after repair; see `RepairSettings.final_stages`."""
-        number = 0 if self.repair is None else self.repair.final_stages
-        return self.stages[len(self.stages) - number :]
+    def _with_stages(self, change: Callable[[Stage], Stage]) -> Preset:
+        first, repeated, final = (tuple(map(change, s)) for s in (self.first, self.repeated, self.final))
+        return Preset(first, repeated, final, self.repair)
 
     @property
     def cuts_shortcuts(self) -> bool:
@@ -90,34 +113,26 @@ class Preset:
         return self.repair is not None and self.repair.cut_shortcuts
 
     @property
-    def number_of_eigenvectors(self) -> int:
-        """The largest number of eigenvectors that a stage uses."""
-        return max(stage.number_of_eigenvectors for stage in self.stages)
+    def sizes(self) -> Sizes:
+        """What the stages need of each shape."""
+        return Sizes(
+            max(stage.number_of_eigenvectors for stage in self.stages),
+            max(stage.number_of_crease_eigenvectors for stage in self.stages),
+            max(stage.number_of_samples or 0 for stage in self.stages),
+        )
 
     @property
     def number_of_descriptors(self) -> int:
         """The largest number of descriptors that a stage uses."""
         return max(stage.number_of_descriptors for stage in self.stages)
 
-    @property
-    def number_of_crease_eigenvectors(self) -> int:
-        """The largest number of crease eigenvectors that a stage uses."""
-        return max(stage.number_of_crease_eigenvectors for stage in self.stages)
 
-    @property
-    def number_of_samples(self) -> int:
-        """The largest number of samples that a stage uses; 0 if no stage uses samples."""
-        return max(stage.number_of_samples or 0 for stage in self.stages)
-
-
-# `Preset.fitted` chooses the `large_stages` if the smaller mesh has at least this number of vertices.
+# `Preset.fitted` chooses the preset `large` if the smaller mesh has at least this number of vertices.
 _LARGE_FROM = 15_000
 
 
-def _check_stages(name: str, stages: tuple[Stage, ...], repair: RepairSettings | None) -> None:
-    """Raise `InputError` if stages cannot run one after another, or if repair cannot repeat its stage."""
-    if not isinstance(stages, tuple) or not all(isinstance(stage, Stage) for stage in stages):
-        raise InputError(f"{name} is {stages!r}: give a tuple of stages.")
+def _check_order(stages: tuple[Stage, ...]) -> None:
+    """Raise `InputError` if stages cannot run one after another."""
     if not stages:
         raise InputError("a preset without stages cannot refine a map: give at least one stage.")
     if stages[-1].ends_on_samples:
@@ -131,28 +146,6 @@ def _check_stages(name: str, stages: tuple[Stage, ...], repair: RepairSettings |
                 f"stage {position - 1} matches only {stage.number_of_samples} samples: let stage {position} "
                 "start on at most as many samples (starts_on_samples=True)."
             )
-    if repair is None:
-        return
-    last = len(stages) - repair.final_stages - 1
-    if last < 0:
-        raise InputError(
-            f"repair has {repair.final_stages} final stages, but there are {len(stages)} stages: give "
-            "RepairSettings(final_stages=...) with a smaller number."
-        )
-    if not 0 <= repair.stage <= last:
-        raise InputError(
-            f"repair repeats stage {repair.stage}, but it can repeat only the stages 0 to {last}: give "
-            "RepairSettings(stage=...) with one of these numbers."
-        )
-    if stages[last].ends_on_samples:
-        raise InputError(
-            f"stage {last} ends on samples, but its map is judged at all vertices: use the default."
-        )
-    if not stages[repair.stage].refiner.levels:
-        raise InputError(
-            f"repair repeats stage {repair.stage}, but {type(stages[repair.stage].refiner).__name__} has no "
-            "levels: give RepairSettings(stage=...) with a stage of FeatureRegression or Registration."
-        )
 
 
 _WAVELETS = Stage()
@@ -171,15 +164,20 @@ PRESETS: dict[PresetName, Preset] = {
     "fast": Preset((Stage(number_of_samples=500),)),
     "paper": Preset((Stage(),)),
     "accurate": Preset(
-        (_WAVELETS, _REGRESSION, _REGISTRATION, _FINAL),
-        RepairSettings(stage=1, final_stages=1),
+        (_WAVELETS,),
+        (_REGRESSION, _REGISTRATION),
+        (_FINAL,),
+        RepairSettings(),
         # On large meshes, searches that match all vertices take most of the time. Crease eigenvectors are
         # left out, because they need the exact eigensolver.
-        large_stages=(
-            replace(_WAVELETS, number_of_samples=1000),
-            replace(_REGRESSION, number_of_crease_eigenvectors=0, ends_on_samples=True),
-            replace(_REGISTRATION, starts_on_samples=True),
-            replace(_FINAL, number_of_samples=1000, starts_on_samples=True),
+        large=Preset(
+            (replace(_WAVELETS, number_of_samples=1000),),
+            (
+                replace(_REGRESSION, number_of_crease_eigenvectors=0, ends_on_samples=True),
+                replace(_REGISTRATION, starts_on_samples=True),
+            ),
+            (replace(_FINAL, number_of_samples=1000, starts_on_samples=True),),
+            RepairSettings(),
         ),
     ),
 }

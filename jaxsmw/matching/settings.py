@@ -180,19 +180,15 @@ class AlternativeSettings:
 class RepairSettings:
     """The settings that determine when a map looks wrong, and how the map is repaired.
 
-    The settings are passed as `Preset(stages, repair=RepairSettings(...))` and take effect in `jaxsmw.match`.
-    A map is judged by its distortion and by its faults. The distortion is 1 for isometries and larger for
-    worse maps. There are two kinds of faults: vertices where the map reverses the orientation, and parts of X
-    that discontinuous edges separate from the rest.
+    The settings are passed as `Preset(first, repeated, repair=RepairSettings(...))` and take effect in
+    `jaxsmw.match`. A map is judged by its distortion and by its faults. The distortion is 1 for isometries
+    and larger for worse maps. There are two kinds of faults: vertices where the map reverses the orientation,
+    and parts of X that discontinuous edges separate from the rest.
 
     Tables and entries R1, R2, … are in `docs/research_log.md`.
 
     **Attributes:**
 
-    - `stage`: the stage that repair repeats, as a 0-based position in the stages of the preset. The refiner
-      of this stage must have levels.
-    - `final_stages` (Table R42): the number of last stages that repair and further passes do not repeat, at
-      least 0. These stages run once, after the map has been repaired.
     - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
       value is suspicious and is repaired. Correct maps between poses of one body have a distortion below this
       value.
@@ -210,7 +206,7 @@ class RepairSettings:
       repaired. If most of a body is mapped upside down, the rest of the map does not suffice to find the
       correct map.
     - `rounds` (Table R5): the largest number of rounds of repair, at least 0. Each round runs the repeated
-      stage and all later stages.
+      stages.
     - `finalists`: the largest number of alternative maps that are refined at all vertices, at least 0.
     - `uncertainty_weight` (Table R28): the weight of the feature regression's uncertainty in the score, at
       least 0. The logarithm of the distortion has the weight 1. Upside-down maps have a higher uncertainty
@@ -220,8 +216,8 @@ class RepairSettings:
     - `non_isometric` (Table R29): a number of at least 0. If the final map of two full shapes has an
       area-based shape difference of at least this value, the map is refined further, even if it looks right.
       The difference is smaller between poses of one body.
-    - `passes` (Table R29): the number of usual passes, at least 0. In a usual pass, the repeated stage and
-      all later stages run again. Maps between non-isometric shapes need further passes, because such maps
+    - `passes` (Table R29): the number of usual passes, at least 0. In a usual pass, the repeated stages
+      run again. Maps between non-isometric shapes need further passes, because such maps
       converge more slowly than maps between poses of one body.
     - `pass_tolerance` (Table R40): a number of at least 0. If all passes together increase the score without
       the deformation by more than this value, the map before the passes is kept.
@@ -256,12 +252,9 @@ class RepairSettings:
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 
-    **Raises:** `InputError` if a number is out of its range. `Preset` raises `InputError` if the stage at
-    position `stage` does not exist or has a refiner without levels.
+    **Raises:** `InputError` if a number is out of its range.
     """
 
-    stage: int = 1
-    final_stages: int = 0
     suspicious: float = 1.12
     compared: float = 1.05
     suspicious_area: float = 0.02
@@ -289,7 +282,7 @@ class RepairSettings:
     scores: ScoreSettings = ScoreSettings()
 
     def __post_init__(self) -> None:
-        for name in ("stage", "final_stages", "rounds", "finalists", "passes", "trims"):
+        for name in ("rounds", "finalists", "passes", "trims"):
             check_whole_number(name, getattr(self, name), 0)
         for name in ("suspicious_area", "negligible_area", "excessive_area"):
             check_number(name, getattr(self, name), most=1.0)

@@ -1,24 +1,17 @@
-"""A stage of refinement, which JAX compiles as one program."""
+"""A stage of refinement: its method and its sizes."""
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
-
 from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS
-from jaxsmw.core.refinement import Refinement, check_samples_use, refine
-from jaxsmw.core.refiner import Refiner, Samples
+from jaxsmw.core.refinement import check_samples_use
+from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.shot import SHOT_DIMENSION
-from jaxsmw.matching.pair import common_range
-from jaxsmw.runtime.compilation import compile_ahead, compiled
 
 
 @dataclass(frozen=True, init=False)
@@ -167,6 +160,15 @@ class Stage:
         derived: dict[str, Any] = {"number_of_eigenvectors": None, "iterations": None}
         return replace(self, refiner=refiner, **derived)
 
+    def coarsened(self, levels: tuple[int, ...]) -> Stage:
+        """Return the stage with other levels, at most its number of eigenvectors each.
+
+        A stage whose refiner has no levels is not changed.
+        """
+        if not self.refiner.levels:
+            return self
+        return self.with_levels(tuple(min(level, self.number_of_eigenvectors) for level in levels))
+
     def without_descriptors(self) -> Stage:
         """Return the stage without descriptors."""
         return replace(self, number_of_descriptors=0)
@@ -192,122 +194,6 @@ class Stage:
         if self.refiner.levels:
             return fitted.with_levels(tuple(min(level, most) for level in self.refiner.levels))
         return replace(fitted, number_of_eigenvectors=most)
-
-    def view(
-        self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, partial: bool = False
-    ) -> tuple[Spectrum, Spectrum]:
-        """Return both spectra, restricted to the data that this stage uses.
-
-        The result contains the eigenvectors, descriptors and crease eigenvectors that the stage uses. If one
-        of the spectra has no crease eigenvectors, the result has none either. This happens in a collection if
-        only one of two meshes is large.
-
-        The two spectra of a partial pair end at a common limit. If the stage leaves out eigenvectors of a
-        partial pair, `jaxsmw.matching.pair.common_range` cuts both spectra at a new common limit.
-
-        **Arguments:**
-
-        - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`, in the same scale; see
-          `paired_spectra`.
-        - `partial`: whether one of the shapes is a partial shape.
-        """
-        spectra, seen = (spectrum_x, spectrum_y), []
-        creased = all(spectrum.crease_eigenvectors is not None for spectrum in spectra)
-        number_of_creases = self.number_of_crease_eigenvectors if creased else 0
-        for spectrum in spectra:
-            descriptors = _first(spectrum.descriptors, self.number_of_descriptors)
-            creases = _first(spectrum.crease_eigenvectors, number_of_creases)
-            used = spectrum.truncate(self.number_of_eigenvectors)
-            seen.append(used.with_descriptors(descriptors).with_crease_eigenvectors(creases))
-        fewer = [now.eigenvalues.shape != s.eigenvalues.shape for now, s in zip(seen, spectra, strict=True)]
-        return common_range(*seen) if partial and any(fewer) else (seen[0], seen[1])
-
-    def run(
-        self,
-        spectrum_x: Spectrum,
-        spectrum_y: Spectrum,
-        pointwise_map: Int[Array, " m"],
-        samples: Samples | None = None,
-        *,
-        partial: bool = False,
-        history: bool = False,
-    ) -> Refinement:
-        """Refine a pointwise map.
-
-        **Arguments:**
-
-        - `spectrum_x`, `spectrum_y`: the spectra of X (m vertices) and Y (n vertices), as returned by `view`.
-        - `pointwise_map`: the map from which the stage starts (m,), as 0-based vertices of Y. If the stage
-          starts on samples, only the entries of the samples are used.
-        - `samples`: the samples of X and of Y in farthest-point order, as a pair of arrays of 0-based
-          vertices; None if the stage uses no samples. Each array contains at least `number_of_samples`
-          vertices.
-        - `partial`: whether one of the shapes is a partial shape.
-        - `history`: whether to record a `History`; see `jaxsmw.refine`.
-
-        **Returns:** A `Refinement`, whose attribute `pointwise_map` (m,) is the refined map, with 0-based
-        vertices of Y. If the stage ends on samples, the map contains -1 for all vertices except the samples.
-        The attribute `result` is `RESULTS.successful`, or another member of `RESULTS` after a failure.
-        """
-        arrays, options = self._arguments(spectrum_x, spectrum_y, pointwise_map, samples)
-        settings = {**options, **self.settings, "partial": partial, "history": history}
-        return compiled(refine)(*arrays, **settings)
-
-    def compile_ahead(
-        self, number_x: int, number_y: int, *, partial: bool = False, history: bool = False
-    ) -> Future[object]:
-        """Compile in the background the program that `run` needs for two shapes.
-
-        Both shapes must have as many eigenvectors as the stage. The shapes of a partial pair have equal
-        numbers of eigenvectors only after trimming; see `jaxsmw.matching.search.trimming`.
-
-        **Arguments:**
-
-        - `number_x`, `number_y`: the numbers of vertices of X and of Y, including padding.
-        - `partial`: whether one of the shapes is a partial shape.
-        - `history`: whether the program records a `History`; see `jaxsmw.refine`.
-
-        **Returns:** A future that is done when the program is compiled.
-        """
-
-        def arguments() -> tuple[tuple, dict[str, Any]]:
-            x, y = (self._outline(number) for number in (number_x, number_y))
-            samples = None
-            if self.number_of_samples is not None:
-                samples = (jnp.zeros(self.number_of_samples, int),) * 2
-            return self._arguments(*self.view(x, y), jnp.zeros(number_x, jnp.int32), samples)
-
-        return compile_ahead(refine, arguments, **self.settings, partial=partial, history=history)
-
-    def _outline(self, number_of_vertices: int) -> Spectrum:
-        """Return a spectrum of zeros for the compilation of the program."""
-        n, k, d = number_of_vertices, self.number_of_eigenvectors, self.number_of_descriptors
-        c = self.number_of_crease_eigenvectors
-        spectrum = Spectrum(jnp.zeros(k), jnp.zeros((n, k)), jnp.zeros(n), jnp.zeros(n, bool))
-        described = spectrum.with_descriptors(jnp.zeros((n, d)) if d else None)
-        creased = described.with_crease_eigenvectors(jnp.zeros((n, c)) if c else None)
-        return creased.with_positions(jnp.zeros((n, 3)), jnp.zeros((n, 3)))
-
-    def _arguments(
-        self,
-        spectrum_x: Spectrum,
-        spectrum_y: Spectrum,
-        pointwise_map: Int[Array, " m"],
-        samples: Samples | None,
-    ) -> tuple[tuple[Spectrum, Spectrum, Int[Array, " m"]], dict[str, Any]]:
-        """Return the positional and keyword arguments of `jaxsmw.refine` that contain arrays.
-
-        `run` and `compile_ahead` call this method so that they use the same compiled program.
-        """
-        chosen = None
-        if self.number_of_samples is not None and samples is not None:
-            chosen = samples[0][: self.number_of_samples], samples[1][: self.number_of_samples]
-        return (spectrum_x, spectrum_y, pointwise_map), {"samples": chosen}
-
-
-def _first(columns: Float[Array, "n d"] | None, number: int) -> Float[Array, "n c"] | None:
-    """Return the first columns of an array; None if there is no array, or if the number is 0."""
-    return columns[:, :number] if number and columns is not None else None
 
 
 def _derived(name: str, given: int | None, derived: int | None, default: int) -> int:

@@ -12,7 +12,7 @@ from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.matching.pair import common_range
+from jaxsmw.matching.executor import common_range
 from jaxsmw.report.colors import error_colors, signed_colors
 from jaxsmw.report.inputs import check_functional_map, describe
 from jaxsmw.report.standing import placement
@@ -50,7 +50,7 @@ def spectra_on_page(
     """Return the spectra of both shapes, truncated to the eigenvectors that a page contains.
 
     If the two spectra have different numbers of eigenvectors, both are also truncated to their common range
-    of eigenvalues (`jaxsmw.matching.pair.common_range`). This is the case for a partial pair.
+    of eigenvalues (`jaxsmw.matching.executor.common_range`). This is the case for a partial pair.
 
     **Arguments:**
 

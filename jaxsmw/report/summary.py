@@ -26,7 +26,8 @@ from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.pair import Pair, paired_spectra
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import paired_spectra
 from jaxsmw.matching.settings import WITHOUT_REPAIR
 from jaxsmw.report.figures import (
     draw_correspondence,

@@ -19,11 +19,11 @@ def no_progress(step: str, done: int, number: int) -> None:
 
 @contextmanager
 def timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    """Log the name of a step, and store the wall time of the block in `seconds[name]`.
+    """Log the name of a step, and add the wall time of the block to `seconds[name]`.
 
-    If the block raises an exception, no time is stored.
+    If the block raises an exception, no time is added.
     """
     logger.info("%s ...", name)
     start = time.perf_counter()
     yield
-    seconds[name] = time.perf_counter() - start
+    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start

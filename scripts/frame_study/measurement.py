@@ -38,7 +38,8 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.preparation import paired_spectra
+from jaxsmw.matching.starts import initial_map
 from jaxsmw.runtime.journal import Row
 
 DATA_SETS = ("faust_r", "tosca_r")
@@ -125,8 +126,9 @@ def load_pair(data: Path, name: PairName, settings: Settings) -> MeasuredPair:
     """Read a pair, and compute the spectra, the initial map and the distances, which all variants share."""
     mesh_x, mesh_y, truth = read_pair(data, name)
     k = settings.number_of_eigenvectors
-    prepared = prepare(Pair(mesh_x, mesh_y), number_of_eigenvectors=k)
-    start, padded = prepared.initial_map, (pad(prepared.spectrum_x), pad(prepared.spectrum_y))
+    pair = Pair(mesh_x, mesh_y)
+    spectra = paired_spectra(pair, k)
+    start, padded = initial_map(pair, *spectra), (pad(spectra[0]), pad(spectra[1]))
     rows = np.random.default_rng(settings.seed).permutation(len(truth.source_vertices))
     rows = rows[: settings.evaluated_points]
     sources, targets = truth.source_vertices[rows], np.asarray(truth.targets)[rows]

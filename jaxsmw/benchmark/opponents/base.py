@@ -16,6 +16,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.matching.executor import SpectralPair, Start, padded_map
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.stages import Stage
 
@@ -55,21 +56,21 @@ class MethodInput:
     prepared: PreparedPair | None = None
 
     @classmethod
-    def of(cls, prepared: PreparedPair, names: tuple[str, str]) -> MethodInput:
+    def of(cls, prepared: PreparedPair, start: Start, names: tuple[str, str]) -> MethodInput:
         """Create the input of all methods from a prepared pair.
 
         **Arguments:**
 
-        - `prepared`: the prepared pair that `jaxsmw.matching.preparation.prepare` returns, with samples.
+        - `prepared`: the prepared pair, with samples.
+        - `start`: the initial map.
         - `names`: the names of X and Y.
         """
-        assert prepared.samples is not None
-        spectrum_x, spectrum_y = prepared.padded
+        spectra = prepared.spectra.padded
+        assert spectra.samples is not None
         return cls(
-            spectrum_x,
-            spectrum_y,
-            prepared.padded_map(prepared.initial_map),
-            prepared.samples,
+            *spectra.both,
+            padded_map(start.pointwise_map),
+            spectra.samples,
             prepared.pair.meshes,
             names,
             prepared.pair.partial,
@@ -77,11 +78,14 @@ class MethodInput:
         )
 
     def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
-        """Return both spectra with the eigenvectors and descriptors that a stage uses; see `Stage.view`.
+        """Return both spectra as a stage sees them; see `SpectralPair.seen_by`.
 
         The spectra of a partial pair are also cut to their common range of eigenvalues.
         """
-        return stage.view(self.spectrum_x, self.spectrum_y, partial=self.partial)
+        spectra = SpectralPair(
+            self.spectrum_x, self.spectrum_y, partial=self.partial, common_limit=self.partial
+        )
+        return spectra.seen_by(stage).both
 
     def truncated(self, k: int) -> tuple[Spectrum, Spectrum]:
         """Return both spectra with their first k eigenvectors.

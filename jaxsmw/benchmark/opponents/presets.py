@@ -13,15 +13,15 @@ from dataclasses import dataclass, field
 from jaxtyping import Array, Int
 
 from jaxsmw.benchmark.opponents.base import Method, MethodInput
+from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.match import match
 from jaxsmw.matching.presets import PRESETS, PresetName
-from jaxsmw.matching.search.rounds import refine_in_stages
-from jaxsmw.matching.search.trimming import complete
 from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime.cache import recomputing
+from jaxsmw.runtime.compilation import compiled
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,13 @@ class Refined(Method):
             iterations=self.iterations,
             number_of_samples=self.number_of_samples,
         )
-        found = stage.run(*pair.seen_in(stage), pair.initial_map, pair.samples, partial=pair.partial)
+        samples = None
+        if self.number_of_samples is not None:
+            samples_x, samples_y = pair.samples
+            samples = samples_x[: self.number_of_samples], samples_y[: self.number_of_samples]
+        found = compiled(refine)(
+            *pair.seen_in(stage), pair.initial_map, samples=samples, partial=pair.partial, **stage.settings
+        )
         return found.pointwise_map, found.result
 
 
@@ -76,7 +82,7 @@ class Chosen(Method):
     @property
     def number_of_eigenvectors(self) -> int:  # type: ignore[override]
         """The largest number of eigenvectors that a stage of the preset uses."""
-        return PRESETS[self.preset].number_of_eigenvectors
+        return PRESETS[self.preset].sizes.number_of_eigenvectors
 
     @property
     def number_of_descriptors(self) -> int:  # type: ignore[override]
@@ -86,25 +92,10 @@ class Chosen(Method):
     def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
         """Return the map X -> Y and the status code; see `Method`."""
         assert pair.prepared is not None
-        prepared, preset = pair.prepared, PRESETS[self.preset]
-        given = prepared.pair
-        surfaces = given.without_shortcuts() if preset.cuts_shortcuts else given
-        preset = preset.fitted(surfaces.fewest_vertices())
-        if surfaces is not given:
-            prepared = prepare(
-                surfaces,
-                number_of_eigenvectors=preset.number_of_eigenvectors,
-                number_of_descriptors=preset.number_of_descriptors,
-                number_of_samples=preset.number_of_samples,
-                init=prepared.init,
-            )
-        if preset.number_of_crease_eigenvectors:
-            with recomputing():
-                prepared = prepared.with_crease_eigenvectors(preset.number_of_crease_eigenvectors)
-        outcome = refine_in_stages(prepared, preset.judged_stages, preset.repair)
+        given = pair.prepared.pair
         with recomputing():
-            _, outcome = complete(prepared, preset.judged_stages, preset.final_stages, preset.repair, outcome)
-        return outcome.pointwise_map, outcome.refinements[-1].result
+            found = match(*given.meshes, preset=self.preset, partial=given.partial)
+        return found.refinement.pointwise_map, found.refinement.result
 
 
 MWP = Refined("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations")

@@ -4,29 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain, count, islice
+from itertools import chain, count, islice, repeat
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
-from jaxsmw.core.results import RESULTS
-from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced
+from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
-from jaxsmw.matching.judge import Judge, Outcome
+from jaxsmw.matching.executor import Outcome, SpectralPair, Start, run
+from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.extremities import extremities, plausible_pairings
 from jaxsmw.matching.search.proxies import Proxy, deformation, map_difference
 from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.shapes import PreparedShape
 from jaxsmw.matching.stages import Stage
-from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import side_by_side
 
 # A map of samples: for each sample of X, the 0-based index of a sample of Y.
@@ -40,14 +37,6 @@ class _Candidate(NamedTuple):
 
     score: float
     found: SampleMap
-
-
-class _Step(NamedTuple):
-    """A stage, and the padded spectra of the samples on which it runs."""
-
-    stage: Stage
-    x: Spectrum
-    y: Spectrum
 
 
 class Alternatives:
@@ -74,66 +63,54 @@ class Alternatives:
     """
 
     def __init__(self, prepared: PreparedPair, settings: RepairSettings) -> None:
-        assert prepared.sampled is not None
         self.prepared, self.pair, self.settings = prepared, prepared.pair, settings
-        self.sampled = prepared.sampled
-        sides = zip(
-            self.pair.meshes,
-            (prepared.spectrum_x, prepared.spectrum_y),
-            self.pair.units_of_length,
-            strict=True,
-        )
+        sides = zip(prepared.shapes, self.pair.units_of_length, strict=True)
         self.x, self.y = side_by_side(self._proxy, *sides)
         chosen = settings.alternatives
         self._stage = Stage(
             FeatureRegression(chosen.levels),
-            number_of_descriptors=0 if prepared.spectrum_x.descriptors is None else chosen.descriptors,
+            number_of_descriptors=0 if prepared.x.spectrum.descriptors is None else chosen.descriptors,
         )
-        self._sampled = self.x.sampled_spectrum(), self.y.sampled_spectrum()
-        self._coarse = self._step(self._stage)
-        self._fine = self._step(self._stage.with_levels(chosen.fine_levels))
-        self._coarse_x, self._coarse_y = (
-            side.truncate(chosen.eigenvectors) for side in (prepared.spectrum_x, prepared.spectrum_y)
-        )
+        partial = self.pair.partial
+        sampled = self.x.sampled_spectrum(), self.y.sampled_spectrum()
+        self._spectra = SpectralPair(*sampled, partial=partial, common_limit=partial)
+        # Distortions need few eigenvectors.
+        x, y = (side.spectrum.truncate(chosen.eigenvectors) for side in prepared.shapes)
+        self._judged_spectra = SpectralPair(x, y)
 
     @property
     def _judge(self) -> Judge:
         # If the judge were an attribute, both objects would refer to each other. Python frees such objects
         # late, and with them all arrays of the pair.
-        return Judge(self.pair, self._coarse_x, self._coarse_y, self.settings, self.deformation)
+        return Judge(self.pair, self._judged_spectra, self.settings, self.deformation)
 
-    def _proxy(self, side: tuple[Mesh, Spectrum, float]) -> Proxy:
-        mesh, spectrum, unit = side
-        number = min(self.settings.alternatives.samples, int(mesh.referenced_vertices.sum()))
-        samples = SurfaceSamples.along_surface(mesh, farthest_point_samples(mesh, number))
-        return Proxy(mesh, spectrum, samples, unit)
+    def _proxy(self, side: tuple[PreparedShape, float]) -> Proxy:
+        shape, unit = side
+        number = min(self.settings.alternatives.samples, int(shape.mesh.referenced_vertices.sum()))
+        samples = SurfaceSamples.along_surface(shape.mesh, farthest_point_samples(shape.mesh, number))
+        return Proxy(shape.mesh, shape.spectrum, samples, unit)
 
     @property
     def has_creases(self) -> bool:
         """Whether `best` can use crease eigenvectors."""
-        spectra = self.prepared.spectrum_x, self.prepared.spectrum_y
-        available = all(spectrum.crease_eigenvectors is not None for spectrum in spectra)
+        shapes = self.prepared.shapes
+        available = all(shape.spectrum.crease_eigenvectors is not None for shape in shapes)
         return available and self.settings.alternatives.crease_eigenvectors > 0
-
-    def _step(self, stage: Stage) -> _Step:
-        fitted = stage.fitted(min(len(self.x.areas), len(self.y.areas)))
-        spectra = fitted.view(*self._sampled, partial=self.pair.partial)
-        return _Step(fitted, *(spectrum.pad(padded_size(len(spectrum.mask))) for spectrum in spectra))
 
     def deformation(self, pointwise_map: Int64[np.ndarray, " m"]) -> float:
         """Return the deformation of a map X -> Y (m,), measured on the proxies."""
         radius = self.settings.alternatives.patch_radius
         return deformation(self.x, self.y, self._reduced(pointwise_map), radius)
 
-    def different(self, outcome: Outcome, others: Sequence[Outcome]) -> tuple[Outcome, ...]:
-        """Return the other outcomes whose maps differ from the map of the given outcome and from each other.
+    def different(self, best: Scored, others: Sequence[Scored]) -> tuple[Scored, ...]:
+        """Return the other maps that differ from the given map and from each other.
 
         Two maps differ if they differ on at least the first share of `AlternativeSettings.different_areas`.
         """
-        kept = [outcome]
+        kept = [best]
         for other in others:
-            reduced = self._reduced(other.unpadded_map(self.pair))
-            known = (self._reduced(one.unpadded_map(self.pair)) for one in kept)
+            reduced = self._reduced(other.pointwise_map)
+            known = (self._reduced(one.pointwise_map) for one in kept)
             least = self.settings.alternatives.different_areas[0]
             if all(self._difference(reduced, one) >= least for one in known):
                 kept.append(other)
@@ -157,14 +134,15 @@ class Alternatives:
         **Returns:** An iterator over maps T: X -> Y (m,), 0-based vertices of Y.
         """
         chosen, usual = self.settings.alternatives, self._reduced(known)
-        step = self._coarse
+        stage = self._stage
         if creased:
-            step = self._step(replace(self._stage, number_of_crease_eigenvectors=chosen.crease_eigenvectors))
-        coarse = self._refined(step, chain(self._initial_maps(), [usual]))
-        repaired = self._without_faults(step, islice(self._distinct(coarse), chosen.repaired))
+            stage = replace(stage, number_of_crease_eigenvectors=chosen.crease_eigenvectors)
+        coarse = self._refined(stage, chain(self._initial_maps(), [usual]))
+        repaired = self._without_faults(stage, islice(self._distinct(coarse), chosen.repaired))
         coarse = sorted(coarse + repaired, key=lambda candidate: candidate.score)
         promising = islice(self._distinct(_within(chosen.coarse_margin, coarse)), chosen.promising)
-        fine = self._refined(self._fine, [candidate.found for candidate in promising])
+        finer = self._stage.with_levels(chosen.fine_levels)
+        fine = self._refined(finer, [candidate.found for candidate in promising])
         for candidate in self._distinct(_within(chosen.margin, fine)):
             if only_better and self._difference(candidate.found, usual) < chosen.different_areas[0]:
                 return
@@ -192,15 +170,14 @@ class Alternatives:
     def _difference(self, first: SampleMap, second: SampleMap) -> float:
         return map_difference(self.x, self.y, first, second, self.settings.alternatives.different_distance)
 
-    def _without_faults(self, step: _Step, candidates: Iterable[_Candidate]) -> list[_Candidate]:
+    def _without_faults(self, stage: Stage, candidates: Iterable[_Candidate]) -> list[_Candidate]:
         """For each fault of each candidate, refine the map of samples without the faulty ones."""
         starts, faults = [], []
         for candidate in candidates:
-            everywhere = Outcome([], jax.device_put(self._extended(candidate.found)))
-            for fault in self._judge.faults(everywhere):
+            for fault in self._judge.faults(self._extended(candidate.found)):
                 starts.append(candidate.found)
                 faults.append(fault[self.x.samples.vertices])
-        return self._refined(step, starts, faults)
+        return self._refined(stage, starts, faults)
 
     def _initial_maps(self) -> Iterator[SampleMap]:
         """Yield the initial maps, each from the samples of X to the samples of Y."""
@@ -253,8 +230,10 @@ class Alternatives:
 
     def _usual_shot(self) -> tuple[Float[np.ndarray, "s d"], Float[np.ndarray, "t d"]]:
         return tuple(
-            shot[side.rows(proxy.samples.vertices)]
-            for shot, side, proxy in zip(self.sampled.shot, self.sampled.sides, (self.x, self.y), strict=True)
+            shot[shape.compared_rows(proxy.samples.vertices)]
+            for shot, shape, proxy in zip(
+                self.prepared.shot, self.prepared.shapes, (self.x, self.y), strict=True
+            )
         )
 
     def _shot(self, multiple: int) -> tuple[Float[np.ndarray, "s d"], Float[np.ndarray, "t d"]]:
@@ -269,30 +248,29 @@ class Alternatives:
 
     def _refined(
         self,
-        step: _Step,
+        stage: Stage,
         initial: Iterable[SampleMap],
-        faults: Sequence[Bool[np.ndarray, " s"]] | None = None,
+        faults: Iterable[Bool[np.ndarray, " s"] | None] = repeat(None),
     ) -> list[_Candidate]:
-        """Refine maps of samples by a step, and return the successful results, the best score first.
+        """Refine maps of samples by a stage, and return the successful results, the best score first.
 
         With `faults`, map number i is refined without the samples of X in the mask `faults[i]`.
         """
-        stage, x, y = step
-        size, candidates = len(x.mask), []
-
-        def run(number: int, start: SampleMap) -> Refinement:
-            weighted = x if faults is None else x.excluding(jnp.asarray(pad_rows(faults[number], size)))
-            padded = jax.device_put(pad_rows(start, size).astype(np.int32))
-            return stage.run(weighted, y, padded, partial=self.pair.partial)
-
+        fitted = stage.fitted(min(len(self.x.areas), len(self.y.areas)))
+        starts = (
+            Start(self._spectra, start, excluded=fault) for start, fault in zip(initial, faults, strict=False)
+        )
+        candidates = []
         # All refinements are started first. The host scores a finished refinement while the others run.
-        for refined in [run(*one) for one in enumerate(initial)]:
-            if refined.result == RESULTS.successful:
-                found = np.asarray(refined.pointwise_map)[: len(self.x.areas)].astype(np.int64)
-                everywhere = jax.device_put(self._extended(found))  # scores are computed at all vertices
-                refined = eqx.tree_at(lambda tree: tree.pointwise_map, refined, everywhere)
-                score = self._judge.score(self._judge.measured(Outcome([refined], everywhere)))
-                candidates.append(_Candidate(score, found))
+        for outcome in list(run([fitted], starts)):
+            if outcome.successful:
+                found = outcome.pointwise_map
+                everywhere = self._extended(found)  # scores are computed at all vertices
+                refined = eqx.tree_at(
+                    lambda tree: tree.pointwise_map, outcome.last, jax.device_put(everywhere)
+                )
+                scored = self._judge.measured(Outcome(everywhere, (refined,)))
+                candidates.append(_Candidate(self._judge.score(scored), found))
         return sorted(candidates, key=lambda candidate: candidate.score)
 
     def _reduced(self, pointwise_map: Int64[np.ndarray, " m"]) -> SampleMap:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import warnings
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int64
 
 from jaxsmw.choices import Mirror
-from jaxsmw.core.refiner import Problem, reverse_map
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
@@ -18,12 +16,11 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, shot_descriptors
 from jaxsmw.matching.descriptors import principal_components
+from jaxsmw.matching.executor import SpectralPair, Start, reverse_map, run
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.search.proxies import Proxy, distance_error
 from jaxsmw.matching.settings import ChiralitySettings
 from jaxsmw.matching.stages import Stage
-from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import side_by_side
 
 
@@ -174,15 +171,10 @@ class Hands:
 
         **Returns:** The refined map (s,) and its reverse map (t,).
         """
-        first = _nearest(x.shot, y.shot)
-        spectra = [hand.shape.sampled_spectrum(hand.components) for hand in (x, y)]
-        size = max(padded_size(len(spectrum.mask)) for spectrum in spectra)
-        views = [spectrum.pad(size) for spectrum in self.stage.view(*spectra)]
-        start = jax.device_put(pad_rows(first, size).astype(np.int32))
-        found = self.stage.run(views[0], views[1], start)
-        reverse = compiled(reverse_map)(self.stage.refiner, Problem(views[0], views[1]), found.state)
-        forward, backward = (np.asarray(T).astype(np.int64) for T in (found.pointwise_map, reverse))
-        return forward[: len(x.shot)], backward[: len(y.shot)]
+        spectra = SpectralPair(x.shape.sampled_spectrum(x.components), y.shape.sampled_spectrum(y.components))
+        (found,) = run([self.stage], [Start(spectra, _nearest(x.shot, y.shot))])
+        seen = spectra.seen_by(self.stage)
+        return found.pointwise_map, reverse_map(self.stage.refiner, seen, found.last.state)
 
 
 class _Hand(NamedTuple):

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int64
 
-from jaxsmw.core.refiner import Problem, reverse_map
+from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
 from jaxsmw.geometry.scans import in_small_components
-from jaxsmw.matching.descriptors import describe
-from jaxsmw.matching.judge import Outcome
-from jaxsmw.matching.pair import Pair, paired_spectra
-from jaxsmw.matching.preparation import PreparedPair, paired_samples
+from jaxsmw.matching.executor import Start, reverse_map, run
+from jaxsmw.matching.judge import Judge, Scored
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import PreparedPair, pair_up
+from jaxsmw.matching.presets import Preset
 from jaxsmw.matching.scores import detours
-from jaxsmw.matching.search.rounds import finish, refine_in_stages, with_coarse_levels
-from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.search.repair import finish
+from jaxsmw.matching.settings import WITHOUT_REPAIR
+from jaxsmw.matching.shapes import Sizes, prepare_shapes
 from jaxsmw.matching.stages import Stage
-from jaxsmw.runtime.compilation import compiled
 
 logger = logging.getLogger("jaxsmw")
 
@@ -70,128 +69,106 @@ def _kept(mesh: Mesh, far: Float[np.ndarray, " n"], share: float) -> Mesh:
     return kept.without_faces(small)
 
 
-def trimmed_stage(pair: Pair, stages: Sequence[Stage], repair: RepairSettings | None) -> Stage | None:
-    """Return the stage that runs after trimming: the last stage, with `repair.trimmed_levels`.
+def trimmed_stage(pair: Pair, preset: Preset) -> Stage | None:
+    """Return the stage that runs after trimming: the last stage of the preset, with `trimmed_levels`.
 
     **Returns:** The stage, or None if the pair is not trimmed. A pair is trimmed only if it is a partial pair
-    and the larger area is at least `repair.trimmed_from` times the smaller area.
+    and the larger area is at least `trimmed_from` times the smaller area.
     """
+    repair = preset.repair
     if repair is None or repair.trims == 0 or not pair.partial:
         return None
     if max(pair.areas) < repair.trimmed_from * min(pair.areas):
         return None
-    return with_coarse_levels(stages[-1], repair.trimmed_levels)
+    return preset.stages[-1].coarsened(repair.trimmed_levels)
 
 
 def complete(
-    prepared: PreparedPair,
-    stages: Sequence[Stage],
-    final_stages: Sequence[Stage],
-    repair: RepairSettings | None,
-    outcome: Outcome,
-    *,
-    history: bool = False,
-) -> tuple[PreparedPair, Outcome]:
+    prepared: PreparedPair, origin: str, preset: Preset, scored: Scored, *, history: bool = False
+) -> tuple[PreparedPair, Scored]:
     """Finish the refinement of a pair, and match a partial pair again after trimming its larger shape.
 
     The eigenfunctions of a part differ from those of the full shape. After trimming, both shapes cover nearly
     the same region of the body, so their eigenfunctions are similar. The last of all stages then runs on the
-    trimmed pair, with `repair.trimmed_levels`. The final stages run only if nothing was trimmed. (Table R46)
+    trimmed pair, with `trimmed_levels`. The final stages run only if nothing was trimmed. (Table R46)
 
-    **Arguments:** see `jaxsmw.matching.search.rounds.finish`.
+    **Arguments:** see `jaxsmw.matching.search.repair.finish`.
 
-    **Returns:** The prepared pair on which the last stage ran, and its `Outcome`. The prepared pair is
-    `prepared` itself if nothing was trimmed. If all stages succeeded, each unreferenced vertex of X has the
-    match of the nearest referenced vertex. The attribute `suspicious` is copied from the given outcome.
+    **Returns:** The prepared pair on which the last stage ran, and its map. The prepared pair is `prepared`
+    itself if nothing was trimmed. The attribute `suspicious` is copied from the given map.
     """
-    start, last = prepared, stages[-1]
-    following = trimmed_stage(prepared.pair, [*stages, *final_stages], repair)
-    if repair is not None and following is not None and outcome.successful:
-        for _ in range(repair.trims):
-            reverse = _reversed(prepared, last, outcome)
-            pair = trimmed(start.pair, _extended(prepared, outcome), reverse, repair.trimmed_area)
-            again = _matched_again(prepared, pair, following, outcome, history)
+    following, start = trimmed_stage(prepared.pair, preset), prepared
+    if preset.repair is not None and following is not None and scored.successful:
+        last = preset.judged[-1]
+        for _ in range(preset.repair.trims):
+            reverse = _reverse_map(prepared, last, scored)
+            area = preset.repair.trimmed_area
+            pair = trimmed(start.pair, _everywhere(prepared, scored), reverse, area)
+            again = _matched_again(prepared, pair, following, scored, history)
             if again is None:
                 break
-            (prepared, outcome), last = again, following
+            (prepared, scored), last = again, following
     if prepared is start:
-        outcome = finish(prepared, stages, final_stages, repair, outcome, history=history)
-    if not outcome.successful:
-        return prepared, outcome
-    found = prepared.padded_map(_extended(prepared, outcome))
-    *before, end = outcome.refinements
-    end = eqx.tree_at(lambda tree: tree.pointwise_map, end, found)
-    return prepared, outcome._replace(refinements=[*before, end])
+        scored = finish(prepared, origin, preset, scored, history=history)
+    return prepared, scored
 
 
-def _extended(prepared: PreparedPair, outcome: Outcome) -> Int64[np.ndarray, " m"]:
-    """Return the map of an outcome (m,). Unreferenced vertices have the match of the nearest vertex."""
-    return extend_to_unreferenced(prepared.pair.mesh_x, outcome.unpadded_map(prepared.pair))
+def _everywhere(prepared: PreparedPair, scored: Scored) -> Int64[np.ndarray, " m"]:
+    return extend_to_unreferenced(prepared.pair.mesh_x, scored.pointwise_map)
 
 
-def _reversed(prepared: PreparedPair, last: Stage, outcome: Outcome) -> Int64[np.ndarray, " n"]:
+def _reverse_map(prepared: PreparedPair, last: Stage, scored: Scored) -> Int64[np.ndarray, " n"]:
     """Return the map Y -> X (n,) from the state of the last stage."""
-    problem = Problem(*prepared.view(last), partial=prepared.pair.partial)
-    padded = compiled(reverse_map)(last.refiner, problem, outcome.refinements[-1].state)
-    found = np.asarray(padded)[: len(prepared.pair.mesh_y.vertices)].astype(np.int64)
+    found = reverse_map(last.refiner, prepared.spectra.seen_by(last), scored.outcome.last.state)
     return extend_to_unreferenced(prepared.pair.mesh_y, found)
 
 
 def _matched_again(
-    prepared: PreparedPair, pair: Pair, stage: Stage, outcome: Outcome, history: bool
-) -> tuple[PreparedPair, Outcome] | None:
-    """Run a stage on a trimmed pair from the map of an outcome. Return None after a failure."""
+    prepared: PreparedPair, pair: Pair, stage: Stage, scored: Scored, history: bool
+) -> tuple[PreparedPair, Scored] | None:
+    """Run a stage on a trimmed pair from a map. Return None after a failure."""
     logger.info("the larger shape is trimmed and matched again ...")
     try:
         stage = stage.fitted(pair.fewest_vertices())
-        start = _prepared_again(prepared, pair, stage, outcome)
+        trimmed_pair = _prepared_again(prepared, pair, stage)
     except InputError as error:  # the kept region can be too small or too coarse
         logger.info("the map is kept as it was before trimming: %s", error)
         return None
-    again = refine_in_stages(start, [stage], history=history)
+    nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
+    start = Start(trimmed_pair.spectra, nearest[_everywhere(prepared, scored)])
+    (again,) = run([stage], [start], history=history)
     if not again.successful:
         return None
-    return start, again._replace(
-        refinements=[*outcome.refinements, *again.refinements],
-        initial_map=outcome.initial_map,
-        suspicious=outcome.suspicious,
-    )
+    judge = Judge(pair, trimmed_pair.spectra.seen_by(stage), WITHOUT_REPAIR)
+    outcome = scored.outcome.followed_by(again)
+    return trimmed_pair, judge.measured(outcome, suspicious=scored.suspicious)
 
 
-def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage, outcome: Outcome) -> PreparedPair:
-    """Compute spectra, descriptors and samples of a trimmed pair, which starts from the map of an outcome.
+def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage) -> PreparedPair:
+    """Prepare a trimmed pair.
 
-    **Raises:** `InputError` if they cannot be computed.
+    Both shapes have equal numbers of eigenvectors, so all trimmed pairs of similar sizes share a program.
+
+    **Raises:** `InputError` if the kept region is too small or too coarse.
     """
-    # Both shapes cover nearly the same region, so they have about as many eigenvalues below any limit.
-    # Equal numbers of eigenvectors let all trimmed pairs of similar sizes share a compiled program.
-    spectra = paired_spectra(
-        pair,
-        stage.number_of_eigenvectors,
-        laplacian=prepared.laplacian,
-        eigensolver=prepared.eigensolver,
-        common_limit=False,
-    )
+    sizes = Sizes(stage.number_of_eigenvectors, number_of_samples=stage.number_of_samples or 0)
+    laplacian, eigensolver = prepared.laplacian, prepared.eigensolver
+    shapes = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver)
     # The first trim changes the descriptors near the new boundary. Later trims hardly change them.
-    before = (prepared.spectrum_x, prepared.spectrum_y)
-    of_x, of_y = (
-        spectrum.with_descriptors(old.descriptors).with_crease_eigenvectors(old.crease_eigenvectors)
-        for spectrum, old in zip(spectra, before, strict=True)
+    kept = (
+        replace(shape, spectrum=_with_columns_of(before.spectrum, shape.spectrum))
+        for shape, before in zip(shapes, prepared.shapes, strict=True)
     )
+    x, y = pair_up(pair, *kept, trimmed=True).shapes
+    again = replace(prepared, pair=pair, x=x, y=y, trimmed=True)
     if stage.number_of_descriptors and not prepared.trimmed:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the given meshes have already caused the same warnings
-            of_x, of_y = describe(pair, of_x, of_y, stage.number_of_descriptors)
-    samples = None
-    if stage.number_of_samples is not None:
-        samples = paired_samples(pair, stage.number_of_samples)
-    nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
-    return replace(
-        prepared,
-        pair=pair,
-        spectrum_x=of_x,
-        spectrum_y=of_y,
-        initial_map=nearest[_extended(prepared, outcome)],
-        samples=samples,
-        trimmed=True,
-    )
+            again = again.describe(stage.number_of_descriptors, required=True)
+    return again
+
+
+def _with_columns_of(before: Spectrum, spectrum: Spectrum) -> Spectrum:
+    """Return a spectrum with the descriptors and crease eigenvectors of an earlier spectrum."""
+    described = spectrum.with_descriptors(before.descriptors)
+    return described.with_crease_eigenvectors(before.crease_eigenvectors)

@@ -1,0 +1,258 @@
+"""The repair of maps that look wrong, and further passes for maps between non-isometric shapes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.matching.executor import Outcome, SpectralPair, Start, run
+from jaxsmw.matching.judge import Judge, Scored
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.presets import Preset
+from jaxsmw.matching.search.alternatives import Alternatives
+from jaxsmw.matching.settings import WITHOUT_REPAIR
+from jaxsmw.matching.stages import Stage
+
+logger = logging.getLogger("jaxsmw")
+
+
+def refine_and_repair(
+    prepared: PreparedPair,
+    start: Start,
+    preset: Preset,
+    *,
+    outcome: Outcome | None = None,
+    alternatives: Iterable[Int64[np.ndarray, " m"]] | None = None,
+    history: bool = False,
+) -> Scored:
+    """Run the first and the repeated stages of a preset from a start, and repair a map that looks wrong.
+
+    If the initial map exchanges symmetric limbs, refinement does not correct this error, because both limbs
+    have the same shape. If the preset has repair, the outcome is checked for orientation reversal and
+    discontinuities (`jaxsmw.matching.scores`). If the outcome looks wrong, repair takes the following two
+    steps.
+
+    1. Alternatives: `jaxsmw.matching.search.alternatives` refines many initial maps on a thousand samples.
+      The
+       best of these maps, at most `finalists`, are then refined by the repeated stages. The outcome with the
+       best score is kept, which can also be the outcome of the original initial map. If the kept outcome
+       looks right, repair ends.
+    2. Rounds: each round runs the repeated stages again. Each round repairs one kind of fault of the previous
+       map, orientation reversal or discontinuities. The first functional map of the round is computed without
+       the vertices that have this fault. If a map has both kinds of fault, the first round repairs the
+       orientation reversal, and further rounds alternate between the two kinds. If the second-best outcome of
+       step 1 has faults, this outcome is repaired as well. The outcome with the best score is used.
+
+    If the map of two near-isometric full shapes still looks wrong, both steps run a second time. The
+    alternatives are then refined with crease eigenvectors as well (Table R45). The better outcome is kept.
+
+    Some wrong maps look right. For two full shapes with the initial map `"shot"`, alternatives are therefore
+    computed if the distortion of the outcome is at least `compared`. Only alternatives that differ from the
+    map, and precede all similar maps in the order of their scores, are then refined at all vertices.
+
+    Maps between non-isometric shapes need further passes; see `refine_further`.
+
+    **Arguments:**
+
+    - `prepared`: the prepared pair.
+    - `start`: the initial map.
+    - `preset`: the stages and the repair. Without repair, the outcome is judged but not repaired.
+    - `outcome`: the outcome of the stages if they have already run, such as a result of `run` in batches.
+    - `alternatives`: alternative maps (m,), the best first, as an iterable that is consumed only if needed.
+      By default, the maps come from `jaxsmw.matching.search.alternatives` if the initial map is `"shot"`. For
+      other initial maps, there are no alternatives by default.
+    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
+
+    **Raises:** `InputError` if alternative maps cannot be computed.
+    """
+    judge, repair = _judge(prepared, preset.judged, preset), preset.repair
+    if outcome is None:
+        (outcome,) = run(preset.judged, [start], history=history)
+    best = judge.judged(outcome)
+    if repair is None or not best.successful:
+        return best
+    repeater = _Repeater(prepared.spectra, preset.repeated, judge, history)
+    computes_alternatives = alternatives is None and start.origin == "shot" and repair.finalists > 0
+    compares = computes_alternatives and not prepared.pair.partial
+    if best.suspicious:
+        logger.info(
+            "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
+            "%.0f %% of the area)",
+            best.distortion,
+            repair.suspicious,
+            100 * repair.suspicious_area,
+        )
+    elif compares and best.distortion >= repair.compared:
+        logger.info("the map is compared with alternative maps (distortion %.3f)", best.distortion)
+    else:
+        return best
+    if not computes_alternatives:
+        return repeater.repaired([best], alternatives or ())
+    proxies = Alternatives(prepared, repair)
+    judge = replace(judge, measure_deformation=proxies.deformation)
+    repeater, usual = replace(repeater, judge=judge), best.pointwise_map
+    found = proxies.best(usual, only_better=not best.suspicious)
+    best = repeater.repaired([judge.measured(best.outcome, suspicious=best.suspicious)], found)
+    tries_again = best.suspicious and proxies.has_creases and not prepared.pair.partial
+    # Between shapes that differ more, crease eigenvectors make some maps worse. (Table R45)
+    if tries_again and judge.area_change(best) < repair.non_isometric:
+        logger.info("further alternative maps are computed with crease eigenvectors ...")
+        if maps := list(proxies.best(usual, creased=True)):
+            best = min(best, repeater.repaired([], maps), key=judge.score)
+    return replace(best, rivals=proxies.different(best, best.rivals))
+
+
+def refine_further(
+    prepared: PreparedPair, origin: str, preset: Preset, scored: Scored, *, history: bool = False
+) -> Scored:
+    """Refine the map between non-isometric shapes further, because such maps converge slowly.
+
+    In each pass, the repeated stages run again. `RepairSettings` explains how many passes run, which passes
+    are coarse, and which passes use crease eigenvectors. The passes also run from the `rivals` of the map. A
+    rival replaces the map if its score after the passes is better. If the map is suspicious, the score must
+    be better by more than `rival_margin`.
+
+    **Arguments:**
+
+    - `prepared`: the prepared pair.
+    - `origin`: the origin of the initial map; see `Start`.
+    - `preset`: the stages and the repair. Without repair, no pass runs.
+    - `scored`: a result of `refine_and_repair`.
+    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
+
+    **Returns:** The map after the last pass. The attribute `suspicious` is copied from the given map. The
+    given map is returned if no pass runs, if a pass fails, or if the passes make the score (without the
+    deformation) worse by more than `pass_tolerance`.
+    """
+    repair = preset.repair
+    if repair is None or not scored.successful:
+        return scored
+    judge = _judge(prepared, preset.judged, preset)
+    change = judge.area_change(scored)
+    # Rigidly aligned full shapes differ in form, not in pose. Coarse passes lower the errors of such pairs
+    # even if the area-based shape difference is small. (Entry R24)
+    aligned = origin == "aligned" and not prepared.pair.partial
+    if change < repair.non_isometric and not aligned:
+        return scored
+    repeater = _Repeater(prepared.spectra, preset.repeated, judge, history)
+    if change >= repair.without_creases_from:
+        repeater = replace(repeater, spectra=_without_creases(repeater.spectra))
+    passes = [repeater] * repair.passes
+    if change >= repair.coarse_from or aligned:
+        passes = [*map(repeater.coarse, repair.coarse_levels), repeater]
+    if not passes:
+        return scored
+
+    def passed(before: Scored) -> Scored:
+        outcome = before.outcome
+        for one in passes:
+            if outcome.successful:
+                outcome = one.repeated(outcome)
+        return judge.measured(outcome)
+
+    after = passed(scored)
+    # After the passes, scores distinguish right maps from wrong maps better than before. (Entry R36)
+    best_rival = min(map(passed, scored.rivals), key=judge.score, default=after)
+    if judge.score(best_rival) < judge.score(after) - repair.rival_margin * scored.suspicious:
+        logger.info("another map has a better score after further passes")
+        after = best_rival
+    # Coarse passes worsen some maps of shapes with topological noise.
+    if not judge.score(after) <= judge.score(replace(scored, deformation=0.0)) + repair.pass_tolerance:
+        return scored
+    # Passes also lower the distortion of wrong maps. Therefore a low distortion after the passes does not
+    # show that a map is right. (Entry R36)
+    return replace(after, suspicious=scored.suspicious)
+
+
+def finish(
+    prepared: PreparedPair, origin: str, preset: Preset, scored: Scored, *, history: bool = False
+) -> Scored:
+    """Refine a map further, and run the final stages of the preset; see `refine_further`.
+
+    **Returns:** The map after the last stage, with its distortion. The attribute `suspicious` is copied from
+    the given map.
+    """
+    scored = refine_further(prepared, origin, preset, scored, history=history)
+    if not (preset.final and scored.successful):
+        return scored
+    start = Start(prepared.spectra, scored.pointwise_map)
+    (after,) = run(preset.final, [start], history=history)
+    outcome = scored.outcome.followed_by(after)
+    return _judge(prepared, preset.final, preset).measured(outcome, suspicious=scored.suspicious)
+
+
+def _judge(prepared: PreparedPair, stages: Sequence[Stage], preset: Preset) -> Judge:
+    """Return a judge that sees the spectra of the stage with the most eigenvectors."""
+    seen = (prepared.spectra.seen_by(stage) for stage in stages)
+    finest = max(seen, key=lambda spectra: spectra.x.eigenvalues.shape[0])
+    return Judge(prepared.pair, finest, preset.repair or WITHOUT_REPAIR)
+
+
+def _without_creases(spectra: SpectralPair) -> SpectralPair:
+    """Return the spectra with crease eigenvectors of zero, which need no further program."""
+
+    def zeroed(spectrum: Spectrum) -> Spectrum:
+        creases = spectrum.crease_eigenvectors
+        return spectrum.with_crease_eigenvectors(None if creases is None else jnp.zeros_like(creases))
+
+    return replace(spectra, x=zeroed(spectra.x), y=zeroed(spectra.y))
+
+
+@dataclass(frozen=True, eq=False)
+class _Repeater:
+    """Runs the repeated stages again from the maps of outcomes, and judges the results."""
+
+    spectra: SpectralPair
+    stages: tuple[Stage, ...]
+    judge: Judge
+    history: bool
+
+    def coarse(self, levels: tuple[int, ...]) -> _Repeater:
+        """Return a repeater whose last stage has the given levels."""
+        *before, last = self.stages
+        return replace(self, stages=(*before, last.coarsened(levels)))
+
+    def repeated(self, outcome: Outcome, excluded: Bool[np.ndarray, " m"] | None = None) -> Outcome:
+        """Run the repeated stages from the map of an outcome, without a mask of vertices of X (m,)."""
+        start = Start(self.spectra, outcome.pointwise_map, excluded=excluded)
+        (again,) = run(self.stages, [start], history=self.history)
+        first = max(0, len(outcome.refinements) - len(self.stages))
+        return Outcome(outcome.initial_map, outcome.refinements[:first]).followed_by(again)
+
+    def repaired(self, known: Sequence[Scored], alternatives: Iterable[Int64[np.ndarray, " m"]]) -> Scored:
+        """Return the best of judged maps and alternative maps, repaired by rounds if it looks wrong."""
+        settings, maps = self.judge.settings, [*known]
+        for number, alternative in enumerate(islice(alternatives, settings.finalists), 1):
+            logger.info("alternative map %d ...", number)
+            maps.append(self.judge.judged(self.repeated(Outcome(alternative))))
+        best, *others = sorted(maps, key=self.judge.score)
+        if not self.judge.looks_right(best):
+            # The second-best map is repaired as well, because a right map with faults can have a worse score
+            # than a wrong map without faults.
+            best, *others = sorted(map(self._without_faults, (best, *others[:1])), key=self.judge.score)
+        wrong = not self.judge.looks_right(best)
+        limit = self.judge.score(best) + settings.rival_margin
+        close = (one for one in others if self.judge.score(one) <= limit)
+        rivals = tuple(one for one in close if wrong or self.judge.looks_right(one))
+        left = "; limbs may still be swapped" if wrong else ""
+        logger.info("the best of %d maps has distortion %.2f%s", len(maps), best.distortion, left)
+        return replace(best, suspicious=wrong, rivals=rivals)
+
+    def _without_faults(self, scored: Scored) -> Scored:
+        """Run rounds, each without the vertices of one kind of fault, and return the best map."""
+        best = last = scored
+        for done in range(self.judge.settings.rounds):
+            if not (last.successful and best.suspicious):
+                break
+            if not (faults := self.judge.faults(last.pointwise_map)):
+                break
+            last = self.judge.judged(self.repeated(last.outcome, faults[done % len(faults)]))
+            best = min(best, last, key=self.judge.score)
+        return best
