@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
@@ -50,12 +50,17 @@ class Skin(NamedTuple):
     weights: np.ndarray
 
 
+Corners: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Texture coordinates (t, 2), and the texture vertex of each corner of each polygon."""
+
+
 class Polygons(NamedTuple):
     """The polygons of a file, and the data on them.
 
     `corners` lists the corners of all faces, one face after another. `sizes` contains the number of corners
     of each face. `face_data` has one row per polygon. `texture` consists of texture coordinates (t, 2) and
     the texture vertex of each entry of `corners`. `weld` is True if the format duplicates vertices at seams.
+    `lines` is the number of lines besides the faces. `strips` marks the faces that are triangle strips.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -69,6 +74,12 @@ class Polygons(NamedTuple):
     skin: Skin | None = None
     label_names: Mapping[str, tuple[str, ...]] = NOTHING
     weld: bool = False
+    lines: int = 0
+    strips: Bool[np.ndarray, " f"] | None = None
+
+    @property
+    def is_strip(self) -> Bool[np.ndarray, " f"]:
+        return np.zeros(len(self.sizes), bool) if self.strips is None else self.strips
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +249,44 @@ def _indices(
     if not _within(array, count, first):
         raise fail(f"{what} use a number outside the {count} {whole}: correct the indices.")
     return array.astype(np.int64)
+
+
+def triangles_of(
+    sizes: Int64[np.ndarray, " f"], is_strip: Bool[np.ndarray, " f"]
+) -> tuple[Int64[np.ndarray, "t 3"], Int64[np.ndarray, " t"]]:
+    """Split polygons and triangle strips into triangles.
+
+    The triangles of a polygon (c0, c1, …) are (c0, ci, ci+1), and a polygon of two corners has none. The
+    triangles of a strip are (ci, ci+1, ci+2), and every second of them is reversed.
+
+    Return the corners of each triangle (t, 3), as indices into the list of all corners, and the face from
+    which each triangle comes (t,).
+    """
+    if (sizes < 2).any():
+        at = int((sizes < 2).argmax())
+        raise InputError(
+            f"face {at} has {count_of(int(sizes[at]), 'corner')}, but needs at least three: remove the face."
+        )
+    if (sizes[is_strip] < 3).any():
+        raise InputError(
+            "a triangle strip has fewer than three corners, so the file is damaged: export the mesh again."
+        )
+    per_face = sizes - 2
+    face = np.repeat(np.arange(len(sizes)), per_face)
+    start = (np.cumsum(sizes) - sizes)[face]
+    step = np.arange(len(face)) - (np.cumsum(per_face) - per_face)[face]
+    reversed_ = is_strip[face] & (step % 2 == 1)
+    first = np.where(is_strip[face], step, 0)
+    corners = first + reversed_, np.where(reversed_, step, step + 1), step + 2
+    return start[:, None] + np.stack(corners, axis=1), face
+
+
+def texture_or_note(parse: Callable[[], Corners | None]) -> tuple[Corners | None, tuple[str, ...]]:
+    """Parse a texture. Matching does not need a texture, so a note replaces a texture that cannot be read."""
+    try:
+        return parse(), ()
+    except InputError as error:
+        return None, (f"The texture was left out: {error}",)
 
 
 class Written(NamedTuple):
