@@ -196,11 +196,7 @@ HOSTILE = {
     "wide words.npz": (npz_with_header((1, 3), f"<U{2**28}"), "not a .npz file"),
     "negative rows.npz": (npz_with_header((-1, -3)), "not a .npz file"),
     "bomb.npz": (npz_with_header((10**6, 3)), "not a .npz file"),
-    "half a texture.npz": (npz(**NPZ, texture_corners=F), "half of a texture"),
     "half a skin.npz": (npz(**NPZ, skin_joints=np.array(["a"])), "half of a texture or of a skin"),
-    "texture of other faces.npz": (npz(**NPZ, texture_coordinates=V[:, :2], texture_corners=F.T), "texture's corners have the shape (3, 1)"),
-    "texture out of range.npz": (npz(**NPZ, texture_coordinates=V[:, :2], texture_corners=F + 1), "outside the 3 texture vertices"),
-    "texture of a number.npz": (npz(**NPZ, texture_coordinates=np.array(1.0), texture_corners=F), "the texture is float64"),
     "short data.npz": (npz(**NPZ, **{"vertex_data/a": np.ones(2)}), "'a' have 2 rows, but need 3"),
     "single number.npz": (npz(**NPZ, **{"face_data/a": np.array(1.0)}), "shape ()"),
     "short shape.npz": (npz(**NPZ, **{"blend_shapes/a": np.ones((2, 3))}), "the blend shape 'a'"),
@@ -208,10 +204,6 @@ HOSTILE = {
     "labels.npz": (npz(**NPZ, **{"face_data/a": np.array([1]), "label_names/a": np.array(["x"])}), "the array of labels 'a'"),
     "texture without faces.obj": (OBJ, "no faces"),
     "texture.mat": (mat(texture=3.0), None),
-    "texture without corners.mat": (mat(texture={"coordinates": V[:, :2]}), "no arrays of real numbers"),
-    "texture too short.mat": (mat(texture={"coordinates": V[:, :2], "corners": F + 1.0}), "one texture vertex for each corner"),
-    "texture out of range.mat": (mat(texture={"coordinates": V[:, :2], "corners": np.full((2, 3), 4.0)}), "one texture vertex for each corner"),
-    "texture of nan.mat": (mat(texture={"coordinates": V[:, :2], "corners": np.full((2, 3), np.nan)}), "no arrays of real numbers"),
     "short data.mat": (mat(vertex_data={"a": np.ones((2, 1))}), "'a' have 2 rows, but need 3"),
     "words as data.mat": (mat(vertex_data={"a": "xyz"}), "the vertex data 'a'"),
     "skin without weights.mat": (mat(skin={"joints": "a"}), "the skin"),
@@ -220,7 +212,15 @@ HOSTILE = {
 
 # Matching does not need a texture: name: (content, what the note about the texture must name).
 WITHOUT_TEXTURE = {
-    "texture of nan.vtk": (VTK + "POINT_DATA 3\nTEXTURE_COORDINATES t 2 float\nnan 0 0 0 0 0\n", "not a finite number"),
+    "half a texture.npz": (npz(**NPZ, texture_corners=F), "half of a texture"),
+    "texture of other faces.npz": (npz(**NPZ, texture_coordinates=V[:, :2], texture_corners=F.T), "texture's corners have the shape (3, 1)"),
+    "texture out of range.npz": (npz(**NPZ, texture_coordinates=V[:, :2], texture_corners=F + 1), "outside the 3 texture vertices"),
+    "texture of a number.npz": (npz(**NPZ, texture_coordinates=np.array(1.0), texture_corners=F), "the texture is float64"),
+    "texture without corners.mat": (mat(texture={"coordinates": V[:, :2]}), "no arrays of real numbers"),
+    "texture too short.mat": (mat(texture={"coordinates": V[:, :2], "corners": F + 1.0}), "one texture vertex for each corner"),
+    "texture out of range.mat": (mat(texture={"coordinates": V[:, :2], "corners": np.full((2, 3), 4.0)}), "one texture vertex for each corner"),
+    "texture of nan.mat": (mat(texture={"coordinates": V[:, :2], "corners": np.full((2, 3), np.nan)}), "no arrays of real numbers"),
+    "texture of nan.vtk": (VTK + "POINT_DATA 3\nTEXTURE_COORDINATES t 2 float\nnan 0 0 0 0 0\n", "a number that is not finite"),
     "texture without vt.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3\n", "uses texture vertex 1, but the file has 0 vt lines"),
     "texture out of range.obj": (OBJ + "f 1/1 2/2 3/3\n", "uses texture vertex 3, but the file has 2 vt lines"),
     "texture zero.obj": (OBJ + "f 1/1 2/2 3/0\n", "uses texture vertex 0"),
@@ -228,7 +228,7 @@ WITHOUT_TEXTURE = {
     "texture of a word.obj": (OBJ + "f 1/1 2/2 3/c\n", "'c' is written where a texture vertex"),
     "texture of 2^60.obj": (OBJ + f"f 1/1 2/2 3/{2**59}\n", "is written where a texture vertex"),
     "word in vt.obj": (OBJ + "vt x y\nf 1/1 2/2 3/3\n", "'x y' is written where 2 numbers"),
-    "nan in vt.obj": (OBJ + "vt nan 0\nf 1/1 2/2 3/3\n", "not a finite number"),
+    "nan in vt.obj": (OBJ + "vt nan 0\nf 1/1 2/2 3/3\n", "a number that is not finite"),
     "texture too short.ply": (PLY + PLY_FACE + "property list uchar float texcoord\n" + PLY_BODY + "3 0 1 2 4 0 0 1 1\n", "two texture coordinates for each corner"),
 }  # fmt: skip
 
@@ -237,7 +237,7 @@ WITHOUT_TEXTURE = {
 def test_textures_that_cannot_be_read_are_left_out(tmp_path, name):
     content, fault = WITHOUT_TEXTURE[name]
     data = read_mesh_data(write(tmp_path / name, content))
-    assert data.faces.tolist() == [[0, 1, 2]] and data.texture is None
+    assert data.mesh.faces.tolist() == [[0, 1, 2]] and data.texture is None
     (note,) = (note for note in data.mesh.notes if "texture" in note)
     assert fault in note and note.endswith(".")
 

@@ -2,10 +2,17 @@
 
 Vertices must keep their order, and a damaged file must cause one clear error message. Therefore this library
 has its own parsers, one per module of `jaxsmw.io.formats`. The reader of libigl accepts indices out of range
-and aborts the process on some invalid headers. The reader of VTK 9.7 ends the process with a segmentation
-fault if a polygon declares too many corners. It also accepts files whose counts are wrong. The reader of
-trimesh splits and drops vertices of OBJ files. It also cannot read binary PLY files whose polygons have
-different numbers of corners. pygltflib parses only the JSON part of glTF files, and has no checks.
+and aborts the process on some invalid headers. The reader of trimesh splits and drops vertices of OBJ files.
+It also cannot read binary PLY files whose polygons have different numbers of corners. pygltflib parses only
+the JSON part of glTF files, and has no checks.
+
+The other libraries were tried on the files of `tests/corpus`, with one to three damages of
+`tests/test_fuzzing.py` each. On 1000 damaged VTK legacy files, the reader of VTK 9.7.2 ended the process with a
+segmentation fault 15 times, and returned cells with indices or offsets out of range 162 times. On 1000
+damaged VTK XML files, it aborted the process twice, hung once, and returned such cells 11 times. cvista-io
+has the same readers. On 1000 damaged PCD files, pypcd4 1.5.1 hung twice, and silently returned too few points
+25 times. It needs python-lzf, which has no wheels. On 2000 damaged MATLAB files of version 7.3, pymatreader
+and h5py only raised exceptions, so these read such files.
 """
 
 from __future__ import annotations
@@ -30,6 +37,7 @@ from jaxsmw.io.formats.data import (
     Skin,
     Texture,
     Written,
+    checked_texture,
     texture_or_note,
     triangles_of,
 )
@@ -192,9 +200,7 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
 
 
 def _texture(texture: Corners | None, at: Int64[np.ndarray, "t 3"]) -> Corners | None:
-    if texture is not None and not np.isfinite(texture[0]).all():
-        raise InputError("a texture coordinate is not a finite number: export the mesh again.")
-    return None if texture is None else (texture[0], texture[1][at])
+    return None if texture is None else checked_texture((texture[0], texture[1][at]), len(at), InputError)
 
 
 def _check_readable(path: Path, data: bytes) -> None:

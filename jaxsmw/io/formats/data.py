@@ -132,10 +132,10 @@ class MeshData:
             "vertex_data": self._rows(self.vertex_data, "vertex data", n, "vertex"),
             "face_data": self._rows(self.face_data, "face data", f, "face"),
             "blend_shapes": {
-                name: self._real(values, f"the blend shape {name!a}", (n, 3))
+                name: _real(values, f"the blend shape {name!a}", (n, 3), self._fail)
                 for name, values in self.blend_shapes.items()
             },
-            "texture": self._checked_texture(f),
+            "texture": None if self.texture is None else checked_texture(self.texture, f, self._fail),
             "skin": self._checked_skin(n),
             "label_names": {name: tuple(map(str, names)) for name, names in self.label_names.items()},
         }
@@ -175,40 +175,13 @@ class MeshData:
             checked[name] = _canonical(array[:, 0] if array.shape[1:] == (1,) else array)
         return checked
 
-    def _real(self, values: Any, what: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "*shape"]:
-        array = np.asarray(values)
-        if array.shape != shape or array.dtype.kind not in "biuf":
-            raise self._fail(
-                f"{what} is {array.dtype.name} of shape {array.shape}, but needs numbers of shape {shape}: "
-                "give an array of this shape."
-            )
-        array = array.astype(np.float64)
-        if not np.isfinite(array).all():
-            raise self._fail(f"{what} contains a number that is not finite: repair the numbers.")
-        return array
-
-    def _checked_texture(self, f: int) -> Texture | None:
-        if self.texture is None:
-            return None
-        coordinates, corners = self.texture
-        coordinates = self._real(coordinates, "the texture", (*np.shape(coordinates)[:1], 2))
-        corners = _indices(
-            corners, len(coordinates), "the texture's corners", "texture vertices", self._fail, -1
-        )
-        if len(corners) != f:
-            raise self._fail(
-                f"the texture has {count_of(len(corners), 'row')} of corners, but the mesh has "
-                f"{count_of(f, 'face')}: give one row for each face."
-            )
-        return Texture(coordinates, corners)
-
     def _checked_skin(self, n: int) -> Skin | None:
         if self.skin is None:
             return None
         joints, weights = self.skin
         if len(set(joints)) != len(joints) or not joints:
             raise self._fail("the names of the joints are not distinct: give each joint its own name.")
-        return Skin(tuple(map(str, joints)), self._real(weights, "the skin", (n, len(joints))))
+        return Skin(tuple(map(str, joints)), _real(weights, "the skin", (n, len(joints)), self._fail))
 
     def _check_labels(self) -> None:
         for name, names in self.label_names.items():
@@ -221,6 +194,33 @@ class MeshData:
                     f"the array of labels {name!a} must contain integers from 0 to {len(names) - 1}, one for "
                     "each label name: correct the array or the names."
                 )
+
+
+def checked_texture(texture: Corners, f: int, fail: Callable[[str], InputError]) -> Texture:
+    """Check the texture of f triangles."""
+    coordinates = _real(texture[0], "the texture", (*np.shape(texture[0])[:1], 2), fail)
+    corners = _indices(texture[1], len(coordinates), "the texture's corners", "texture vertices", fail, -1)
+    if len(corners) != f:
+        raise fail(
+            f"the texture has {count_of(len(corners), 'row')} of corners, but the mesh has "
+            f"{count_of(f, 'face')}: give one row for each face."
+        )
+    return Texture(coordinates, corners)
+
+
+def _real(
+    values: Any, what: str, shape: tuple[int, ...], fail: Callable[[str], InputError]
+) -> Float64[np.ndarray, "*shape"]:
+    array = np.asarray(values)
+    if array.shape != shape or array.dtype.kind not in "biuf":
+        raise fail(
+            f"{what} is {array.dtype.name} of shape {array.shape}, but needs numbers of shape {shape}: "
+            "give an array of this shape."
+        )
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        raise fail(f"{what} contains a number that is not finite: repair the numbers.")
+    return array
 
 
 def _within(array: np.ndarray, count: int, first: int = 0) -> bool:
