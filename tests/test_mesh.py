@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Diagnosis, Mesh, diagnose, make_mesh
+from jaxsmw.geometry.mesh import Diagnosis, Mesh, coincident_vertices, diagnose, make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
 
 OCTAHEDRON = make_mesh(
@@ -95,8 +95,8 @@ BAD_ARRAYS = {
     "words": ([["a", "b", "c"]] * 4, SQUARE_FACES, "vertices must be"),
     "complex": (np.array(SQUARE) * 1j, SQUARE_FACES, "vertices must be"),
     "a single number": (np.array(3.0), SQUARE_FACES, "vertices must be"),
-    "nan": ([*SQUARE, [np.nan, 0, 0]], SQUARE_FACES, "1 vertex, the first of them number 4"),
-    "inf": ([*SQUARE, [0, np.inf, 0]], SQUARE_FACES, "finite"),
+    "nan": ([*SQUARE[:3], [np.nan, 0, 0]], SQUARE_FACES, "1 vertex, the first of them number 3"),
+    "inf": ([*SQUARE[:3], [0, np.inf, 0]], SQUARE_FACES, "finite"),
     "beyond float64": (np.array(SQUARE, np.longdouble) * np.longdouble("1e4000"), SQUARE_FACES, "finite"),
     "quads": (SQUARE, [[0, 1, 2, 3]], "faces must be"),
     "boolean faces": (SQUARE, np.ones((2, 3), bool), "faces must be"),
@@ -186,9 +186,32 @@ def test_welding_closes_a_seam_without_renumbering():
     assert not any("--weld" in note for note in welded.notes)
 
 
-def test_welding_joins_only_equal_positions_and_both_zeros_are_equal():
-    vertices = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-0.0, 0, 0], [1 + 1e-15, 0, 0], [0, -1, 0]]
-    assert make_mesh(vertices, [[0, 1, 2], [3, 5, 4]], weld=True).faces.tolist() == [[0, 1, 2], [0, 5, 4]]
+@pytest.mark.parametrize(("gap", "joined"), [(1e-15, True), (1e-3, True), (-1e-3, True), (0.02, False)])
+def test_welding_joins_positions_that_differ_by_rounding_and_both_zeros_are_equal(gap, joined):
+    """Rounding splits a vertex if the gap is at most a hundredth of the shortest edge."""
+    vertices = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-0.0, 0, 0], [1 + gap, 0, 0], [0, -1, 0]]
+    faces = [[0, 1, 2], [3, 5, 4]]
+    welded = make_mesh(vertices, faces, weld=True)
+    assert welded.faces.tolist() == [[0, 1, 2], [0, 5, 1 if joined else 4]]
+    assert welded.vertices.tolist() == vertices
+    reported = sum("4 boundary vertices" in note for note in make_mesh(vertices, faces).notes)
+    assert reported == joined and not any("--weld" in note for note in welded.notes)
+
+
+def test_rounding_never_closes_a_short_edge():
+    """A small triangle lies at the corner of a large one, whose edges are 500 times longer."""
+    vertices = [[0, 0, 0], [100, 0, 0], [0, 100, 0], [0.2, 0, 0], [0.4, 0, 0], [0.2, -0.2, 0]]
+    assert coincident_vertices(np.array(vertices), np.array([[0, 1, 2], [3, 5, 4]])).tolist() == [*range(6)]
+
+
+@pytest.mark.parametrize("stray", [np.nan, np.inf, -np.inf])
+def test_vertices_without_faces_need_no_position(stray):
+    mesh = make_mesh([*SQUARE, *[[stray, 0, 0]] * 9], SQUARE_FACES)
+    assert mesh.faces.tolist() == SQUARE_FACES and mesh.vertices[:4].tolist() == SQUARE
+    assert np.isfinite(mesh.vertices).all() and len(mesh.vertices) == 13
+    assert (
+        "9 vertices" in mesh.notes[0] and "number 4" in mesh.notes[0] and "0 faces dropped" in mesh.notes[0]
+    )
 
 
 def test_no_seam_is_reported_away_from_boundaries():
@@ -578,6 +601,61 @@ PLY_HEAD = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty 
 PLY_FACE = "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
 PLY_BINARY = ply("binary_little_endian", [("vertex", XYZ, TRIANGLE[0]), ("face", CORNERS, [[[0, 1, 2]]])])
 
+PLY_STRIPS = "element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
+
+# Flaws that matching does not need to refuse: name: (content, faces, what a note must name).
+FORGIVEN = {
+    "face of two.off": (f"OFF\n3 2 0\n{T}3 0 1 2\n2 0 1\n", [[0, 1, 2]], "1 face with 2 corners"),
+    "face of two first.obj": (V + "f 1 2\nf 1/1 2/2 3/3\nf 2 3\n", [[0, 1, 2]], "2 faces with 2 corners"),
+    "line and face.obj": (V + "l 1 2\nf 1 2 3\n", [[0, 1, 2]], ""),
+    "texture without vt.obj": (V + "f 1/1 2/2 3/3\n", [[0, 1, 2]], "texture vertex 1, but the file has 0 vt lines"),
+    "unreferenced nan.obj": (V + "v nan nan nan\nf 1 2 3\n", [[0, 1, 2]], "number 3"),
+    "unreferenced inf.off": (f"OFF\n4 1 0\n{T}1e999 0 0\n3 0 1 2\n", [[0, 1, 2]], "number 3"),
+    "face of two.ply": (
+        PLY_HEAD + PLY_FACE.replace("face 1", "face 2") + T + "2 0 1\n3 0 1 2\n", [[0, 1, 2]], "1 face with 2 corners"
+    ),
+    "padded.ply": (PLY_BINARY + bytes(64), [[0, 1, 2]], ""),
+    "strips.ply": (
+        PLY_HEAD.replace("vertex 3", "vertex 5") + PLY_STRIPS.replace("tristrips 1", "tristrips 2") + T
+        + "1 1 0\n2 2 2\n6 0 1 2 3 -1 4\n7 -1 2 1 4 -1 0 1\n",
+        [[0, 1, 2], [2, 1, 3], [2, 1, 4]], "",
+    ),
+    "faces and strips.ply": (
+        PLY_HEAD + PLY_FACE.replace("end_header", "property int part\n" + PLY_STRIPS[:-1]) + T.replace("0 1 0", "0 1 5")
+        + "3 0 1 2 7\n3 1 0 2\n", [[0, 1, 2]], "'part'",
+    ),
+    "without end.stl": (text_stl(TRIANGLE).replace("endsolid", ""), [[0, 1, 2]], "endsolid"),
+    "bytes behind.stl": (binary_stl(TRIANGLE) + bytes(64), [[0, 1, 2]], "64 bytes"),
+    "one byte behind, says solid.stl": (binary_stl(TRIANGLE, header=b"solid") + b"x", [[0, 1, 2]], "1 byte "),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FORGIVEN)
+def test_harmless_flaws_are_read_with_a_note(saved, name):
+    content, faces, named = FORGIVEN[name]
+    mesh = read_mesh(saved(name, content))
+    assert mesh.faces.tolist() == faces
+    assert not named or any(named in note for note in mesh.notes)
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_stl_corners_that_differ_by_rounding_become_one_vertex(saved, form):
+    mesh = bumpy_grid(12)
+    corners = mesh.vertices[mesh.faces] + np.random.default_rng(0).normal(
+        scale=1e-5, size=(len(mesh.faces), 3, 3)
+    )
+    content = binary_stl(corners) if form == "binary" else text_stl(corners)
+    again = read_mesh(saved("s.stl", content))
+    assert len(again.vertices) == len(mesh.vertices) and diagnose(again).boundary_edges == len(
+        mesh.boundary_edges
+    )
+    assert np.abs(again.vertices[again.faces] - mesh.vertices[mesh.faces]).max() < 1e-4
+    assert any(
+        "rounding" in note and str(mesh.faces.size - len(mesh.vertices)) in note for note in again.notes
+    )
+    assert not any("--weld" in note for note in again.notes)
+
+
 HOSTILE = {
     # name: (content, what the message must say)
     "empty.off": ("", "is empty"),
@@ -639,7 +717,8 @@ HOSTILE = {
     "index of 500 digits.off": (f"OFF\n3 1 0\n{T}3 0 1 {'9' * 500}\n", "uses vertex inf"),
     "index fractional.off": (f"OFF\n3 1 0\n{T}3 0 1 1.5\n", "whole number"),
     "index nan.off": (f"OFF\n3 1 0\n{T}3 0 1 nan\n", "uses vertex nan"),
-    "face of two.off": (f"OFF\n3 2 0\n{T}3 0 1 2\n2 0 1\n", "face 1 has 2 corners"),
+    "only a face of two.off": (f"OFF\n3 1 0\n{T}2 0 1\n", "1 line (edges or faces with 2 corners)"),
+    "face of one.off": (f"OFF\n3 2 0\n{T}3 0 1 2\n1 0\n", "face 1 has 1 corner,"),
     "face of none.off": (f"OFF\n3 1 0\n{T}0\n", "face 0 has 0 corners"),
     "face of minus one.off": (f"OFF\n3 1 0\n{T}-1 0 1 2\n", "'-1 0 1 2'"),
     "face of nan.off": (f"OFF\n3 1 0\n{T}nan 0 1 2\n", "'nan 0 1 2'"),
@@ -656,6 +735,8 @@ HOSTILE = {
     "word.obj": ("v 0 0 x\n" + V + "f 1 2 3\n", "'0 0 x'"),
     "nan.obj": ("v 0 0 nan\n" + V + "f 1 2 3\n", "finite"),
     "edge as face.obj": (V + "f 1 2\n", "2 corners"),
+    "lines.obj": (V + "l 1 2 3\nl 3 1\n", "2 lines"),
+    "free-form surface.obj": (V + "cstype bezier\nsurf 0 1 0 1 1 2 3\nend\n", "free-form surfaces"),
     "zero.obj": (V + "f 0 1 2\n", "count from 1"),
     "too large.obj": (V + "f 1 2 4\n", "uses vertex 4, but the file has 3 v lines"),
     "too negative.obj": (V + "f -4 -2 -1\n", "uses vertex -4"),
@@ -705,6 +786,12 @@ HOSTILE = {
     "list of nan.ply": (PLY_HEAD + PLY_FACE + T + "nan 0 1 2\n", "nan numbers"),
     "list of one and a half.ply": (PLY_HEAD + PLY_FACE + T + "1.5 0 1 2\n", "1.5 numbers"),
     "list of a billion.ply": (PLY_HEAD + PLY_FACE + T + "1000000000 0 1 2\n", "1000000000 numbers"),
+    "edges.ply": (
+        PLY_HEAD + "element edge 2\nproperty int vertex1\nproperty int vertex2\nend_header\n" + T + "0 1\n1 2\n",
+        "2 lines",
+    ),
+    "strip with a missing vertex.ply": (PLY_HEAD + PLY_STRIPS + T + "4 0 1 2 3\n", "uses vertex 3"),
+    "strip with a negative vertex.ply": (PLY_HEAD + PLY_STRIPS + T + "4 0 1 2 -2\n", "uses vertex -2"),
     "face of two.ply": (PLY_HEAD + PLY_FACE + T + "2 0 1\n", "2 corners"),
     "nan.ply": (PLY_HEAD + PLY_FACE + "0 0 nan\n1 0 0\n0 1 0\n3 0 1 2\n", "finite"),
     "index too large.ply": (PLY_HEAD + PLY_FACE + T + "3 0 1 3\n", "uses vertex 3"),
@@ -741,7 +828,9 @@ HOSTILE = {
     "nan.stl": (binary_stl(TRIANGLE * np.nan), "finite"),
     "in one point.stl": (binary_stl(TRIANGLE * 0), "no triangle has an area"),
     "truncated text.stl": (text_stl(TRIANGLE)[:90], "truncated"),
-    "without end.stl": (text_stl(TRIANGLE).replace("endsolid", ""), "truncated"),
+    "truncated after three corners.stl": (text_stl(TRIANGLE).partition("endloop")[0], "truncated"),
+    "bytes as many as a facet.stl": (binary_stl(TRIANGLE) + bytes(50), "declares 1 triangles"),
+    "bytes behind nothing.stl": (binary_stl(TRIANGLE[:0]) + bytes(64), "declares 0 triangles"),
     "four corners.stl": (text_stl(TRIANGLE).replace("outer loop", "outer loop vertex 1 1 1"), "4 corners"),
     "underscore.stl": (text_stl(TRIANGLE).replace("vertex 1", "vertex 1_0"), "'1_0 0 0'"),
     "word.stl": (text_stl(TRIANGLE).replace("vertex 1", "vertex one"), "'one 0 0'"),

@@ -108,6 +108,8 @@ HOSTILE = {
     "polygon of minus one.vtk": (VTK.replace("3 0 1 2\n", "-1 0 1 2\n"), "which contain other cells"),
     "polygon of two.vtk": (VTK.replace("1 4\n3 0 1 2", "1 3\n2 0 1"), "2 corners"),
     "polygon of two billion.vtk": (binary_vtk(sizes=struct.pack(">4i", 2**31 - 1, 0, 1, 2)), "which contain other"),
+    "lines.vtk": (HEAD + POINTS + "LINES 2 6\n2 0 1\n2 1 2\n", "2 lines"),
+    "lines.vtp": (vtp(corners="0 1").replace('Polys', 'Lines').replace('>3</DataArray></Lines', '>2</DataArray></Lines'), "1 line"),
     "index too large.vtk": (VTK.replace("3 0 1 2\n", "3 0 1 3\n"), "uses vertex 3"),
     "index negative.vtk": (VTK.replace("3 0 1 2\n", "3 0 1 -2\n"), "uses vertex -2"),
     "index of 2^40.vtk": (VTK.replace("3 0 1 2\n", f"3 0 1 {2**40}\n"), "among numbers of the type int32"),
@@ -137,7 +139,6 @@ HOSTILE = {
     "binary strings.vtk": (binary_vtk(more=b"FIELD f 1\na 1 2 string\n\x3f\xff\xff\xff\xff\xff\xff\xff"), "the file ends within"),
     "data for two points.vtk": (VTK + "POINT_DATA 2\nSCALARS a float\nLOOKUP_TABLE default\n1 2\n", "'a' has 2 rows, but the file has 3 points"),
     "data for two cells.vtk": (VTK + "CELL_DATA 2\nSCALARS a float\nLOOKUP_TABLE default\n1 2\n", "'a' has 2 rows, but the file has 1 cell"),
-    "texture of nan.vtk": (VTK + "POINT_DATA 3\nTEXTURE_COORDINATES t 2 float\nnan 0 0 0 0 0\n", "not finite"),
     "empty.vtp": ("", "is empty"),
     "cut.vtp": (vtp()[:-20], "not a complete XML file"),
     "entities.vtp": (ENTITIES, "not a complete XML file"),
@@ -195,36 +196,50 @@ HOSTILE = {
     "wide words.npz": (npz_with_header((1, 3), f"<U{2**28}"), "not a .npz file"),
     "negative rows.npz": (npz_with_header((-1, -3)), "not a .npz file"),
     "bomb.npz": (npz_with_header((10**6, 3)), "not a .npz file"),
-    "half a texture.npz": (npz(**NPZ, texture_corners=F), "half of a texture"),
     "half a skin.npz": (npz(**NPZ, skin_joints=np.array(["a"])), "half of a texture or of a skin"),
-    "texture of other faces.npz": (npz(**NPZ, texture_coordinates=V[:, :2], texture_corners=F.T), "texture's corners have the shape (3, 1)"),
-    "texture out of range.npz": (npz(**NPZ, texture_coordinates=V[:, :2], texture_corners=F + 1), "outside the 3 texture vertices"),
-    "texture of a number.npz": (npz(**NPZ, texture_coordinates=np.array(1.0), texture_corners=F), "the texture is float64"),
     "short data.npz": (npz(**NPZ, **{"vertex_data/a": np.ones(2)}), "'a' have 2 rows, but need 3"),
     "single number.npz": (npz(**NPZ, **{"face_data/a": np.array(1.0)}), "shape ()"),
     "short shape.npz": (npz(**NPZ, **{"blend_shapes/a": np.ones((2, 3))}), "the blend shape 'a'"),
     "short skin.npz": (npz(**NPZ, skin_joints=np.array(["a"]), skin_weights=np.ones((2, 1))), "the skin"),
     "labels.npz": (npz(**NPZ, **{"face_data/a": np.array([1]), "label_names/a": np.array(["x"])}), "the array of labels 'a'"),
+    "texture without faces.obj": (OBJ, "no faces"),
+    "texture.mat": (mat(texture=3.0), None),
+    "short data.mat": (mat(vertex_data={"a": np.ones((2, 1))}), "'a' have 2 rows, but need 3"),
+    "words as data.mat": (mat(vertex_data={"a": "xyz"}), "the vertex data 'a'"),
+    "skin without weights.mat": (mat(skin={"joints": "a"}), "the skin"),
+    "labels.mat": (mat(label_names={"a": "x"}), "the array of labels 'a'"),
+}  # fmt: skip
+
+# Matching does not need a texture: name: (content, what the note about the texture must name).
+WITHOUT_TEXTURE = {
+    "half a texture.npz": (npz(**NPZ, texture_corners=F), "half of a texture"),
+    "texture of other faces.npz": (npz(**NPZ, texture_coordinates=V[:, :2], texture_corners=F.T), "texture's corners have the shape (3, 1)"),
+    "texture out of range.npz": (npz(**NPZ, texture_coordinates=V[:, :2], texture_corners=F + 1), "outside the 3 texture vertices"),
+    "texture of a number.npz": (npz(**NPZ, texture_coordinates=np.array(1.0), texture_corners=F), "the texture is float64"),
+    "texture without corners.mat": (mat(texture={"coordinates": V[:, :2]}), "no arrays of real numbers"),
+    "texture too short.mat": (mat(texture={"coordinates": V[:, :2], "corners": F + 1.0}), "one texture vertex for each corner"),
+    "texture out of range.mat": (mat(texture={"coordinates": V[:, :2], "corners": np.full((2, 3), 4.0)}), "one texture vertex for each corner"),
+    "texture of nan.mat": (mat(texture={"coordinates": V[:, :2], "corners": np.full((2, 3), np.nan)}), "no arrays of real numbers"),
+    "texture of nan.vtk": (VTK + "POINT_DATA 3\nTEXTURE_COORDINATES t 2 float\nnan 0 0 0 0 0\n", "a number that is not finite"),
     "texture without vt.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3\n", "uses texture vertex 1, but the file has 0 vt lines"),
     "texture out of range.obj": (OBJ + "f 1/1 2/2 3/3\n", "uses texture vertex 3, but the file has 2 vt lines"),
     "texture zero.obj": (OBJ + "f 1/1 2/2 3/0\n", "uses texture vertex 0"),
     "texture too negative.obj": (OBJ + "f 1/1 2/2 3/-3\n", "uses texture vertex -3"),
     "texture of a word.obj": (OBJ + "f 1/1 2/2 3/c\n", "'c' is written where a texture vertex"),
     "texture of 2^60.obj": (OBJ + f"f 1/1 2/2 3/{2**59}\n", "is written where a texture vertex"),
-    "texture without faces.obj": (OBJ, "no faces"),
     "word in vt.obj": (OBJ + "vt x y\nf 1/1 2/2 3/3\n", "'x y' is written where 2 numbers"),
-    "nan in vt.obj": (OBJ + "vt nan 0\nf 1/1 2/2 3/3\n", "the texture contains a number that is not finite"),
+    "nan in vt.obj": (OBJ + "vt nan 0\nf 1/1 2/2 3/3\n", "a number that is not finite"),
     "texture too short.ply": (PLY + PLY_FACE + "property list uchar float texcoord\n" + PLY_BODY + "3 0 1 2 4 0 0 1 1\n", "two texture coordinates for each corner"),
-    "texture.mat": (mat(texture=3.0), None),
-    "texture without corners.mat": (mat(texture={"coordinates": V[:, :2]}), "no arrays of real numbers"),
-    "texture too short.mat": (mat(texture={"coordinates": V[:, :2], "corners": F + 1.0}), "one texture vertex for each corner"),
-    "texture out of range.mat": (mat(texture={"coordinates": V[:, :2], "corners": np.full((2, 3), 4.0)}), "one texture vertex for each corner"),
-    "texture of nan.mat": (mat(texture={"coordinates": V[:, :2], "corners": np.full((2, 3), np.nan)}), "no arrays of real numbers"),
-    "short data.mat": (mat(vertex_data={"a": np.ones((2, 1))}), "'a' have 2 rows, but need 3"),
-    "words as data.mat": (mat(vertex_data={"a": "xyz"}), "the vertex data 'a'"),
-    "skin without weights.mat": (mat(skin={"joints": "a"}), "the skin"),
-    "labels.mat": (mat(label_names={"a": "x"}), "the array of labels 'a'"),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WITHOUT_TEXTURE)
+def test_textures_that_cannot_be_read_are_left_out(tmp_path, name):
+    content, fault = WITHOUT_TEXTURE[name]
+    data = read_mesh_data(write(tmp_path / name, content))
+    assert data.mesh.faces.tolist() == [[0, 1, 2]] and data.texture is None
+    (note,) = (note for note in data.mesh.notes if "texture" in note)
+    assert fault in note and note.endswith(".")
 
 
 @pytest.fixture
@@ -281,7 +296,7 @@ def test_files_that_end_anywhere_are_refused(tmp_path, suffix):
 
 
 @pytest.mark.parametrize(
-    "name", ["polygon of a billion.vtk", "bomb.vtp", "2^59 rows.npz", "texture without vt.obj", "m.glb"]
+    "name", ["polygon of a billion.vtk", "bomb.vtp", "2^59 rows.npz", "lines.vtk", "m.glb"]
 )
 def test_the_command_line_refuses_with_code_2(run, pair, tmp_path, name):
     path = write(tmp_path / name, HOSTILE.get(name, (b"glTF" + bytes(40), ""))[0])

@@ -102,7 +102,7 @@ def add_eigenproblem(parser: argparse._ActionsContainer) -> None:
 
 def add_weld(parser: argparse.ArgumentParser) -> None:
     """Add `--weld`."""
-    parser.add_argument("--weld", action="store_true", help="merge vertices at exactly the same position")
+    parser.add_argument("--weld", action="store_true", help="merge vertices at the same position")
 
 
 def add_index_base(parser: argparse.ArgumentParser) -> None:

@@ -206,7 +206,7 @@ def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int
 
 def _note_index_base(file: str, index_base: IndexBase | None) -> None:
     """Print a note that the indices of a `.mat` file are read as 1-based, unless `--index-base` is given."""
-    from jaxsmw.io.mat_files import is_mat_file
+    from jaxsmw.io.formats.mat import is_mat_file
 
     if index_base is None and is_mat_file(file):
         say(

@@ -37,6 +37,9 @@ SMALLEST_EXTENT, LARGEST_EXTENT = 1e-60, 1e60
 # 1e-4 edge lengths. Maps are refined in float32. At `LARGEST_DISTANCE` from the middle of a mesh, float32
 # rounds positions by 0.1 edge lengths. (The meshes of the data sets measure at most 1e4 edge lengths.)
 LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
+# Two boundary vertices are one vertex, which rounding has split, if their distance is at most this share of
+# the shortest edge at both. Numbers with six digits, which many programs write, stay below this share.
+_ROUNDING = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,7 +418,8 @@ def make_mesh(
     if its position is not finite or is very far away. If at most one vertex in 1000 is lost, the faces of
     lost vertices are dropped. Each lost vertex is moved to the mean of its usable neighbours. A lost vertex
     without usable neighbours is moved to the mean of all usable vertices. If more than one vertex in 1000 is
-    lost, no vertex is moved, and the checks under "Raises" apply to the lost vertices. If one component has
+    lost, no vertex is moved, and the checks under "Raises" apply to the lost vertices. Vertices without
+    faces do not count: they are always moved if their position is not finite. If one component has
     at least half of the area, the faces of components with less than 1 % of the area are dropped. For closed
     components, such as enclosed bubbles, the limit is 5 %. Vertices that lose all their faces become
     unreferenced, and receive the match of the nearest referenced vertex.
@@ -430,9 +434,10 @@ def make_mesh(
     - `faces`: vertex indices (f, 3), 0-based, as integers of any type, or as floats with integer values. The
         array is copied.
     - `name`: the name of the mesh in messages.
-    - `weld`: whether to merge vertices at exactly the same position. If True, faces use only the
-        lowest-numbered vertex at each position, and the other vertices at this position become unreferenced.
-        Welding closes seams along which some programs duplicate vertices.
+    - `weld`: whether to merge vertices at the same position. If True, faces use only the lowest-numbered
+        vertex at each position, and the other vertices at this position become unreferenced. Welding closes
+        seams along which some programs duplicate vertices. Vertices at the boundary are also merged if
+        rounding can explain their distance, which is then at most 1 % of the shortest edge at both.
     - `notes`: sentences to which this function appends its own notes.
 
     **Returns:**
@@ -457,13 +462,13 @@ def make_mesh(
         position = np.array(position, dtype=np.float64, order="C")
     triangles = _indices(numeric_rows(faces, "faces", name), len(position), name)
     notes = list(notes)
-    lost = lost_vertices(position)
+    lost = lost_vertices(position, triangles)
     if lost.any():
         position = between_neighbors(position, triangles, lost)
     check_extent(position, name)
 
     if weld:
-        lowest = first_equal_rows(position)
+        lowest = coincident_vertices(position, triangles)
         welded = int((lowest[triangles] != triangles).any(axis=1).sum())
         triangles = lowest[triangles]
         notes.append(
@@ -537,10 +542,7 @@ def _distinct_faces(triangles: Int64[np.ndarray, "f 3"]) -> tuple[Int64[np.ndarr
 def _unusual_vertices(mesh: Mesh) -> list[str]:
     """Return notes about vertices that appear to be duplicated along a seam, and unreferenced vertices."""
     notes = []
-    boundary = np.unique(mesh.boundary_edges)
-    lowest = first_equal_rows(mesh.vertices[boundary])
-    seam = int((np.bincount(lowest, minlength=len(boundary))[lowest] > 1).sum())
-    if seam:
+    if seam := int(_split_vertices(mesh)[1].sum()):
         notes.append(
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
             "surface should be closed there, weld it (`weld=True`, on the command line `--weld`)."
@@ -652,6 +654,38 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
     if (triangles != faces).any():
         raise InputError(f"{name}: a face has an index that is not a whole number: correct the faces.")
     return triangles
+
+
+def coincident_vertices(
+    position: Float64[np.ndarray, "n 3"], triangles: Int64[np.ndarray, "f 3"]
+) -> Int64[np.ndarray, " n"]:
+    """For each vertex, return the lowest-numbered vertex at the same position, as an array (n,).
+
+    The position of two boundary vertices is the same if it differs only by rounding.
+    """
+    n = len(position)
+    lowest = first_equal_rows(position)
+    while True:
+        corners = lowest[triangles]
+        whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+        pairs, split = _split_vertices(Mesh(position, corners[whole]))
+        if not split.any():
+            return lowest
+        _, group = connected_components(pairs[split], n)
+        lowest = np.unique(group, return_index=True)[1][group][lowest]
+
+
+def _split_vertices(mesh: Mesh) -> tuple[Int64[np.ndarray, "b 2"], Bool[np.ndarray, " b"]]:
+    """Pair each boundary vertex with the nearest other one, and mark the pairs that rounding can explain."""
+    boundary = np.unique(mesh.boundary_edges)
+    if not len(boundary):
+        return np.empty((0, 2), np.int64), np.empty(0, bool)
+    shortest = np.full(len(mesh.vertices), np.inf)
+    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
+    np.minimum.at(shortest, mesh.edges, lengths[:, None])
+    distance, nearest = KDTree(mesh.vertices[boundary]).query(mesh.vertices[boundary], k=2)
+    pairs = np.stack([boundary, boundary[nearest[:, 1]]], axis=1)
+    return pairs, distance[:, 1] <= _ROUNDING * shortest[pairs].min(axis=1)
 
 
 def first_equal_rows(rows: np.ndarray) -> Int64[np.ndarray, " n"]:

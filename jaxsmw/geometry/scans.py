@@ -30,10 +30,18 @@ def usable_positions(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, "
     return usable
 
 
-def lost_vertices(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the vertices without a usable position; all False if there are too many of them."""
-    lost = ~usable_positions(position)
-    return lost if lost.sum() <= _MOST_LOST * len(position) else np.zeros_like(lost)
+def lost_vertices(
+    position: Float64[np.ndarray, "n 3"], triangles: Int64[np.ndarray, "f 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Return a mask of the vertices without a usable position.
+
+    Nothing needs the position of a vertex without faces, so any number of these may be not finite. If too
+    many of the other vertices are lost, the mask does not contain them.
+    """
+    idle = ~np.isfinite(position).all(axis=1)
+    idle[triangles] = False
+    lost = ~usable_positions(position) & ~idle
+    return lost | idle if lost.sum() <= _MOST_LOST * len(position) else idle
 
 
 def between_neighbors(

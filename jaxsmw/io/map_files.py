@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io.formats.mat import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
 from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
-from jaxsmw.io.mat_files import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
 from jaxsmw.io.mesh_data import MESH_SUFFIXES, POINT_CLOUD_SUFFIXES
 from jaxsmw.io.text import is_number
 from jaxsmw.runtime.files import atomic_write, read_bytes

@@ -19,9 +19,9 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     """Read a triangle mesh from an OFF, OBJ, PLY, STL, MAT, VTK, VTP, glTF or NPZ file, or a point cloud.
 
     Vertices keep the order of the file. An STL file contains only the corners of triangles, so corners at
-    exactly the same position become one vertex. The vertices of an STL file are numbered in the order in
-    which their positions first appear. Faces with more than three corners are split into fans of triangles.
-    `read_mesh_data` also returns colours, texture coordinates and other data of the file.
+    the same position become one vertex. The vertices of an STL file are numbered in the order in which their
+    positions first appear. Faces with more than three corners are split into fans of triangles, and triangle
+    strips into triangles. `read_mesh_data` also returns colours, texture coordinates and other data.
 
     **Arguments:**
 
@@ -39,7 +39,7 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
         - `.npz`: a file with the arrays `vertices` and `faces`.
         - `.xyz`, `.pcd`, `.npy`: a point cloud. Files in the other formats are also point clouds if they
           contain no faces. `jaxsmw.geometry.triangulate_points` makes a mesh whose vertices are the points.
-    - `weld`: if True, vertices at exactly the same position are merged. Faces then use only the
+    - `weld`: if True, vertices at the same position are merged, as in `make_mesh`. Faces then use only the
         lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so no vertex is
         renumbered. Welding has no effect on an STL file, whose corners are always merged.
 
@@ -47,13 +47,15 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
 
     A `Mesh` whose `name` is the path, with positions (n, 3) in the unit of the file and 0-based faces (f, 3).
     The `notes` of the mesh report changes such as dropped faces, and peculiarities such as unreferenced
-    vertices.
+    vertices. Flaws that do not concern the surface are also noted there: faces with two corners, a damaged
+    texture, bytes behind the triangles of a binary STL file, or a text STL file without `endsolid`.
 
     **Raises:**
 
-    `InputError` if the file cannot be read, does not have the format of its suffix, ends early, or contains
-    data after the declared end. `InputError` is also raised if `make_mesh` refuses the mesh, for example
-    because an index is out of range, a position is not finite, or all faces are degenerate.
+    `InputError` if the file cannot be read, does not have the format of its suffix, ends early, contains
+    lines but no faces, or continues after the declared end. `InputError` is also raised if `make_mesh`
+    refuses the mesh, for example because an index is out of range, the position of a corner is not finite, or
+    all faces are degenerate.
     """
     return read_mesh_data(path, weld=weld).mesh
 

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, to_host
-from jaxsmw.io.mat_files import (
+from jaxsmw.io.formats.mat import (
     FUNCTIONAL_MAP,
     find_structs,
     is_mat_file,

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
@@ -50,12 +50,17 @@ class Skin(NamedTuple):
     weights: np.ndarray
 
 
+Corners: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Texture coordinates (t, 2), and the texture vertex of each corner of each polygon."""
+
+
 class Polygons(NamedTuple):
     """The polygons of a file, and the data on them.
 
     `corners` lists the corners of all faces, one face after another. `sizes` contains the number of corners
     of each face. `face_data` has one row per polygon. `texture` consists of texture coordinates (t, 2) and
     the texture vertex of each entry of `corners`. `weld` is True if the format duplicates vertices at seams.
+    `lines` is the number of lines besides the faces. `strips` marks the faces that are triangle strips.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -69,6 +74,12 @@ class Polygons(NamedTuple):
     skin: Skin | None = None
     label_names: Mapping[str, tuple[str, ...]] = NOTHING
     weld: bool = False
+    lines: int = 0
+    strips: Bool[np.ndarray, " f"] | None = None
+
+    @property
+    def is_strip(self) -> Bool[np.ndarray, " f"]:
+        return np.zeros(len(self.sizes), bool) if self.strips is None else self.strips
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,10 +132,10 @@ class MeshData:
             "vertex_data": self._rows(self.vertex_data, "vertex data", n, "vertex"),
             "face_data": self._rows(self.face_data, "face data", f, "face"),
             "blend_shapes": {
-                name: self._real(values, f"the blend shape {name!a}", (n, 3))
+                name: _real(values, f"the blend shape {name!a}", (n, 3), self._fail)
                 for name, values in self.blend_shapes.items()
             },
-            "texture": self._checked_texture(f),
+            "texture": None if self.texture is None else checked_texture(self.texture, f, self._fail),
             "skin": self._checked_skin(n),
             "label_names": {name: tuple(map(str, names)) for name, names in self.label_names.items()},
         }
@@ -164,40 +175,13 @@ class MeshData:
             checked[name] = _canonical(array[:, 0] if array.shape[1:] == (1,) else array)
         return checked
 
-    def _real(self, values: Any, what: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "*shape"]:
-        array = np.asarray(values)
-        if array.shape != shape or array.dtype.kind not in "biuf":
-            raise self._fail(
-                f"{what} is {array.dtype.name} of shape {array.shape}, but needs numbers of shape {shape}: "
-                "give an array of this shape."
-            )
-        array = array.astype(np.float64)
-        if not np.isfinite(array).all():
-            raise self._fail(f"{what} contains a number that is not finite: repair the numbers.")
-        return array
-
-    def _checked_texture(self, f: int) -> Texture | None:
-        if self.texture is None:
-            return None
-        coordinates, corners = self.texture
-        coordinates = self._real(coordinates, "the texture", (*np.shape(coordinates)[:1], 2))
-        corners = _indices(
-            corners, len(coordinates), "the texture's corners", "texture vertices", self._fail, -1
-        )
-        if len(corners) != f:
-            raise self._fail(
-                f"the texture has {count_of(len(corners), 'row')} of corners, but the mesh has "
-                f"{count_of(f, 'face')}: give one row for each face."
-            )
-        return Texture(coordinates, corners)
-
     def _checked_skin(self, n: int) -> Skin | None:
         if self.skin is None:
             return None
         joints, weights = self.skin
         if len(set(joints)) != len(joints) or not joints:
             raise self._fail("the names of the joints are not distinct: give each joint its own name.")
-        return Skin(tuple(map(str, joints)), self._real(weights, "the skin", (n, len(joints))))
+        return Skin(tuple(map(str, joints)), _real(weights, "the skin", (n, len(joints)), self._fail))
 
     def _check_labels(self) -> None:
         for name, names in self.label_names.items():
@@ -210,6 +194,33 @@ class MeshData:
                     f"the array of labels {name!a} must contain integers from 0 to {len(names) - 1}, one for "
                     "each label name: correct the array or the names."
                 )
+
+
+def checked_texture(texture: Corners, f: int, fail: Callable[[str], InputError]) -> Texture:
+    """Check the texture of f triangles."""
+    coordinates = _real(texture[0], "the texture", (*np.shape(texture[0])[:1], 2), fail)
+    corners = _indices(texture[1], len(coordinates), "the texture's corners", "texture vertices", fail, -1)
+    if len(corners) != f:
+        raise fail(
+            f"the texture has {count_of(len(corners), 'row')} of corners, but the mesh has "
+            f"{count_of(f, 'face')}: give one row for each face."
+        )
+    return Texture(coordinates, corners)
+
+
+def _real(
+    values: Any, what: str, shape: tuple[int, ...], fail: Callable[[str], InputError]
+) -> Float64[np.ndarray, "*shape"]:
+    array = np.asarray(values)
+    if array.shape != shape or array.dtype.kind not in "biuf":
+        raise fail(
+            f"{what} is {array.dtype.name} of shape {array.shape}, but needs numbers of shape {shape}: "
+            "give an array of this shape."
+        )
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        raise fail(f"{what} contains a number that is not finite: repair the numbers.")
+    return array
 
 
 def _within(array: np.ndarray, count: int, first: int = 0) -> bool:
@@ -238,6 +249,44 @@ def _indices(
     if not _within(array, count, first):
         raise fail(f"{what} use a number outside the {count} {whole}: correct the indices.")
     return array.astype(np.int64)
+
+
+def triangles_of(
+    sizes: Int64[np.ndarray, " f"], is_strip: Bool[np.ndarray, " f"]
+) -> tuple[Int64[np.ndarray, "t 3"], Int64[np.ndarray, " t"]]:
+    """Split polygons and triangle strips into triangles.
+
+    The triangles of a polygon (c0, c1, …) are (c0, ci, ci+1), and a polygon of two corners has none. The
+    triangles of a strip are (ci, ci+1, ci+2), and every second of them is reversed.
+
+    Return the corners of each triangle (t, 3), as indices into the list of all corners, and the face from
+    which each triangle comes (t,).
+    """
+    if (sizes < 2).any():
+        at = int((sizes < 2).argmax())
+        raise InputError(
+            f"face {at} has {count_of(int(sizes[at]), 'corner')}, but needs at least three: remove the face."
+        )
+    if (sizes[is_strip] < 3).any():
+        raise InputError(
+            "a triangle strip has fewer than three corners, so the file is damaged: export the mesh again."
+        )
+    per_face = sizes - 2
+    face = np.repeat(np.arange(len(sizes)), per_face)
+    start = (np.cumsum(sizes) - sizes)[face]
+    step = np.arange(len(face)) - (np.cumsum(per_face) - per_face)[face]
+    reversed_ = is_strip[face] & (step % 2 == 1)
+    first = np.where(is_strip[face], step, 0)
+    corners = first + reversed_, np.where(reversed_, step, step + 1), step + 2
+    return start[:, None] + np.stack(corners, axis=1), face
+
+
+def texture_or_note(parse: Callable[[], Corners | None]) -> tuple[Corners | None, tuple[str, ...]]:
+    """Parse a texture. Matching does not need a texture, so a note replaces a texture that cannot be read."""
+    try:
+        return parse(), ()
+    except InputError as error:
+        return None, (f"The texture was left out: {error}",)
 
 
 class Written(NamedTuple):

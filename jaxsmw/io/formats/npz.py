@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import MeshData, Polygons, Skin, Written
+from jaxsmw.io.formats.data import MeshData, Polygons, Skin, Written, texture_or_note
 from jaxsmw.runtime.files import largest_contents
 
 _FOLDERS = "vertex_data", "face_data", "blend_shapes", "label_names"
@@ -44,24 +44,29 @@ def parse_npz(data: bytes) -> Polygons:
             folders[folder][rest] = array
     texture = [arrays[name] for name in ("texture_coordinates", "texture_corners") if name in arrays]
     skin = [arrays[name] for name in ("skin_joints", "skin_weights") if name in arrays]
-    if len(texture) == 1 or len(skin) == 1:
+    if len(skin) == 1:
         raise InputError("contains only half of a texture or of a skin: save both arrays.")
+    corners, notes = texture_or_note(lambda: _texture(texture, faces.shape))
     return Polygons(
         vertices.astype(np.float64),
         faces.ravel(),
         np.full(len(faces), 3),
         vertex_data=folders["vertex_data"],
         face_data=folders["face_data"],
-        texture=_texture(texture[0], texture[1], faces.shape) if texture else None,
+        notes=notes,
+        texture=corners,
         blend_shapes=folders["blend_shapes"],
         skin=Skin(tuple(map(str, skin[0].ravel())), skin[1]) if skin else None,
         label_names={name: tuple(map(str, names.ravel())) for name, names in folders["label_names"].items()},
     )
 
 
-def _texture(
-    coordinates: np.ndarray, corners: np.ndarray, shape: tuple[int, ...]
-) -> tuple[np.ndarray, np.ndarray]:
+def _texture(arrays: list[np.ndarray], shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray] | None:
+    if not arrays:
+        return None
+    if len(arrays) == 1:
+        raise InputError("contains only half of a texture: save both arrays.")
+    coordinates, corners = arrays
     if corners.shape != shape:
         raise InputError(
             f"the texture's corners have the shape {corners.shape}, but the faces have the shape {shape}: "

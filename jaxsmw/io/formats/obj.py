@@ -10,7 +10,16 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import COLORS, MeshData, Polygons, Written, always, is_color, omissions
+from jaxsmw.io.formats.data import (
+    COLORS,
+    MeshData,
+    Polygons,
+    Written,
+    always,
+    is_color,
+    omissions,
+    texture_or_note,
+)
 from jaxsmw.io.formats.lines import excerpt, numbers, polygon_lines, text
 
 # A dictionary from each kind of label to the keyword of its lines in OBJ files. Such a line sets the label of
@@ -33,6 +42,8 @@ def parse_obj(data: bytes) -> Polygons:
     if slashed:  # corners of the form vertex/texture/normal
         lines = re.sub(r"/\S*", "", "\n".join(lines)).split("\n")
     corners, sizes = polygon_lines([f"{len(line.split())} {line}" for line in lines])
+    if not lines and re.search(r"^\s*surf\s", content, re.MULTILINE):
+        raise InputError("contains free-form surfaces but no faces: export the mesh as triangles.")
     if ends_in_face and sizes[-1] < 3:
         raise InputError("ends in the middle of a face, so the file is truncated: export the mesh again.")
     if (corners == 0).any():
@@ -46,14 +57,17 @@ def parse_obj(data: bytes) -> Polygons:
             "correct the index or restore the missing vertices."
         )
     labels, names = _labels(content, face_at)
+    texture, notes = texture_or_note(lambda: _texture(content, slashed, sizes, face_at))
     return Polygons(
         vertices,
         corners - 1,
         sizes,
         vertex_data=_vertex_colors(vertex_lines),
         face_data=labels,
-        texture=_texture(content, slashed, sizes, face_at),
+        texture=texture,
         label_names=names,
+        notes=notes,
+        lines=len(_lines("l").findall(content)),
     )
 
 

@@ -22,6 +22,7 @@ from jaxsmw.io.formats.data import (
     omissions,
     texture_at_corners,
     texture_of_corners,
+    texture_or_note,
 )
 from jaxsmw.io.formats.lines import excerpt
 from jaxsmw.io.text import is_number
@@ -90,27 +91,56 @@ def parse_ply(data: bytes) -> Polygons:
                 f"the header declares {count} rows of {excerpt(name)}, but the file ends within these rows, "
                 "so the file is truncated or its header is wrong: export the mesh again."
             ) from None
-    if body[offset:].strip():
+    if body[offset:].strip(b"\0 \t\r\n"):
         raise InputError(
             "continues after the last declared row, so the header is wrong: export the mesh again."
         )
 
-    vertex, face = tables.get("vertex", {}), tables.get("face", {})
+    vertex, face, strips = (tables.get(name, {}) for name in ("vertex", "face", "tristrips"))
     position = [vertex[axis].values for axis in "xyz" if axis in vertex and (vertex[axis].sizes == 1).all()]
     if len(position) < 3:
         raise InputError("has no properties x, y and z for its vertices: export the mesh again.")
-    corners = face.get("vertex_indices", face.get("vertex_index"))
+    corners, strip = (table.get("vertex_indices", table.get("vertex_index")) for table in (face, strips))
     if corners is None:
         if elements.get("face", (0, {}))[0]:
             raise InputError("has no faces with vertex_indices: export the mesh again as a triangle mesh.")
-        corners = _Column(np.empty(0), np.empty(0, np.int64))  # a point cloud
+        corners = _Column(np.empty(0), np.empty(0, np.int64))  # a point cloud, or strips only
     vertices = np.stack(position, axis=1, dtype=np.float64)
+    of_corners = face.get(TEXTURE_OF_CORNERS)
     vertex_data, face_data = (
         _numbers_of(tables.get(name, {}), elements.get(name, (0, {}))[1]) for name in ("vertex", "face")
     )
-    texture = _texture(face.get(TEXTURE_OF_CORNERS), corners, vertex_data)
-    return Polygons(
-        vertices, *corners, vertex_data=_grouped(vertex_data), face_data=_grouped(face_data), texture=texture
+    for name in ("vertex_indices", "vertex_index", TEXTURE_OF_CORNERS):
+        face_data.pop(name, None)
+    texture, notes = texture_or_note(lambda: _texture(of_corners, corners, vertex_data))
+    polygons = Polygons(
+        vertices,
+        *corners,
+        notes=notes,
+        vertex_data=_grouped(vertex_data),
+        face_data=_grouped(face_data),
+        texture=texture,
+        lines=elements.get("edge", (0, {}))[0],
+    )
+    return polygons if strip is None else _with_strips(polygons, strip)
+
+
+def _with_strips(polygons: Polygons, strips: _Column) -> Polygons:
+    """Append triangle strips, which have neither data nor a texture. The index -1 begins another strip."""
+    begins = strips.values == -1
+    number = np.cumsum(begins) + np.repeat(np.arange(len(strips.sizes)), strips.sizes)
+    _, strip, sizes = np.unique(number[~begins], return_inverse=True, return_counts=True)
+    lost = [name for name, values in polygons.face_data.items() if len(values)]
+    what = [*(["texture"] if polygons.texture is not None else []), *map(ascii, lost)]
+    note = f"The data of the faces ({', '.join(what)}) were left out, because triangle strips have none."
+    used = sizes > 2
+    return polygons._replace(
+        corners=np.concatenate([polygons.corners, strips.values[~begins][used[strip]]]),
+        sizes=np.concatenate([polygons.sizes, sizes[used]]),
+        strips=np.repeat([False, True], [len(polygons.sizes), used.sum()]),
+        notes=(*polygons.notes, *([note] if what else [])),
+        face_data={},
+        texture=None,
     )
 
 
@@ -120,18 +150,17 @@ _TEXTURES = ("s", "t"), ("u", "v"), ("texture_u", "texture_v")
 
 
 def _numbers_of(table: Mapping[str, _Column], properties: Mapping[str, _Property]) -> dict[str, np.ndarray]:
-    """Return the properties with one number per row, except positions, in the declared types."""
+    """Return the properties with equally many numbers in all rows, in the declared types, except x, y, z."""
     found = {}
     for name, column in table.items():
-        if properties[name].length is None and name not in ("x", "y", "z"):
+        width = int(column.sizes[0]) if len(column.sizes) else 0
+        if width and (column.sizes == width).all() and name not in ("x", "y", "z"):
             with np.errstate(all="ignore"):
                 values = column.values.astype(properties[name].declared)
             # Text can contain numbers that the declared type cannot hold.
-            found[name] = (
-                values
-                if np.array_equal(values, column.values, equal_nan=True) or (values.dtype.kind == "f")
-                else column.values
-            )
+            if not np.array_equal(values, column.values, equal_nan=True) and values.dtype.kind != "f":
+                values = column.values
+            found[name] = values if width == 1 else values.reshape(-1, width)
     return found
 
 
@@ -164,21 +193,26 @@ def _grouped(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def _texture(
     of_corners: _Column | None, faces: _Column, vertex_data: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the texture from the face property `texcoord`, or from vertex properties such as `s`, `t`."""
+    """Return the texture from `texcoord` of the faces or vertices, or from properties such as `s` and `t`."""
     corners = faces.values
     if of_corners is not None and of_corners.sizes.any():
         given = of_corners.sizes > 0
-        if (of_corners.sizes[given] != 2 * faces.sizes[given]).any():
+        width = int(of_corners.sizes[given][0] // max(faces.sizes[given][0], 1))
+        if width not in (2, 3) or (of_corners.sizes[given] != width * faces.sizes[given]).any():
             raise InputError(
                 "a face does not have two texture coordinates for each corner: export the mesh again."
             )
         at_corners = np.full((len(corners), 2), np.nan)
-        at_corners[np.repeat(given, faces.sizes)] = of_corners.values.reshape(-1, 2)
+        at_corners[np.repeat(given, faces.sizes)] = of_corners.values.reshape(-1, width)[:, :2]
         return texture_of_corners(corners, at_corners)
-    for u, v in _TEXTURES:
-        n = len(vertex_data.get(u, ()))
-        if v in vertex_data and n and ((corners >= 0) & (corners < n) & (corners == np.floor(corners))).all():
-            return np.stack([vertex_data.pop(u), vertex_data.pop(v)], axis=1), corners.astype(np.int64)
+    whole = (corners >= 0) & (corners == np.floor(corners))
+    for names in ((TEXTURE_OF_CORNERS,), *_TEXTURES):
+        columns = [vertex_data[name] for name in names if name in vertex_data]
+        found = np.column_stack(columns) if columns else np.empty((0, 0))
+        if len(columns) == len(names) and found.shape[1] == 2 and (whole & (corners < len(found))).all():
+            for name in names:
+                del vertex_data[name]
+            return found, corners.astype(np.int64)
     return None
 
 

@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import first_equal_rows
+from jaxsmw.geometry.mesh import coincident_vertices, first_equal_rows
 from jaxsmw.io.formats.data import MeshData, Polygons, Written, omissions
 from jaxsmw.io.formats.lines import numbers, text
 from jaxsmw.wording import count_of
@@ -19,24 +19,32 @@ def parse_stl(data: bytes) -> Polygons:
     """Parse a text or binary file. Corners at the same position become one vertex."""
     header = 84
     count = int.from_bytes(data[80:header], "little")
+    behind = len(data) - header - count * _FACET.itemsize
+    notes = []
     # All text files and some binary files begin with "solid". Therefore a file is treated as binary if its
     # length fits its header.
-    if len(data) >= header and len(data) == header + count * _FACET.itemsize:
-        corners = np.frombuffer(data, _FACET, offset=header)["corners"].reshape(-1, 3)
+    is_text = data.lstrip()[:5].lower() == b"solid" and b"facet" in data.lower()
+    # Other programs may own the bytes behind the triangles, unless these could be triangles as well.
+    has_more = not is_text and count > 0 and behind > 0 and behind % _FACET.itemsize > 0
+    if len(data) >= header and (behind == 0 or has_more):
+        corners = np.frombuffer(data, _FACET, count, offset=header)["corners"].reshape(-1, 3)
         with np.errstate(invalid="ignore"):  # some bit patterns of NaN cause a warning
             corners = corners.astype(np.float64)
-    elif data.lstrip()[:5].lower() == b"solid" and b"facet" in data.lower():
+        if behind:
+            notes.append(f"{count_of(behind, 'byte')} behind the last of {count} declared triangles ignored.")
+    elif is_text:
         content = text(data).lower()
         corners = numbers(
             [" ".join(words) for words in re.findall(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", content)], 3
         )
         facets = len(re.findall(r"\bendfacet\b", content))
-        if len(corners) != 3 * facets or "endsolid" not in content:
+        if len(corners) != 3 * facets:
             raise InputError(
                 f"has {count_of(facets, 'complete facet')} and {count_of(len(corners), 'corner')}, but must "
-                "have three corners per facet and end with endsolid, so the file is truncated or damaged: "
-                "export the mesh again."
+                "have three corners per facet, so the file is truncated or damaged: export the mesh again."
             )
+        if "endsolid" not in content:
+            notes.append("The file does not end with endsolid, so triangles may be missing.")
     elif len(data) >= header:
         raise InputError(
             f"the header declares {count} triangles, which does not fit the file's {len(data)} bytes, so the "
@@ -44,12 +52,18 @@ def parse_stl(data: bytes) -> Polygons:
         )
     else:
         raise InputError("is neither a text nor a binary STL file: export the mesh again.")
-    appearance, faces = np.unique(first_equal_rows(corners), return_inverse=True)
-    note = (
+    equal = first_equal_rows(corners)
+    same = equal
+    if np.isfinite(corners).all():
+        same = coincident_vertices(corners, np.arange(len(corners)).reshape(-1, 3))
+    appearance, faces = np.unique(same, return_inverse=True)
+    notes.append(
         "STL files have no shared vertices: corners at the same position were merged into "
         f"{count_of(len(appearance), 'vertex')}, numbered by first appearance."
     )
-    return Polygons(corners[appearance], faces, np.full(len(corners) // 3, 3), (note,))
+    if rounded := int((same != equal).sum()):
+        notes.append(f"The positions of {count_of(rounded, 'merged corner')} differ by rounding.")
+    return Polygons(corners[appearance], faces, np.full(len(corners) // 3, 3), tuple(notes))
 
 
 def format_stl(data: MeshData) -> Written:

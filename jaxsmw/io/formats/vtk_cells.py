@@ -25,7 +25,7 @@ from jaxsmw.wording import count_of
 
 # Types of cells (https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html).
 VERTEX, LINE, STRIP, POLYGON = 1, 3, 6, 7
-_IGNORED = 0, VERTEX, 2, LINE, 4
+_POINTS, _LINES = (0, VERTEX, 2), (LINE, 4)
 _SURFACE = 5, STRIP, POLYGON, 9
 DAMAGED = "so the file is damaged: export the mesh again."
 
@@ -87,7 +87,7 @@ def polygons_of(
     cell_data: Mapping[str, np.ndarray],
     coordinates: np.ndarray | None = None,
 ) -> Polygons:
-    """Return the polygons among the cells. Strips become triangles, and points and lines are ignored.
+    """Return the polygons and strips among the cells. Points and lines are ignored.
 
     **Arguments:**
 
@@ -101,7 +101,7 @@ def polygons_of(
                     f"the array {name[:40]!a} has {count_of(len(values), 'row')}, but the file has "
                     f"{count_of(count, what)}: export the mesh again."
                 )
-    known = np.isin(cells.kinds, _IGNORED + _SURFACE)
+    known = np.isin(cells.kinds, _POINTS + _LINES + _SURFACE)
     if not known.all():
         raise InputError(
             f"contains cells of type {cells.kinds[int(known.argmin())]}, which are not triangles or "
@@ -110,41 +110,30 @@ def polygons_of(
     used = np.isin(cells.kinds, _SURFACE)
     ignored = int((~used).sum())
     notes = (f"{count_of(ignored, 'cell')} ignored: points and lines are not part of a surface.",)
-    sizes, corners, cell = _without_strips(cells, used)
+    sizes, corners = cells.sizes[used], cells.corners[np.repeat(used, cells.sizes)]
     texture = None
     if coordinates is not None and _within(corners, len(points)):
         texture = coordinates[:, :2].astype(np.float64), corners
     of_corners = cell_data.get(TEXTURE_OF_CORNERS)
-    face_data = {name: values[cell] for name, values in cell_data.items()}
+    face_data = {name: values[used] for name, values in cell_data.items()}
     if of_corners is not None and of_corners.shape[1:] == (6,) and (sizes == 3).all():
         del face_data[TEXTURE_OF_CORNERS]
-        texture = texture_of_corners(corners, of_corners[cell].reshape(-1, 2).astype(np.float64))
-    return Polygons(points, corners, sizes, notes if ignored else (), point_data, face_data, texture=texture)
+        texture = texture_of_corners(corners, of_corners[used].reshape(-1, 2).astype(np.float64))
+    return Polygons(
+        points,
+        corners,
+        sizes,
+        notes=notes if ignored else (),
+        vertex_data=point_data,
+        face_data=face_data,
+        texture=texture,
+        strips=cells.kinds[used] == STRIP,
+        lines=int(np.isin(cells.kinds, _LINES).sum()),
+    )
 
 
 def _within(corners: np.ndarray, n: int) -> bool:
     return not len(corners) or bool(corners.min() >= 0 and corners.max() < n)
-
-
-def _without_strips(cells: Cells, used: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Drop the cells for which `used` is False, and split triangle strips into triangles.
-
-    Return the size of each polygon, the corners of all polygons, and the cell from which each polygon comes.
-    """
-    start = np.cumsum(cells.sizes) - cells.sizes
-    strip = cells.kinds == STRIP
-    if (cells.sizes[strip] < 3).any():
-        raise InputError(f"a triangle strip has fewer than three corners, {DAMAGED}")
-    cell = np.repeat(np.arange(len(used)), np.where(used, np.where(strip, cells.sizes - 2, 1), 0))
-    first = np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]])) if len(cell) else cell
-    per_cell = np.diff(np.append(first, len(cell)))
-    step = np.where(strip[cell], np.arange(len(cell)) - np.repeat(first, per_cell), 0)
-    sizes = np.where(strip[cell], 3, cells.sizes[cell])
-    polygon = np.repeat(np.arange(len(cell)), sizes)
-    corner = np.arange(len(polygon)) - (np.cumsum(sizes) - sizes)[polygon]
-    # Every second triangle of a strip has the opposite orientation.
-    corner = np.where((step[polygon] % 2 == 1) & (corner < 2), 1 - corner, corner)
-    return sizes, cells.corners[start[cell[polygon]] + step[polygon] + corner], cell
 
 
 def add_array(data: dict[str, np.ndarray], name: str, values: np.ndarray) -> str:
