@@ -156,7 +156,9 @@ def test_the_camera_sees_the_outside_of_open_surfaces(cut: float) -> None:
 def test_the_camera_stays_in_front_of_closed_bodies_with_holes() -> None:
     punctured = replace(TALL, faces=TALL.faces[8:])
     for mesh in (TALL, punctured):
-        assert choose_azimuth([stand(mesh, "y")]) == pytest.approx(choose_azimuth([stand(TALL, "y")]), abs=0.1)
+        assert choose_azimuth([stand(mesh, "y")]) == pytest.approx(
+            choose_azimuth([stand(TALL, "y")]), abs=0.1
+        )
 
 
 def test_a_mask_and_a_head_with_an_open_neck_look_at_the_camera(shared: Path) -> None:

@@ -225,7 +225,7 @@ def _guess_up(mesh: Mesh) -> Axis:
 
 
 def _suits_opening(mesh: Mesh, up: Axis) -> float:
-    """Return how well an axis suits an open surface: a flat one faces the camera, a deep one stands on its rim."""
+    """Return how well flat open surfaces face the camera, and how well deep ones stand on their rim."""
     outside = facing(mesh)
     across, upwards, forward = np.array(_STAND[up], dtype=float) @ outside
     flatness = float(np.linalg.norm(outside))

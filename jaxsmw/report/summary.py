@@ -43,7 +43,7 @@ from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.provenance import machine, versions
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
-from jaxsmw.wording import percentage
+from jaxsmw.wording import percentage, short_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -328,7 +328,7 @@ def _encoded(
 
 
 def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
-    return f"{Path(mesh_x.name).name} to {Path(mesh_y.name).name}"
+    return " to ".join(short_names([mesh_x.name, mesh_y.name]))
 
 
 def _error_statistics(error: GeodesicError | None) -> dict[str, str]:
