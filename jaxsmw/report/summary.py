@@ -80,7 +80,6 @@ def write_report(
     correspondence: Correspondence,
     *,
     errors: Mapping[str, GeodesicError] | None = None,
-    expected_error: Float[np.ndarray, " m"] | None = None,
     settings: Mapping[str, Any] | None = None,
     seconds: Mapping[str, float] | None = None,
     up: Axis | None = None,
@@ -101,8 +100,6 @@ def write_report(
     - `errors`: a dictionary from the name of each map to its `GeodesicError`. The last entry must contain the
       errors of `correspondence.pointwise_map`. An entry named `initial` must contain the errors of
       `correspondence.initial_map`.
-    - `expected_error`: the expected error of each match (m,), divided by the square root of Y's area. By
-      default, `Correspondence.expected_error` computes it.
     - `settings`: a dictionary of settings to include in `summary.json`. The settings must be serialisable as
       JSON.
     - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds. The
@@ -123,11 +120,10 @@ def write_report(
     directory = make_directory(directory)
     errors = errors or {}
     steps = dict(correspondence.seconds if seconds is None else seconds)
-    expected = expected_error
-    if expected is None:
+    if not any("expected error" in step for step in steps):
         with timed("expected error", steps):
-            expected = correspondence.expected_error()
-    shown = _shown_maps(correspondence, errors, expected)
+            correspondence.expected_error()
+    shown = _shown_maps(correspondence, errors)
     with timed("pictures", steps):
         pictures, captions = _save_figures(directory, correspondence, shown["refined"].errors, errors, up)
     wavelets = _last_wavelets(correspondence)
@@ -141,7 +137,7 @@ def write_report(
         title=_title(correspondence.mesh_x, correspondence.mesh_y),
         spectra=(correspondence.spectrum_x, correspondence.spectrum_y),
         refiner=WaveletPreservation() if wavelets is None else wavelets[0],
-        statistics=summarize(correspondence, others, expected, steps),
+        statistics=summarize(correspondence, others, steps),
         error_meanings=_ERROR_MEANINGS,
         figures=[(caption, path.read_bytes()) for path, caption in captions.items()],
         up=up,
@@ -150,10 +146,10 @@ def write_report(
     )
     summary = {
         "settings": dict(settings or {}),
-        "result": summarize(correspondence, errors, expected, steps),
+        "result": summarize(correspondence, errors, steps),
         "distortion": correspondence.distortion,
         "suspicious": correspondence.suspicious,
-        "wrong_probability": correspondence.wrong_probability(expected),
+        "wrong_probability": correspondence.wrong_probability(),
         "errors": {name: error.as_dictionary() for name, error in errors.items()},
         "seconds": {**steps, "total": sum(steps.values())},
         "provenance": provenance(),
@@ -163,11 +159,7 @@ def write_report(
     return [directory / "report.html", *pictures, directory / "summary.json"]
 
 
-def _shown_maps(
-    correspondence: Correspondence,
-    errors: Mapping[str, GeodesicError],
-    expected_error: Float[np.ndarray, " m"],
-) -> dict[str, ShownMap]:
+def _shown_maps(correspondence: Correspondence, errors: Mapping[str, GeodesicError]) -> dict[str, ShownMap]:
     """Return the refined map and the initial map, with the errors and functional maps that the page shows."""
     m = len(correspondence.pointwise_map)
     spectra = correspondence.spectrum_x, correspondence.spectrum_y
@@ -175,7 +167,7 @@ def _shown_maps(
     final, initial = list(errors.values())[-1] if errors else None, errors.get("initial")
     refined = ShownMap(
         correspondence.pointwise_map,
-        _named_errors(final, m) | {EXPECTED_ERROR: expected_error},
+        _named_errors(final, m) | {EXPECTED_ERROR: correspondence.expected_error()},
         correspondence.functional_map,
         convention,
         _error_statistics(final),
@@ -385,7 +377,6 @@ def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
 def summarize(
     correspondence: Correspondence,
     errors: Mapping[str, GeodesicError],
-    expected_error: Float[np.ndarray, " m"],
     seconds: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
     """Describe the sizes, errors and times of a match as text.
@@ -394,7 +385,6 @@ def summarize(
 
     - `correspondence`: the result of `match`.
     - `errors`: a dictionary from the name of each map to its `GeodesicError`.
-    - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds. The
       default is `correspondence.seconds`.
 
@@ -418,8 +408,9 @@ def summarize(
         if correspondence.suspicious and correspondence.distortion >= limit:
             suspicion = f"; above {limit} limbs may be swapped"
         facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
-    facts["expected error, mean"] = f"{correspondence.mesh_x.average(expected_error):.4f} √area"
-    if (probability := correspondence.wrong_probability(expected_error)) is not None:
+    expected = correspondence.mesh_x.average(correspondence.expected_error())
+    facts["expected error, mean"] = f"{expected:.4f} √area"
+    if (probability := correspondence.wrong_probability()) is not None:
         facts["probability of a wrong part"] = percentage(probability)
     steps = correspondence.seconds if seconds is None else seconds
     times = {**steps, "total": sum(steps.values())}
