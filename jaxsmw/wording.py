@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Sequence
+from pathlib import PurePath
 
 
 def count_of(number: int, noun: str) -> str:
@@ -10,6 +12,18 @@ def count_of(number: int, noun: str) -> str:
     if number != 1:
         noun = noun.removesuffix("ex") + "ices" if noun.endswith("ex") else noun + "s"
     return f"{number} {noun}"
+
+
+def short_names(paths: Sequence[str]) -> list[str]:
+    """Return file names, each with as many of its directories as are needed to tell different files apart.
+
+    Question marks replace bytes that are not valid UTF-8.
+    """
+    files = [PurePath(path.encode("utf-8", "replace").decode()) for path in paths]
+    last = 1
+    while len({file.parts[-last:] for file in files}) < len({file.parts for file in files}):
+        last += 1
+    return [str(PurePath(*file.parts[-last:])) if file.parts else "" for file in files]
 
 
 def percentage(probability: float) -> str:

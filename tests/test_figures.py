@@ -23,6 +23,7 @@ from jaxsmw.report.figures import (
     save_figure,
 )
 from jaxsmw.report.page import ShownMap, write_page
+from jaxsmw.wording import short_names
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -248,6 +249,38 @@ def test_hostile_names_are_drawn_as_plain_text() -> None:
     boxes = [text.get_window_extent() for text in figure.texts]
     assert all(box.x0 >= 0 and box.x1 <= figure.bbox.x1 for box in boxes)
     assert boxes[1].x1 < boxes[3].x0
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize(
+    ("names", "shown"),
+    [
+        (("a/mesh.off", "b/mesh.off"), ("a/mesh.off", "b/mesh.off")),
+        (("/data/s1/left/mesh.off", "/data/s2/left/mesh.off"), ("s1/left/mesh.off", "s2/left/mesh.off")),
+        (("/data/mesh.off", "mesh.off"), ("data/mesh.off", "mesh.off")),
+        (("a/mesh.off", "a/mesh.off"), ("mesh.off", "mesh.off")),
+        (("a/x.off", "b/y.off"), ("x.off", "y.off")),
+        (("", "mesh"), ("", "mesh")),
+    ],
+)
+def test_titles_tell_files_of_one_name_apart(names: tuple[str, str], shown: tuple[str, str]) -> None:
+    assert tuple(short_names(names)) == shown
+    bodies = [replace(TALL, name=name) for name in names]
+    identity = np.arange(len(TALL.vertices))
+    figure = draw_correspondence(*bodies, identity, errors={"Error": np.zeros(len(identity))})
+    captions = [text.get_text() for text in figure.texts[1::2]]
+    assert captions == [f"{name}\n642 vertices" for name in (*shown, shown[0])]
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("difference", [0, 20, 60, 119])
+def test_long_titles_tell_files_apart(difference: int) -> None:
+    names = ["".join("ab"[side] if i == difference else "x" for i in range(120)) + ".off" for side in (0, 1)]
+    for folder in ("", "folder/"):
+        bodies = [replace(TALL, name=folder + name) for name in names]
+        figure = draw_correspondence(*bodies, np.arange(len(TALL.vertices)))
+        shown = [figure.texts[i].get_text().split("\n")[0] for i in (1, 3)]
+        assert shown[0] != shown[1] and max(map(len, shown)) <= 36
 
 
 def test_without_matplotlib_only_figures_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

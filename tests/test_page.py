@@ -21,6 +21,7 @@ from jaxsmw.report.figures import draw_correspondence
 from jaxsmw.report.page import ShownMap, write_page
 from jaxsmw.report.page_data import eigenvectors_on_page
 from jaxsmw.report.standing import stand_pair
+from jaxsmw.report.summary import write_comparison
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -44,6 +45,17 @@ def test_invalid_maps_and_errors_are_refused(show: Callable[..., Any]) -> None:
     for limit in (0, -1, np.nan, np.inf):
         with pytest.raises(InputError, match="positive"):
             show(TALL, TALL, good, errors={"Error": np.zeros(n)}, error_limit=limit)
+
+
+def test_bodies_from_files_of_one_name_have_different_captions(tmp_path: Path) -> None:
+    first, second = (replace(TALL, name=f"/home/{directory}/scan.off") for directory in ("before", "after"))
+    page_file = tmp_path / "page.html"
+    write_comparison(page_file, first, second, {"map": np.arange(len(TALL.vertices))})
+    page = page_file.read_text("utf-8")
+    assert "<span>before/scan.off · 642 vertices</span>" in page
+    assert "<span>after/scan.off · 642 vertices</span>" in page
+    assert "<h1>before/scan.off to after/scan.off</h1>" in page and "home" not in page
+    assert [embedded(page)[side]["name"] for side in "xy"] == ["before/scan.off", "after/scan.off"]
 
 
 def test_page_holds_its_data_and_loads_nothing(tmp_path: Path) -> None:

@@ -259,10 +259,10 @@ def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
     ):
         found = match(mesh, mesh, preset=preset, init=mirrored)
     assert found.suspicious and found.distortion > 1.3
-    facts = summarize(found, {}, found.expected_error())
+    facts = summarize(found, {})
     assert f"{found.distortion:.2f}; above 1.12 limbs may be swapped" in facts.values()
     trusted = replace(found, suspicious=False)  # the page does not contradict `match`
-    assert f"{found.distortion:.2f}" in summarize(trusted, {}, found.expected_error()).values()
+    assert f"{found.distortion:.2f}" in summarize(trusted, {}).values()
     right = match(mesh, mesh, preset=preset, init=identity)
     assert right.distortion < 1.1 and not right.suspicious
 
@@ -274,7 +274,7 @@ def test_maps_of_presets_without_repair_are_judged(body, mirrored, identity):
     ):
         wrong = match(mesh, mesh, preset=Preset((STAGE,)), init=mirrored, mirror="no")
     assert wrong.suspicious and wrong.distortion > 1.25
-    facts = summarize(wrong, {}, wrong.expected_error())
+    facts = summarize(wrong, {})
     assert f"{wrong.distortion:.2f}; above 1.25 limbs may be swapped" in facts.values()
     right = match(mesh, mesh, preset=Preset((STAGE,)), init=identity, mirror="no")
     assert right.distortion < 1.1 and not right.suspicious

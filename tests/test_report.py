@@ -89,7 +89,7 @@ def _check_results(
     assert summary["distortion"] == pytest.approx(1, abs=1e-3) and summary["suspicious"] is False
     assert summary["errors"]["refined"]["mean"] == errors["refined"].mean
     expected = found.expected_error()
-    facts = summarize(found, errors, expected)
+    facts = summarize(found, errors)
     shown = {label: text for label, text in summary["result"].items() if not label.startswith("time")}
     assert shown == {label: text for label, text in facts.items() if not label.startswith("time")}
     assert facts["vertices"] == "642 to 642" and facts["iterations"] == "1"
@@ -101,9 +101,7 @@ def _check_results(
     assert facts["probability of a wrong part"] == percentage(summary["wrong_probability"])
     assert replace(found, distortion=None).wrong_probability() is None
     assert facts["time, total"] == f"{sum(found.seconds.values()):.2f} s"
-    judged = summarize(
-        replace(found, preset=PRESETS["accurate"], distortion=1.3, suspicious=True), {}, expected
-    )
+    judged = summarize(replace(found, preset=PRESETS["accurate"], distortion=1.3, suspicious=True), {})
     assert judged["distortion (1 is none)"] == "1.30; above 1.12 limbs may be swapped"
     # The page shows the refined and the initial map in the convention of the refiner.
     refined, initial = embedded(page)["maps"]

@@ -13,7 +13,8 @@ from jaxsmw.creature import creature_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.mesh_files import read_mesh
-from jaxsmw.report.standing import guess_up, placement, stand, stand_pair
+from jaxsmw.report.rendering import camera_axes, choose_azimuth
+from jaxsmw.report.standing import facing, guess_up, placement, stand, stand_pair
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
@@ -114,14 +115,57 @@ def test_real_animals_stand_upright_in_every_convention(shared: Path, up: str) -
         assert guess_up(in_convention(y_up, up)) == up
 
 
-def test_stand_orients_faces_consistently() -> None:
+def test_stand_orients_faces_outward() -> None:
     mixed = TALL.faces.copy()
     mixed[::3] = mixed[::3, ::-1]
-    for faces in (TALL.faces, mixed):
+    for faces in (TALL.faces, TALL.faces[:, ::-1], mixed):
         standing = stand(replace(TALL, faces=faces))
         outwards = np.einsum("ij,ij->i", standing.vertex_normals, standing.vertices)
-        assert np.all(outwards > 0) or np.all(outwards < 0)
+        assert np.all(outwards > 0)
         assert np.array_equal(np.sort(standing.faces), np.sort(faces))
+
+
+def shell(cut: float) -> Mesh:
+    """Return the part of a sphere of radius 1 with z above the cut."""
+    whole = ellipsoid(1, 1, 1)
+    return replace(whole, faces=whole.faces[whole.vertices[whole.faces, 2].min(axis=1) > cut])
+
+
+def seen_outside(mesh: Mesh, up: Any = None) -> float:
+    """Return the projected area of the outside minus that of the inside, seen by the camera."""
+    standing = stand(mesh, up)
+    return float(facing(standing) @ camera_axes(choose_azimuth([standing]))[2])
+
+
+@pytest.mark.parametrize("cut", [-0.3, 0.1, 0.6])
+def test_the_camera_sees_the_outside_of_open_surfaces(cut: float) -> None:
+    cap = shell(cut)
+    assert np.linalg.norm(facing(stand(cap))) == pytest.approx((1 + cut) / 2, abs=0.1)
+    for degrees in (0, 40, 90, 135, 180, 260):
+        angle = np.radians(degrees)
+        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        turned = replace(cap, vertices=cap.vertices @ turn.T)
+        for file in (turned, replace(turned, faces=turned.faces[:, ::-1]), renumbered(turned)[0]):
+            assert seen_outside(file, "y") > 0.4 * np.linalg.norm(facing(stand(cap)))
+    # Shells that lie on their rim or hang from it are shown from outside, too.
+    for axes in ([0, 1, 2], [0, 2, 1], [2, 0, 1]):
+        for sign in (1, -1):
+            assert seen_outside(replace(cap, vertices=sign * cap.vertices[:, axes])) > 0
+
+
+def test_the_camera_stays_in_front_of_closed_bodies_with_holes() -> None:
+    punctured = replace(TALL, faces=TALL.faces[8:])
+    for mesh in (TALL, punctured):
+        assert choose_azimuth([stand(mesh, "y")]) == pytest.approx(
+            choose_azimuth([stand(TALL, "y")]), abs=0.1
+        )
+
+
+def test_a_mask_and_a_head_with_an_open_neck_look_at_the_camera(shared: Path) -> None:
+    mask, head = (read_mesh(shared / f"data/open_shells/{name}.off") for name in ("mask", "head"))
+    assert guess_up(mask) == guess_up(head) == "y"
+    azimuth = choose_azimuth([stand(mask), stand(head)])
+    assert abs(np.degrees(azimuth)) < 45 and seen_outside(mask) > 0.5
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -54,41 +54,35 @@ def measure_match(
 
 
 def estimate_error(correspondence: Correspondence, stopwatch: Stopwatch) -> Float[np.ndarray, " m"]:
-    """Return the expected error of each match (m,), as a fraction of sqrt(area of Y)."""
+    """Return the expected error of each match (m,), as a fraction of sqrt(area of Y).
+
+    The correspondence keeps the result, so the time of the first call is the time of the step.
+    """
     report_progress("expected error ...")
     with stopwatch.step("expected error"):
         return correspondence.expected_error()
 
 
-def show_quality(correspondence: Correspondence, expected_error: Float[np.ndarray, " m"] | None) -> None:
-    """Print one line with the quality of a match. If nothing is known about the quality, print nothing.
+def show_quality(correspondence: Correspondence) -> None:
+    """Print one line with the quality of a match."""
+    from jaxsmw.wording import percentage
 
-    **Arguments:**
-
-    - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y);
-      None if it was not computed.
-    """
     parts = []
     if correspondence.distortion is not None:
         parts.append(f"distortion {correspondence.distortion:.3f} (1 for isometries)")
-    if expected_error is not None:
-        mean = correspondence.mesh_x.average(expected_error)
-        parts.append(f"area-weighted mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)")
-        if (probability := correspondence.wrong_probability(expected_error)) is not None:
-            from jaxsmw.wording import percentage
-
-            parts.append(f"wrong on a part of the body with probability {percentage(probability)}")
+    mean = correspondence.mesh_x.average(correspondence.expected_error())
+    parts.append(f"area-weighted mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)")
+    if (probability := correspondence.wrong_probability()) is not None:
+        parts.append(f"wrong on a part of the body with probability {percentage(probability)}")
     if correspondence.suspicious:
         parts.append("the map is suspicious")
-    if parts:
-        show(f"quality:     {', '.join(parts)}")
+    show(f"quality:     {', '.join(parts)}")
 
 
 def write_match_report(
     directory: str,
     correspondence: Correspondence,
     errors: Mapping[str, GeodesicError],
-    expected_error: Float[np.ndarray, " m"],
     options: argparse.Namespace,
     stopwatch: Stopwatch,
     *,
@@ -101,7 +95,6 @@ def write_match_report(
     **Arguments:**
 
     - `errors`: the dictionary that `measure_match` returns.
-    - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
     - `registered`: the registered mesh if it was already computed; None otherwise.
     - `landmarks`: the landmarks on the source and on the target. The interactive page of the
@@ -117,7 +110,6 @@ def write_match_report(
             directory,
             correspondence,
             errors=errors,
-            expected_error=expected_error,
             settings=settings,
             seconds=stopwatch.steps(),
             up=up,
@@ -128,17 +120,10 @@ def write_match_report(
 
 
 def show_match(
-    correspondence: Correspondence,
-    errors: Mapping[str, GeodesicError],
-    expected_error: Float[np.ndarray, " m"] | None,
-    stopwatch: Stopwatch,
+    correspondence: Correspondence, errors: Mapping[str, GeodesicError], stopwatch: Stopwatch
 ) -> None:
-    """Print the quality of a match, the errors of all maps and the times of all steps on standard output.
-
-    `expected_error` is the expected error of each match (m,), as a fraction of sqrt(area of Y),
-    or None if it was not computed.
-    """
-    show_quality(correspondence, expected_error)
+    """Print the quality of a match, the errors of all maps and the times of all steps on standard output."""
+    show_quality(correspondence)
     for name, error in errors.items():
         show(f"{name + ' map:':12} {error}")
     show(f"time:        {stopwatch.summary()} (compilation included)")

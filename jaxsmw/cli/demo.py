@@ -75,9 +75,9 @@ def run(options: argparse.Namespace) -> None:
         write_pointwise_map(found_map, correspondence.pointwise_map)
     report_written(source, target, true_points, found_map)
     errors = measure_match(correspondence, truth, {}, stopwatch, {})
-    expected = estimate_error(correspondence, stopwatch)
-    write_match_report(options.output, correspondence, errors, expected, options, stopwatch, up="y")
-    show_match(correspondence, errors, expected, stopwatch)
+    estimate_error(correspondence, stopwatch)
+    write_match_report(options.output, correspondence, errors, options, stopwatch, up="y")
+    show_match(correspondence, errors, stopwatch)
     show(f"Open {directory / 'report.html'} or {directory / 'correspondence.png'} to see the result.")
 
 

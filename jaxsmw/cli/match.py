@@ -128,9 +128,7 @@ def run(options: argparse.Namespace) -> None:
         index_base=options.index_base,
     )
     others = _write_files(options, correspondence, stopwatch)
-    expected = None
-    if options.expected_error or options.report:
-        expected = estimate_error(correspondence, stopwatch)
+    expected = estimate_error(correspondence, stopwatch)
     if options.expected_error:
         with stopwatch.step("writing"):
             _write_numbers(options.expected_error, expected)
@@ -139,11 +137,9 @@ def run(options: argparse.Namespace) -> None:
         _write_overlap(options.overlap, correspondence, stopwatch)
     settings = evaluation_settings(options)
     errors = measure_match(correspondence, truth, settings, stopwatch, others)
-    if expected is not None and options.report:
-        write_match_report(
-            options.report, correspondence, errors, expected, options, stopwatch, up=options.up
-        )
-    show_match(correspondence, errors, expected, stopwatch)
+    if options.report:
+        write_match_report(options.report, correspondence, errors, options, stopwatch, up=options.up)
+    show_match(correspondence, errors, stopwatch)
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -133,9 +133,9 @@ def run(options: argparse.Namespace) -> None:
                 "skin or other data) for --attributes: leave the option out, or give a source that has some."
             )
         landmarks = _read_landmarks(options, source) if options.landmarks else None
-    correspondence, registered, expected = _register(options, source, target, stopwatch)
+    correspondence, registered = _register(options, source, target, stopwatch)
     if correspondence is not None:
-        show_quality(correspondence, expected)
+        show_quality(correspondence)
     for sentence in registered.sentences():
         show(sentence)
     if registered.looks_wrong:
@@ -163,13 +163,13 @@ def run(options: argparse.Namespace) -> None:
         _write(options.attributes, carried, stopwatch)
     transferred = None
     if landmarks:
+        expected = None if correspondence is None else correspondence.expected_error()
         transferred = _transfer_landmarks(options, landmarks, expected, registered, stopwatch)
-    if correspondence is not None and expected is not None and options.report:
+    if correspondence is not None and options.report:
         write_match_report(
             options.report,
             correspondence,
             {},
-            expected,
             options,
             stopwatch,
             up=options.up,
@@ -255,11 +255,10 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
 
 def _register(
     options: argparse.Namespace, source: MeshData, target: MeshData, stopwatch: Stopwatch
-) -> tuple[Correspondence | None, RegisteredMesh, Float[np.ndarray, " m"] | None]:
-    """Return the `Match`, the registered mesh and the expected errors (m,), one for each vertex of X.
+) -> tuple[Correspondence | None, RegisteredMesh]:
+    """Return the match, which is None if a map is given, and the registered mesh.
 
-    If a map is given, the match and the expected error are None. The expected error is also None if neither
-    landmarks nor a report need it.
+    The match already contains its expected error.
     """
     from jaxsmw.matching.pair import Pair
     from jaxsmw.runtime.threads import one_blas_thread
@@ -276,10 +275,6 @@ def _register(
             scale=options.scale,
             index_base=index_base,
         )
-        if not (options.landmarks or options.report):
-            report_progress("registered mesh ...")
-            with stopwatch.step("registered mesh"):
-                return correspondence, correspondence.registered_mesh(stiffness=stiffness), None
         report_progress("registered mesh and expected error ...")
         with (
             stopwatch.step("registered mesh and expected error"),
@@ -288,14 +283,15 @@ def _register(
         ):
             expected = executor.submit(correspondence.expected_error)
             registered = correspondence.registered_mesh(stiffness=stiffness)
-            return correspondence, registered, expected.result()
+            expected.result()
+            return correspondence, registered
     report_progress("registered mesh ...")
     with stopwatch.step("registered mesh"):
         (pointwise_map,) = read_maps([options.map], *meshes, index_base=index_base).values()
         pair = Pair.make(*meshes, partial=options.partial, scale=options.scale or 1.0)
         scale = pair.scale if pair.partial else None
         points = points_of_map(*meshes, pointwise_map, scale=scale)
-        return None, register_mesh(*meshes, points, stiffness=stiffness, scale=scale), None
+        return None, register_mesh(*meshes, points, stiffness=stiffness, scale=scale)
 
 
 def _transfer_landmarks(

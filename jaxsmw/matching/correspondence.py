@@ -348,23 +348,17 @@ class Correspondence:
             overlap(self.pair.reversed(), reverse, self.pointwise_map),
         )
 
-    def wrong_probability(self, expected_error: Float[np.ndarray, " m"] | None = None) -> float | None:
+    def wrong_probability(self) -> float | None:
         """Estimate the probability that the map is wrong on a part of the body, without ground truth.
 
         A map is called wrong if at least 2 % of X's area have errors above 0.25 times the square root of Y's
         area, for example because limbs are swapped. `jaxsmw.matching.scores` explains the estimate.
 
-        **Arguments:**
-
-        - `expected_error`: the expected error of each match (m,), divided by the square root of Y's area. By
-          default, `Correspondence.expected_error` computes it.
-
         **Returns:** A probability, from 0 to 1; None if `distortion` is None.
         """
         if self.distortion is None:
             return None
-        expected = self._expected_error if expected_error is None else expected_error
-        return wrong_probability(self.distortion, float(self.mesh_x.average(expected)))
+        return wrong_probability(self.distortion, float(self.mesh_x.average(self._expected_error)))
 
     @functools.cached_property
     def _expected_error(self) -> Float[np.ndarray, " m"]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
@@ -20,11 +21,11 @@ from jaxsmw.core.functional_map import Convention
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, error_colors, position_colors
-from jaxsmw.report.inputs import check_error_limit, check_errors, check_functional_map, check_map, describe
+from jaxsmw.report.inputs import check_error_limit, check_errors, check_functional_map, check_map
 from jaxsmw.report.rendering import camera_axes, choose_azimuth, render
 from jaxsmw.report.standing import stand, stand_pair
 from jaxsmw.runtime.files import atomic_write, check_writable
-from jaxsmw.wording import printable
+from jaxsmw.wording import printable, short_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -583,8 +584,8 @@ def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margi
     height, width = body_height + 2 * gap + header, sum(widths) + right_margin
 
     figure = _new_figure(width / _DPI, height / _DPI)
-    left = 0
-    for panel, panel_width in zip(panels, widths, strict=True):
+    left, names = 0, _fitting_names([panel.mesh.name for panel in panels])
+    for panel, panel_width, name in zip(panels, widths, names, strict=True):
         picture = render(
             panel.mesh, panel.colors, azimuth=angle, scale=scale, width=panel_width, height=body_height
         )
@@ -595,11 +596,10 @@ def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margi
         if captioned:
             center, top = (left + panel_width / 2) / width, 1 - gap / height
             figure.text(center, top, panel.role, ha="center", va="top", fontsize=11, color=_INK)
-            name, size = describe(panel.mesh)
             figure.text(
                 center,
                 top - 50 / height,
-                f"{_shorten(name)}\n{size}",
+                f"{name}\n{len(panel.mesh.vertices)} vertices",
                 ha="center",
                 va="top",
                 fontsize=7.5,
@@ -610,9 +610,17 @@ def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margi
     return figure
 
 
-def _shorten(name: str) -> str:
-    name, half = printable(name), _LONGEST_NAME // 2
-    return name if len(name) <= _LONGEST_NAME else f"{name[: half - 1]}…{name[-half:]}"
+def _fitting_names(paths: Sequence[str]) -> list[str]:
+    """Return short names of files that fit above a panel. Different files keep different names."""
+    names, half = [printable(name) for name in short_names(paths)], _LONGEST_NAME // 2
+    # If the ends of long names are equal, the names are shown from shortly before their first difference.
+    first_difference = next((i for i, letters in enumerate(zip_longest(*names)) if len(set(letters)) > 1), 0)
+    for start in (0, max(first_difference - half // 2, 0)):
+        rest = [f"…{name[start:]}" if start else name for name in names]
+        fitting = [n if len(n) <= _LONGEST_NAME else f"{n[: half - 1]}…{n[-half:]}" for n in rest]
+        if len(set(fitting)) == len(set(names)):
+            break
+    return fitting
 
 
 def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:

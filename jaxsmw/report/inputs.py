@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int, Int64
@@ -88,10 +87,3 @@ def check_functional_map(
             "are not finite; give a non-empty matrix of finite numbers."
         )
     return matrix
-
-
-def describe(mesh: Mesh) -> tuple[str, str]:
-    """Return the caption of a mesh: its file name without the directory, and its number of vertices."""
-    # File names may contain bytes that are not valid UTF-8. Question marks replace these bytes.
-    name = Path(mesh.name).name.encode("utf-8", "replace").decode()
-    return name, f"{len(mesh.vertices)} vertices"

@@ -20,7 +20,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, position_colors
-from jaxsmw.report.inputs import check_error_limit, check_errors, check_map, describe
+from jaxsmw.report.inputs import check_error_limit, check_errors, check_map
 from jaxsmw.report.page_data import (
     COLOR_SCALES,
     encode,
@@ -36,6 +36,7 @@ from jaxsmw.report.rendering import ELEVATION, choose_azimuth
 from jaxsmw.report.standing import stand_pair
 from jaxsmw.report.template import fill_template
 from jaxsmw.runtime.files import atomic_write
+from jaxsmw.wording import short_names
 
 # If the bodies are wider than this multiple of their height, narrow screens show one body above the other.
 _WIDE = 0.65
@@ -165,9 +166,10 @@ def write_page(
     error_names = list(dict.fromkeys(of for shown in maps.values() for of in shown.errors))
     first = check_map(mesh_x, mesh_y, next(iter(maps.values())).pointwise_map)
     shown_x, shown_y = stand_pair(mesh_x, mesh_y, up, first)
+    name_x, name_y = short_names([mesh_x.name, mesh_y.name])
     data = _encode_view(shown_x, shown_y) | {
-        "x": encode_shape(mesh_x, shown_x),
-        "y": encode_shape(mesh_y, shown_y),
+        "x": encode_shape(name_x, mesh_x, shown_x),
+        "y": encode_shape(name_y, mesh_y, shown_y),
         "maps": encoded,
         "plain": np.round(255 * PLAIN).astype(int).tolist(),
         "scales": {name: encode_colors(colors) for name, colors in COLOR_SCALES.items()},
@@ -183,8 +185,8 @@ def write_page(
     modes = _modes(maps, error_names, has_spectra=filters > 0)
     fragments = {
         "title": html.escape(title),
-        "source": html.escape(" · ".join(describe(mesh_x))),
-        "target": html.escape(" · ".join(describe(mesh_y))),
+        "source": html.escape(f"{name_x} · {len(mesh_x.vertices)} vertices"),
+        "target": html.escape(f"{name_y} · {len(mesh_y.vertices)} vertices"),
         "last_vertex": str(len(mesh_x.vertices) - 1),
         "last_filter": str(max(filters - 1, 0)),
         "map_choices": _choices("map", "Map", dict(enumerate(maps))) if len(maps) > 1 else "",

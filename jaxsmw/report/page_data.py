@@ -14,7 +14,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.executor import common_range
 from jaxsmw.report.colors import error_colors, signed_colors
-from jaxsmw.report.inputs import check_functional_map, describe
+from jaxsmw.report.inputs import check_functional_map
 from jaxsmw.report.standing import placement
 
 # A page contains between `_FEWEST` and `_EIGENVECTORS` eigenvectors per shape, or no eigenvectors. The
@@ -89,7 +89,7 @@ def encode_mesh(mesh: Mesh) -> dict[str, Any]:
     return {"vertices": encode(mesh.vertices, "<f4"), "faces": encode(mesh.faces, "<u4")}
 
 
-def encode_shape(mesh: Mesh, standing: Mesh) -> dict[str, Any]:
+def encode_shape(name: str, mesh: Mesh, standing: Mesh) -> dict[str, Any]:
     """Encode a shape: its upright mesh, its name, and the transformation from the page to its file.
 
     The page stores the positions of vertices in float32, but computes in float64. To convert a point on a
@@ -100,12 +100,13 @@ def encode_shape(mesh: Mesh, standing: Mesh) -> dict[str, Any]:
 
     **Arguments:**
 
+    - `name`: the name of the shape on the page.
     - `mesh`: the mesh in the coordinates of its file.
     - `standing`: the mesh in the coordinates of the page; a result of `jaxsmw.report.standing.stand_pair`.
     """
     matrix, offset = placement(mesh, standing)
     return encode_mesh(standing) | {
-        "name": describe(mesh)[0],
+        "name": name,
         "placement": {"matrix": matrix.tolist(), "offset": offset.tolist()},
     }
 

@@ -10,12 +10,17 @@ from scipy.ndimage import uniform_filter
 
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report.colors import linear_to_srgb, srgb_to_linear
+from jaxsmw.report.standing import facing
 
 # The preferred azimuth of the viewer in radians, measured from +z towards +x. At this azimuth, the viewer is
 # in front of the body and a little to the side.
 _PREFERRED_AZIMUTH = np.radians(30)
 ELEVATION = np.radians(8)
 """The angle at which the viewer looks down on the body, in radians."""
+
+# An open surface is seen from its outside rather than from the preferred side if the projected area of the
+# outside exceeds the projected area of the inside by more than about a tenth of the surface area.
+_OUTSIDE_WEIGHT = 10.0
 
 # The first three numbers of each light are its direction in camera coordinates (right, up, towards the
 # viewer). The last number is the strength of the light.
@@ -35,7 +40,8 @@ def choose_azimuth(meshes: Sequence[Mesh]) -> float:
     people from the front and animals from the side. Directions close to a preferred direction r are favoured.
     The direction r shows a body from the front and a little from the side. Let M be the sum of the horizontal
     covariance matrices of all n meshes, each scaled to trace 1. The chosen direction is the eigenvector of
-    M - 0.8 n r r^T with the smallest eigenvalue.
+    M - 0.8 n r r^T with the smallest eigenvalue. Its sign is chosen such that the viewer is in front of the
+    bodies, unless they are open surfaces whose outside faces the other way.
 
     **Arguments:**
 
@@ -51,7 +57,8 @@ def choose_azimuth(meshes: Sequence[Mesh]) -> float:
         covariance = (mesh.vertex_areas * horizontal.T) @ horizontal
         matrix += covariance / max(np.trace(covariance), 1e-12)
     direction = np.linalg.eigh(matrix)[1][:, 0]
-    direction *= np.sign(direction @ preferred)
+    outside = np.mean([facing(mesh)[[0, 2]] for mesh in meshes], axis=0)
+    direction *= np.sign(direction @ (preferred + _OUTSIDE_WEIGHT * outside))
     return float(np.arctan2(*direction))
 
 

@@ -32,10 +32,10 @@ _CONVENTIONS: tuple[Axis, ...] = ("y", "z", "-y")
 # files, the spread along z is at least 0.47 times the spread along y. The only exceptions are two animals
 # that leap or crouch.
 _SLENDER = 0.45
-# The numbers that are added to the score of the usual axis, which is y or z (see `guess_up`). For people who
-# stand on one foot with raised arms, an upside-down axis scores up to 0.18 higher than the correct axis. For
-# bodies that sit or leap, a wrong axis scores up to 0.09 higher than the correct axis.
-_HEAD_STARTS: dict[Axis, float] = {"y": 0.25, "z": 0.1}
+# The number that is added to the score of the usual axis (see `guess_up`). For people who stand on one foot
+# with raised arms, an upside-down axis scores up to 0.18 higher than the correct axis. For bodies that sit or
+# leap, a wrong axis scores up to 0.09 higher than the correct axis.
+_HEAD_START_IF_SLENDER, _HEAD_START = 0.25, 0.1
 _STABILITY_WEIGHT = 0.25
 # Stability is clipped to this range, in units of the square root of the area. Outside of the range, stability
 # does not show which axis is correct.
@@ -60,8 +60,7 @@ _RIGID, _MUCH_NEARER = 0.15, 2.0
 def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
     """Turn a mesh upright, scale it to area 1, and centre its bounding box on the origin.
 
-    Faces are reoriented where needed, so that adjacent faces have consistent orientations. The numbering of
-    the vertices does not change.
+    Faces are reoriented such that their normals point outward. The numbering of the vertices does not change.
 
     **Arguments:**
 
@@ -73,21 +72,37 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
 
     **Raises:** `InputError` if the mesh has no area or `up` is not an axis.
     """
-    _check_area(mesh)
+    mesh = _outward(mesh)
     if up is None:
-        up = guess_up(mesh)
+        up = _guess_up(mesh)
     else:
         check_choice(up, Axis, "an axis")
     vertices = mesh.vertices @ np.array(_STAND[up], dtype=float).T / np.sqrt(mesh.area)
-    faces, _ = igl.bfs_orient(mesh.faces)
-    return replace(mesh, vertices=_centered(vertices, mesh), faces=faces.astype(np.int64))
+    return replace(mesh, vertices=_centered(vertices, mesh))
 
 
-def _check_area(mesh: Mesh) -> None:
+def _outward(mesh: Mesh) -> Mesh:
+    """Return the mesh with outward normals: on average, the normals of a patch point away from its centre."""
     if not mesh.area > 0:
         raise InputError(
             f"{mesh.name}: there is nothing to draw because the faces have no area; give a surface."
         )
+    faces, patches = igl.bfs_orient(mesh.faces)
+    faces, _ = igl.orient_outward(mesh.vertices, faces, patches[:, None])
+    return replace(mesh, faces=faces.astype(np.int64))
+
+
+def facing(mesh: Mesh) -> Float64[np.ndarray, " 3"]:
+    """Return the direction that the outside of an open surface faces.
+
+    The result is the mean of the outward normals. For example, the result for a mask is the direction of the
+    nose, with a length near 0.6. The result for a closed surface is 0.
+
+    **Arguments:**
+
+    - `mesh`: a surface of positive area whose normals point outward.
+    """
+    return mesh.area_vectors.sum(axis=0) / (2 * mesh.area)
 
 
 def stand_pair(
@@ -171,8 +186,8 @@ def guess_up(mesh: Mesh) -> Axis:
     The score of an axis is the sum of two terms. The first term measures the limbs that hang down along the
     axis (`_hanging_limbs`). Legs and arms usually hang down, and only the head points up. The second term
     measures how stably the body would stand (`_stability`). The usual axis is y for a body that is slender
-    along y, such as a person. For other bodies, the usual axis is z. The usual axis is returned unless the
-    score of another axis is clearly higher.
+    along y, such as a person, and for an open surface that faces along z, such as a mask. For other bodies,
+    the usual axis is z. The usual axis is returned unless the score of another axis is clearly higher.
 
     The guesses for several data sets were checked by eye. The guess is right for all 70 FAUST bodies, 41 of
     43 TOSCA bodies and 30 of 32 SMAL animals. The guess is also right for 17 of 19 people of SHREC'19 and all
@@ -187,11 +202,17 @@ def guess_up(mesh: Mesh) -> Axis:
 
     **Raises:** `InputError` if the mesh has no area.
     """
-    _check_area(mesh)
+    return _guess_up(_outward(mesh))
+
+
+def _guess_up(mesh: Mesh) -> Axis:
+    """Guess the axis that points up, for a mesh whose normals point outward."""
     unit = np.sqrt(mesh.area)
     center = mesh.vertex_areas @ mesh.vertices / mesh.area
-    spread = np.sqrt(mesh.vertex_areas @ (mesh.vertices - center) ** 2)
-    usual: Axis = "z" if spread[2] > _SLENDER * spread[1] else "y"
+    spread = np.sqrt(mesh.vertex_areas @ (mesh.vertices - center) ** 2) / mesh.area
+    too_thick = spread[2] - _SLENDER * spread[1]
+    preference = _suits_opening(mesh, "y") - _suits_opening(mesh, "z")
+    usual: Axis = "y" if too_thick <= max(preference, 0) else "z"
     points, edges = _merge_vertices(mesh, _CELL * unit)
     points = (points - center) / unit
     scores: dict[Axis, float] = {}
@@ -199,8 +220,16 @@ def guess_up(mesh: Mesh) -> Axis:
         across, upwards, forward = np.array(_STAND[axis], dtype=float) @ points.T
         ground = np.stack([across, forward], axis=1)
         scores[axis] = _hanging_limbs(upwards, edges) + _STABILITY_WEIGHT * _stability(upwards, ground)
-    scores[usual] += _HEAD_STARTS[usual]
+    scores[usual] += _HEAD_START_IF_SLENDER if too_thick <= 0 else _HEAD_START
     return max(scores, key=scores.__getitem__)
+
+
+def _suits_opening(mesh: Mesh, up: Axis) -> float:
+    """Return how well flat open surfaces face the camera, and how well deep ones stand on their rim."""
+    outside = facing(mesh)
+    across, upwards, forward = np.array(_STAND[up], dtype=float) @ outside
+    flatness = float(np.linalg.norm(outside))
+    return 2 * flatness * float(np.hypot(across, forward)) + (1 - flatness) * float(upwards)
 
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:

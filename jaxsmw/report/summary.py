@@ -44,7 +44,7 @@ from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.provenance import machine, versions
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
-from jaxsmw.wording import percentage
+from jaxsmw.wording import percentage, short_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -81,7 +81,6 @@ def write_report(
     correspondence: Correspondence,
     *,
     errors: Mapping[str, GeodesicError] | None = None,
-    expected_error: Float[np.ndarray, " m"] | None = None,
     settings: Mapping[str, Any] | None = None,
     seconds: Mapping[str, float] | None = None,
     up: Axis | None = None,
@@ -102,8 +101,6 @@ def write_report(
     - `errors`: a dictionary from the name of each map to its `GeodesicError`. The last entry must contain the
       errors of `correspondence.pointwise_map`. An entry named `initial` must contain the errors of
       `correspondence.initial_map`.
-    - `expected_error`: the expected error of each match (m,), divided by the square root of Y's area. By
-      default, `Correspondence.expected_error` computes it.
     - `settings`: a dictionary of settings to include in `summary.json`. The settings must be serialisable as
       JSON.
     - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds. The
@@ -124,11 +121,10 @@ def write_report(
     directory = make_directory(directory)
     errors = errors or {}
     steps = dict(correspondence.seconds if seconds is None else seconds)
-    expected = expected_error
-    if expected is None:
+    if not any("expected error" in step for step in steps):
         with timed("expected error", steps):
-            expected = correspondence.expected_error()
-    shown = _shown_maps(correspondence, errors, expected)
+            correspondence.expected_error()
+    shown = _shown_maps(correspondence, errors)
     with timed("pictures", steps):
         pictures, captions = _save_figures(directory, correspondence, shown["refined"].errors, errors, up)
     wavelets = _last_wavelets(correspondence)
@@ -142,7 +138,7 @@ def write_report(
         title=_title(correspondence.mesh_x, correspondence.mesh_y),
         spectra=(correspondence.spectrum_x, correspondence.spectrum_y),
         refiner=WaveletPreservation() if wavelets is None else wavelets[0],
-        statistics=summarize(correspondence, others, expected, steps),
+        statistics=summarize(correspondence, others, steps),
         error_meanings=_ERROR_MEANINGS,
         figures=[(caption, path.read_bytes()) for path, caption in captions.items()],
         up=up,
@@ -151,10 +147,10 @@ def write_report(
     )
     summary = {
         "settings": dict(settings or {}),
-        "result": summarize(correspondence, errors, expected, steps),
+        "result": summarize(correspondence, errors, steps),
         "distortion": correspondence.distortion,
         "suspicious": correspondence.suspicious,
-        "wrong_probability": correspondence.wrong_probability(expected),
+        "wrong_probability": correspondence.wrong_probability(),
         "errors": {name: error.as_dictionary() for name, error in errors.items()},
         "seconds": {**steps, "total": sum(steps.values())},
         "provenance": provenance(),
@@ -164,11 +160,7 @@ def write_report(
     return [directory / "report.html", *pictures, directory / "summary.json"]
 
 
-def _shown_maps(
-    correspondence: Correspondence,
-    errors: Mapping[str, GeodesicError],
-    expected_error: Float[np.ndarray, " m"],
-) -> dict[str, ShownMap]:
+def _shown_maps(correspondence: Correspondence, errors: Mapping[str, GeodesicError]) -> dict[str, ShownMap]:
     """Return the refined map and the initial map, with the errors and functional maps that the page shows."""
     m = len(correspondence.pointwise_map)
     spectra = correspondence.spectrum_x, correspondence.spectrum_y
@@ -176,7 +168,7 @@ def _shown_maps(
     final, initial = list(errors.values())[-1] if errors else None, errors.get("initial")
     refined = ShownMap(
         correspondence.pointwise_map,
-        _named_errors(final, m) | {EXPECTED_ERROR: expected_error},
+        _named_errors(final, m) | {EXPECTED_ERROR: correspondence.expected_error()},
         correspondence.functional_map,
         convention,
         _error_statistics(final),
@@ -329,7 +321,7 @@ def _encoded(
 
 
 def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
-    return f"{Path(mesh_x.name).name} to {Path(mesh_y.name).name}"
+    return " to ".join(short_names([mesh_x.name, mesh_y.name]))
 
 
 def _error_statistics(error: GeodesicError | None) -> dict[str, str]:
@@ -386,7 +378,6 @@ def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
 def summarize(
     correspondence: Correspondence,
     errors: Mapping[str, GeodesicError],
-    expected_error: Float[np.ndarray, " m"],
     seconds: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
     """Describe the sizes, errors and times of a match as text.
@@ -395,7 +386,6 @@ def summarize(
 
     - `correspondence`: the result of `match`.
     - `errors`: a dictionary from the name of each map to its `GeodesicError`.
-    - `expected_error`: the expected error of each match (m,), as a fraction of sqrt(area of Y).
     - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds. The
       default is `correspondence.seconds`.
 
@@ -419,8 +409,9 @@ def summarize(
         if correspondence.suspicious and correspondence.distortion >= limit:
             suspicion = f"; above {limit} limbs may be swapped"
         facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
-    facts["expected error, mean"] = f"{correspondence.mesh_x.average(expected_error):.4f} √area"
-    if (probability := correspondence.wrong_probability(expected_error)) is not None:
+    expected = correspondence.mesh_x.average(correspondence.expected_error())
+    facts["expected error, mean"] = f"{expected:.4f} √area"
+    if (probability := correspondence.wrong_probability()) is not None:
         facts["probability of a wrong part"] = percentage(probability)
     steps = correspondence.seconds if seconds is None else seconds
     times = {**steps, "total": sum(steps.values())}
