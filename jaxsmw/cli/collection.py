@@ -10,7 +10,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, MirrorCollection, PresetName
+from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, EDGES_PER_SHAPE, MirrorCollection, PresetName
 from jaxsmw.cli.arguments import add_weld, path, refuse_without, whole_number
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
@@ -89,7 +89,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--edges",
         metavar="N",
         type=whole_number(1, _MOST_EDGES),
-        help=f"number of matched pairs divided by the number of meshes, at most {_MOST_EDGES} (default: 4)",
+        default=EDGES_PER_SHAPE,
+        help=f"number of matched pairs divided by the number of meshes, at most {_MOST_EDGES} (default: "
+        "%(default)s)",
     )
     parser.add_argument(
         "--scale",
@@ -146,11 +148,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Match all meshes of a directory, and write maps, registered meshes, the shape model and a page.
-
-    **Raises:** `InputError` if an option or the directory cannot be used, or if fewer than two meshes can be
-    matched. `ArithmeticError` if a computation fails.
-    """
+    """Match all meshes of a directory, and write maps, registered meshes, the shape model and a page."""
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         files = _mesh_files(options)
@@ -446,11 +444,7 @@ def _match(
     from tqdm import tqdm
 
     from jaxsmw.collection.matching import match_collection
-    from jaxsmw.collection.settings import CollectionSettings
 
-    settings = CollectionSettings()
-    if options.edges:
-        settings = CollectionSettings(edges_per_shape=float(options.edges))
     bars: dict[str, tqdm] = {}
 
     def progress(step: str, done: int, number: int) -> None:
@@ -467,7 +461,7 @@ def _match(
         preset=options.preset,
         template=None if options.template is None else list(data).index(Path(options.template).name),
         mirror=_mirror(options, data),
-        settings=settings,
+        edges_per_shape=options.edges,
         seed=options.seed,
         directory=work,
         executor=executor,

@@ -8,14 +8,16 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.sparse.csgraph import minimum_spanning_tree
 
+from jaxsmw.choices import EDGES_PER_SHAPE
 from jaxsmw.collection.consistency import Edge, check_pairs
-from jaxsmw.collection.settings import CollectionSettings
 from jaxsmw.collection.shapes import PreparedShape
 from jaxsmw.errors import InputError, check_number, check_whole_number
 from jaxsmw.runtime.cache import Store
 
 # Low eigenvalues describe the proportions of a body. High eigenvalues depend on the mesh.
 _COMPARED_EIGENVALUES = 50
+# (Table R26 of docs/research_log.md)
+_RANDOM_SHARE = 0.25
 
 
 def shape_distances(shapes: Sequence[PreparedShape]) -> Float64[np.ndarray, "N N"]:
@@ -59,8 +61,8 @@ def _moments(shape: PreparedShape) -> Float64[np.ndarray, " q"]:
 def choose_edges(
     distances: Float64[np.ndarray, "N N"],
     *,
-    edges_per_shape: float | int = 4,
-    random_share: float = 0.25,
+    edges_per_shape: float | int = EDGES_PER_SHAPE,
+    random_share: float = _RANDOM_SHARE,
     given: Sequence[Edge] = (),
     seed: int = 0,
 ) -> list[Edge]:
@@ -135,34 +137,24 @@ def choose_edges(
 
 
 def extended_graph(
-    shapes: Sequence[PreparedShape], settings: CollectionSettings, *, seed: int = 0, store: Store
+    shapes: Sequence[PreparedShape], edges_per_shape: float | int, *, seed: int, store: Store
 ) -> list[Edge]:
-    """Choose the pairs of a collection that are matched, and keep them in a store.
+    """Choose edges as `choose_edges` does, and keep those of an earlier call with the same store.
 
-    The edges of an earlier call with the same store, settings and seed are kept. Edges of removed shapes are
-    dropped, and edges of new shapes are added.
-
-    **Arguments:**
-
-    - `shapes`: the shapes, with names that differ from each other.
-    - `settings`: the settings of the graph.
-    - `seed`: the seed of the random edges.
-    - `store`: the store of the collection.
-
-    **Returns:** The edges (i, j) with i < j, in ascending order; see `choose_edges`.
+    Edges of removed shapes are dropped, and edges of new shapes are added. The names of shapes identify them.
     """
     names = [shape.mesh.name for shape in shapes]
-    inputs = (repr(settings.edges_per_shape), settings.random_share, seed)
+    inputs = (float(edges_per_shape), _RANDOM_SHARE, seed)
     stored = store.load("graph", inputs)
     given: list[Edge] = []
     if stored is not None:
         row = {name: number for number, name in enumerate(names)}
-        pairs = [(row.get(a), row.get(b)) for a, b in stored["edges"].reshape(-1, 2).tolist()]
-        given = [(min(a, b), max(a, b)) for a, b in pairs if a is not None and b is not None]
+        pairs = stored["edges"].reshape(-1, 2).tolist()
+        given = [(row[a], row[b]) for a, b in pairs if a in row and b in row]
     edges = choose_edges(
         shape_distances(shapes),
-        edges_per_shape=settings.edges_per_shape,
-        random_share=settings.random_share,
+        edges_per_shape=edges_per_shape,
+        random_share=_RANDOM_SHARE,
         given=given,
         seed=seed,
     )
