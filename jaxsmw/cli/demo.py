@@ -46,11 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Generate a creature in two poses, match the poses, and write the meshes, the map and the report.
-
-    **Raises:** `InputError` if an option cannot be used or an output cannot be written. `ArithmeticError` if
-    a computation fails.
-    """
+    """Generate a creature in two poses, match the poses, and write the meshes, the map and the report."""
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         check_preset(options)

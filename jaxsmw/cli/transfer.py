@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import math
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.cli.arguments import (
@@ -16,6 +15,7 @@ from jaxsmw.cli.arguments import (
     add_up,
     add_weld,
     path,
+    positive_number,
     refuse_without,
 )
 from jaxsmw.cli.conclusion import show_quality, write_match_report
@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stiffness",
         metavar="LENGTH",
-        type=_positive,
+        type=positive_number,
         help="length below which noise of the map is smoothed, in units of the square root of the target's "
         "area (default: 0.005)",
     )
@@ -101,21 +101,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_index_base(parser)
 
 
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text[:60]!r} is not a positive number")
-    return value
-
-
 def run(options: argparse.Namespace) -> None:
-    """Match two meshes or read a map, write the requested files, and print the quality and the times.
-
-    **Raises:** `InputError` if an option or a file cannot be used. `ArithmeticError` if a computation fails.
-    """
+    """Match two meshes or read a map, write the requested files, and print the quality and the times."""
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         _check(options)
@@ -256,11 +243,7 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
 def _register(
     options: argparse.Namespace, source: MeshData, target: MeshData, stopwatch: Stopwatch
 ) -> tuple[Correspondence | None, RegisteredMesh, Float[np.ndarray, " m"] | None]:
-    """Return the `Match`, the registered mesh and the expected errors (m,), one for each vertex of X.
-
-    If a map is given, the match and the expected error are None. The expected error is also None if neither
-    landmarks nor a report need it.
-    """
+    """Return the match unless a map is given, the registered mesh, and the expected errors if needed."""
     from jaxsmw.matching.pair import Pair
     from jaxsmw.runtime.threads import one_blas_thread
     from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, points_of_map, register_mesh
@@ -305,11 +288,7 @@ def _transfer_landmarks(
     registered: RegisteredMesh,
     stopwatch: Stopwatch,
 ) -> Landmarks:
-    """Transfer the landmarks, print their expected errors, write them if requested, and return them.
-
-    `expected_error` is the expected error of each match (m,), as a fraction of sqrt(area of Y),
-    or None if a map was given.
-    """
+    """Transfer the landmarks, print their expected errors, write them if requested, and return them."""
     from jaxsmw.io.landmark_files import write_landmark_file
     from jaxsmw.transfer.landmarks import transfer_landmarks
 
@@ -325,7 +304,7 @@ def _transfer_landmarks(
 
 
 def _show_landmarks(found: TransferredLandmarks) -> None:
-    """Print the expected error of each landmark, in the unit of the target, and mark large errors."""
+    """Print the expected error of each landmark, and mark large errors."""
     if found.expected_errors is None:
         return
     import numpy as np
@@ -342,7 +321,7 @@ def _show_landmarks(found: TransferredLandmarks) -> None:
 _LARGE = 2
 
 
-def _write(file: str, data: Any, stopwatch: Stopwatch) -> None:
+def _write(file: str, data: MeshData, stopwatch: Stopwatch) -> None:
     """Write a mesh with its data, and print notes about data that the file does not contain."""
     from jaxsmw.io.mesh_data import write_mesh_data
 

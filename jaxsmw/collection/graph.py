@@ -24,10 +24,9 @@ def shape_distances(shapes: Sequence[PreparedShape]) -> Float64[np.ndarray, "N N
     """Compute how much the shapes of a collection differ, without matching them.
 
     The distance of two shapes is the root mean square of two parts, each divided by its median over all
-    pairs. The first part compares the logarithms of the eigenvalues of the Laplacian (Reuter, Wolter,
-    Peinecke, "Laplace-Beltrami spectra as Shape-DNA of surfaces and solids", 2006). The eigenvalues hardly
-    change with the pose. The second part compares the second moments of the descriptors over the surface.
-    Unlike the eigenvalues, these moments change with the pose.
+    pairs. The first part compares the logarithms of the eigenvalues of the Laplacian, which hardly change
+    with the pose (Reuter, Wolter, Peinecke, "Laplace-Beltrami spectra as Shape-DNA of surfaces and solids",
+    2006). The second part compares the second moments of the descriptors over the surface, which do change.
 
     **Arguments:**
 
@@ -68,15 +67,14 @@ def choose_edges(
 ) -> list[Edge]:
     """Choose the pairs of a collection that are matched.
 
-    The graph consists of three parts. The minimum spanning tree connects all shapes through similar shapes.
-    Edges to the nearest neighbours of each shape form cycles. The other edges are random. Random edges keep
-    the paths between any two shapes short. They also reveal errors that all similar shapes share.
+    The minimum spanning tree connects all shapes through similar shapes. Edges to the nearest neighbours of
+    each shape form cycles. The other edges are random: they keep the paths between any two shapes short, and
+    reveal errors that all similar shapes share.
 
     **Arguments:**
 
     - `distances`: the distances of the shapes (N, N), in any unit; see `shape_distances`.
-    - `edges_per_shape`: the number of edges divided by N. If the shapes form fewer pairs than this number of
-      edges, all pairs are chosen.
+    - `edges_per_shape`: the number of edges divided by N, if there are so many pairs.
     - `random_share`: the share of random edges, from 0 to 1.
     - `given`: edges that are already matched and are kept, as tuples (i, j) of 0-based numbers. If shapes
       were added to a collection, only edges of the added shapes are new.
@@ -85,9 +83,7 @@ def choose_edges(
     **Returns:** A list of the edges in ascending order. An edge is a tuple (i, j) of the 0-based numbers of
     two shapes, with i < j.
 
-    **Raises:** `InputError` if the distances are not a square matrix of finite numbers that are not negative.
-    `InputError` is also raised if the number of edges is not positive, the share is not from 0 to 1, the seed
-    is negative, or a given edge does not join two shapes.
+    **Raises:** `InputError` if an argument is not as described.
     """
     distances = np.asarray(distances)
     if not (
@@ -112,16 +108,13 @@ def choose_edges(
     wanted = [(i, j) for i in range(number) for j in range(i + 1, number) if not known >= {i, j}]
     new = number - len(known)
     most = min(len(wanted), round(edges_per_shape * new)) if known else round(edges_per_shape * number)
-    added: set[Edge] = set()
     # The tree prefers edges that are already matched. All lengths are positive, because SciPy ignores edges
     # of length zero.
     lengths = distances + 1e-6 * (1 + distances.max(initial=0))
     for edge in chosen:
         lengths[edge] *= 1e-6
     tree = minimum_spanning_tree(np.triu(lengths, 1)).tocoo()
-    added |= {
-        (min(i, j), max(i, j)) for i, j in zip(tree.row.tolist(), tree.col.tolist(), strict=True)
-    } - chosen
+    added = set(zip(tree.row.tolist(), tree.col.tolist(), strict=True)) - chosen
     generator = np.random.default_rng(seed)
     random = [wanted[row] for row in generator.permutation(len(wanted))]
     added |= set(random[: round(random_share * most)])

@@ -81,18 +81,15 @@ def align(
 
     - `shapes`: the positions of n corresponding vertices on N shapes, as an array (N, n, 3) or a sequence of
       arrays (n, 3). Without `scale`, all shapes need the same unit of length.
-    - `scale`: whether to remove differences of size. If True, each shape is scaled to fit the mean in the
-      least-squares sense. All shapes are then scaled by one common factor, so that the mean has the average
-      size of the given shapes.
-    - `weights`: non-negative weights of the vertices (n,). If the weights are the vertex areas of one shape,
-      dense regions of the triangulation do not dominate. With None (the default), all weights are equal.
+    - `scale`: whether to scale each shape to fit the mean in the least-squares sense. One common factor then
+      gives the mean the average size of the given shapes.
+    - `weights`: non-negative weights of the vertices (n,), such as vertex areas, so that dense regions of the
+      triangulation do not dominate. By default, all weights are equal.
     - `reference`: the 0-based index of the shape whose rotation and centroid do not change.
 
     **Returns:** An `ProcrustesAlignment`, in the unit of length of the shapes.
 
-    **Raises:** `InputError` if there is no shape, if shapes have different numbers of vertices, if a
-    coordinate is not finite, or if a shape is a single point. `InputError` is also raised if the weights or
-    the reference do not fit the shapes, or `scale` is neither True nor False.
+    **Raises:** `InputError` if an argument is not as described, or a shape is a single point.
     """
     points = _checked(shapes)
     count, n, _ = points.shape
@@ -118,15 +115,7 @@ def align(
 
 
 class DistanceCurve(NamedTuple):
-    """A mean distance for each number of modes.
-
-    **Attributes:**
-
-    - `numbers_of_modes`: a tuple of the numbers of modes, in the given order.
-    - `mean`: an array with the mean of the distances for each number of modes, in the unit of length of the
-      shapes.
-    - `standard_error`: an array with the standard error of each mean, in the same unit.
-    """
+    """The mean of distances for each number of modes, and its standard error, in the unit of the shapes."""
 
     numbers_of_modes: tuple[int, ...]
     mean: Float64[np.ndarray, " numbers"]
@@ -211,8 +200,7 @@ class ShapeModel:
         **Returns:** The scores (k,), in units of length. For a shape of the collection, the result equals the
         row of this shape in the attribute `scores`.
 
-        **Raises:** `InputError` if the shape has another number of vertices, a coordinate is not finite, or
-        the shape is a single point.
+        **Raises:** `InputError` if the shape has another number of vertices or is a single point.
         """
         shape = numeric_rows(shape, "vertices", "the shape").astype(np.float64)
         if len(shape) != len(self.mean):
@@ -258,8 +246,7 @@ class ShapeModel:
 
         **Returns:** A `DistanceCurve` of the errors of the N shapes.
 
-        **Raises:** `InputError` if there are fewer than two shapes, or if an entry of `numbers_of_modes` is
-        not a whole number from 0 to N - 2.
+        **Raises:** `InputError` if there are fewer than two shapes, or another number of modes is given.
         """
         count = len(self.scores)
         if count < 2:
@@ -296,8 +283,7 @@ class ShapeModel:
 
         **Returns:** A `DistanceCurve` of the distances of the random shapes.
 
-        **Raises:** `InputError` if `samples` is below 2, if `seed` is negative, or if an entry of
-        `numbers_of_modes` is not a whole number from 0 to k.
+        **Raises:** `InputError` if an argument is not as described.
         """
         samples = check_whole_number("samples", samples, 2)
         seed = check_whole_number("seed", seed, 0)
@@ -341,9 +327,8 @@ def shape_model(
     **Arguments:**
 
     - `shapes`, `scale`, `weights`, `reference`: the arguments of `align`.
-    - `number_of_modes`: the largest number of modes; None (the default) for all modes. A model of N shapes
-      has at most N - 1 modes. Modes whose standard deviation is below 1e-6 of the size of the mean are
-      left out as rounding errors. One shape and identical shapes therefore have no modes.
+    - `number_of_modes`: the largest number of modes; None for all modes, at most N - 1. Modes whose standard
+      deviation is below 1e-6 of the size of the mean are left out as rounding errors.
 
     **Returns:** A `ShapeModel`, in the unit of length of the shapes.
 
