@@ -72,7 +72,7 @@ def read_maps(
     return maps
 
 
-def initial_map(text: str) -> str:
+def initial_map_choice(text: str) -> str:
     """An argument type for the values of `--init`."""
     kind, _, file = text.partition(":")
     if file and kind in ("landmarks", "map"):
@@ -93,7 +93,7 @@ def initial_map_files(init: str) -> list[str]:
     return [file] if file else []
 
 
-def check_initial_map(init: str) -> None:
+def check_initial_map_files(init: str) -> None:
     """Check the landmark files in a value of `--init`, before any mesh is read."""
     files = initial_map_files(init)
     if not init.startswith("landmarks:"):

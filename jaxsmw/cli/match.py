@@ -18,14 +18,13 @@ from jaxsmw.cli.arguments import (
 from jaxsmw.cli.conclusion import estimate_error, measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, show
 from jaxsmw.cli.inputs import (
-    check_initial_map,
     check_inputs,
     initial_map_files,
     read_mesh_file,
     read_truth,
 )
 from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
-from jaxsmw.cli.method import add_method, check_preset, match_meshes
+from jaxsmw.cli.method import add_method, check_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
 from jaxsmw.errors import InputError
 
@@ -150,8 +149,7 @@ def run(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
     init_files = initial_map_files(options.init)
-    check_preset(options)
-    check_initial_map(options.init)
+    check_method(options)
     check_evaluation(options)
     refuse_without(options, "--partial", options.partial, "scale", "overlap")
     refuse_without(options, "--report", bool(options.report), "up")

@@ -21,7 +21,7 @@ from jaxsmw.choices import (
 from jaxsmw.cli.arguments import add_eigenproblem, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.inputs import initial_map, read_initial_map
+from jaxsmw.cli.inputs import check_initial_map_files, initial_map_choice, read_initial_map
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--init",
         metavar="INITIAL_MAP",
-        type=initial_map,
+        type=initial_map_choice,
         default=DEFAULT_MATCH_INIT,
         help=f"initial map: {', '.join(get_args(MatchInit))}, landmarks:FILE, "
         "landmarks:SOURCE_FILE,TARGET_FILE or map:FILE (default: "
@@ -144,13 +144,14 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
     )
 
 
-def check_preset(options: argparse.Namespace) -> None:
-    """Refuse any `--preset` other than `paper` if an option changes the MWP paper's method."""
+def check_method(options: argparse.Namespace) -> None:
+    """Check the landmark files of `--init`, and refuse changes to presets other than `paper`."""
     if options.preset not in (None, _PAPER) and (changes := _changes(options)):
         raise InputError(
             f"{changes[0]}: changes the paper's method, but --preset {options.preset} is another method: "
             "leave one of the two options out."
         )
+    check_initial_map_files(options.init)
 
 
 def preset_name(options: argparse.Namespace) -> PresetName:

@@ -20,8 +20,8 @@ from jaxsmw.cli.arguments import (
 )
 from jaxsmw.cli.conclusion import show_quality, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.inputs import check_initial_map, check_inputs, initial_map_files, read_maps, report_mesh
-from jaxsmw.cli.method import add_method, check_preset, given_method, match_meshes
+from jaxsmw.cli.inputs import check_inputs, initial_map_files, read_maps, report_mesh
+from jaxsmw.cli.method import add_method, check_method, given_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
 from jaxsmw.errors import InputError
 
@@ -183,8 +183,7 @@ def _check(options: argparse.Namespace) -> None:
     refuse_without(options, "--partial", options.partial, "scale")
     refuse_without(options, "--report", bool(options.report), "up")
     init_files = initial_map_files(options.init)
-    check_preset(options)
-    check_initial_map(options.init)
+    check_method(options)
     refuse_without(options, "--map or a file of --init", bool(options.map or init_files), "index_base")
     from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
     from jaxsmw.io.mesh_data import check_attribute_suffix, check_mesh_suffix
