@@ -23,6 +23,9 @@ MirrorCollection = Literal["auto", "no"]
 """Whether mirror images of some meshes are matched instead of the meshes; see `jaxsmw.match_collection`."""
 DEFAULT_MIRROR: MirrorCollection = "auto"
 
+EDGES_PER_SHAPE = 4
+"""The default number of matched pairs of a collection, divided by the number of shapes."""
+
 Scale = Literal["unknown"]
 """The name of a scale of a partial pair that must be estimated; see `jaxsmw.match`."""
 

@@ -31,9 +31,10 @@ import multiprocessing
 import resource
 import time
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import igl
 import numpy as np
@@ -43,8 +44,8 @@ from tqdm import tqdm
 
 from jaxsmw import geodesic_error, make_mesh, match, read_ground_truth, read_mesh
 from jaxsmw.benchmark.intervals import mean_interval
-from jaxsmw.choices import DEFAULT_PRESET
-from jaxsmw.collection import Collection, CollectionSettings, match_collection
+from jaxsmw.choices import DEFAULT_PRESET, EDGES_PER_SHAPE
+from jaxsmw.collection import Collection, match_collection
 from jaxsmw.collection.synchronization import vertex_map_between, vertices_as_points
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import nearest_surface_points
@@ -58,21 +59,22 @@ from jaxsmw.transfer import transfer_landmarks
 _LOST = 100
 _TRIANGLES = 1000
 
-_DEFAULT = CollectionSettings()
-ABLATIONS = {
-    "default": _DEFAULT,
-    "2 edges per shape": replace(_DEFAULT, edges_per_shape=2),
-    "6 edges per shape": replace(_DEFAULT, edges_per_shape=6),
-    "random graph": replace(_DEFAULT, random_share=1.0),
-    "no random edges": replace(_DEFAULT, random_share=0.0),
-    "best paths alone": replace(_DEFAULT, synchronization=replace(_DEFAULT.synchronization, iterations=0)),
-    "means without robust weights": replace(
-        _DEFAULT, synchronization=replace(_DEFAULT.synchronization, robust_scale=1e3)
+_DEFAULT = "default"
+ABLATIONS: dict[str, tuple[float, dict[str, float]]] = {
+    _DEFAULT: (EDGES_PER_SHAPE, {}),
+    "2 edges per shape": (2, {}),
+    "6 edges per shape": (6, {}),
+    "random graph": (EDGES_PER_SHAPE, {"graph._RANDOM_SHARE": 1.0}),
+    "no random edges": (EDGES_PER_SHAPE, {"graph._RANDOM_SHARE": 0.0}),
+    "best paths alone": (EDGES_PER_SHAPE, {"synchronization._ITERATIONS": 0}),
+    "means without robust weights": (EDGES_PER_SHAPE, {"synchronization._ROBUST_SCALE": 1e3}),
+    "no second match": (EDGES_PER_SHAPE, {"matching._ROUNDS": 0}),
+    "every edge matched again": (
+        EDGES_PER_SHAPE,
+        {"consistent_maps._CONTRADICTED_FROM": 0.0, "matching._ROUNDS": 1},
     ),
-    "no second match": replace(_DEFAULT, rounds=0),
-    "every edge matched again": replace(_DEFAULT, contradicted_from=0.0, rounds=1),
 }
-"""A dictionary from the name of each ablation to its settings."""
+"""A dictionary from the name of each ablation to its edges per shape, and to its changed constants."""
 
 
 def main() -> None:
@@ -96,9 +98,8 @@ def main() -> None:
             print(f"{name}: {json.dumps(_growth(options.directory, name, number))}", flush=True)
         if options.growth:
             continue
-        chosen = ABLATIONS if options.ablations else {"default": _DEFAULT}
-        for ablation, settings in chosen.items():
-            found = _measure(options, name, settings, direct=not options.no_direct and ablation == "default")
+        for ablation in ABLATIONS if options.ablations else [_DEFAULT]:
+            found = _measure(options, name, ablation)
             print(f"{name}, {ablation}: {json.dumps(found)}", flush=True)
     print(made_with())
 
@@ -115,16 +116,18 @@ def _files(directory: Path, name: str) -> list[Path]:
     return files
 
 
-def _measure(
-    options: argparse.Namespace, name: str, settings: CollectionSettings, *, direct: bool
-) -> dict[str, Any]:
+def _measure(options: argparse.Namespace, name: str, ablation: str) -> dict[str, Any]:
     """Match a collection, and measure the errors of its maps."""
+    edges_per_shape, constants = ABLATIONS[ablation]
+    direct = ablation == _DEFAULT and not options.no_direct
     files = _files(options.directory, name)
     meshes = [read_mesh(file) for file in files]
     place = options.output / name.replace("/", "_")
     work = place / "work"
     work.mkdir(parents=True, exist_ok=True)
-    with tqdm() as bar:
+    with tqdm() as bar, ExitStack() as changed:
+        for constant, value in constants.items():
+            changed.enter_context(patch(f"jaxsmw.collection.{constant}", value))
 
         def progress(step: str, done: int, number: int) -> None:
             bar.total, bar.n = number, done
@@ -135,7 +138,7 @@ def _measure(
             meshes,
             names=[file.stem for file in files],
             preset=options.preset,
-            settings=settings,
+            edges_per_shape=edges_per_shape,
             directory=work,
             progress=progress,
         )
@@ -165,14 +168,14 @@ def _measure(
         "contradicted": sum(edge.decision == "contradicted" for edge in found.edges),
         "outliers": [found.names[shape] for shape in found.outliers],
         "through_template": _summary(np.array(through)),
-        "cycles": _cycles(found) if settings == _DEFAULT else {},
+        "cycles": _cycles(found) if ablation == _DEFAULT else {},
         "seconds": seconds,
         "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
     }
     if single:
         result["direct"] = _summary(np.array(single))
         result["ratio"] = float(np.mean(through) / np.mean(single))
-    if options.ablations and settings == _DEFAULT:
+    if options.ablations and ablation == _DEFAULT:
         points = [_measure_truth(found, files, i, j, _Unregistered(found, i, j)) for i, j in pairs]
         result["without_registered_meshes"] = _summary(np.array(points))
     return result
@@ -253,10 +256,10 @@ def _cycles(found: Collection) -> dict[str, float]:
             points = found.registered[after].project(found.registered[before].project_back(points))
         offsets = points.positions(mesh) - mesh.vertices[vertex]
         errors.append(np.linalg.norm(offsets, axis=1).mean() / mesh.area**0.5)
-    graph = found.cycle_errors or (np.array([]), np.array([]))
-    parts = (("template", errors), ("graph_first", graph[0]), ("graph_final", graph[1]))
-    found = {name: float(1e3 * np.mean(values)) if len(values) else float("nan") for name, values in parts}
-    return found | {"template_median": float(1e3 * np.median(errors))}
+    first, final = found.cycle_errors
+    parts = (("template", errors), ("graph_first", first), ("graph_final", final))
+    means = {name: float(1e3 * np.mean(values)) if len(values) else float("nan") for name, values in parts}
+    return means | {"template_median": float(1e3 * np.median(errors))}
 
 
 def _summary(errors: Float64[np.ndarray, " p"]) -> dict[str, float]:

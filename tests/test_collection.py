@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
 from jaxsmw import InputError, make_mesh, read_mesh, write_mesh
-from jaxsmw.collection import CollectionSettings, edge_matcher, match_collection
+from jaxsmw.choices import EDGES_PER_SHAPE
+from jaxsmw.collection import edge_matcher, match_collection
 from jaxsmw.collection.files import write_registered
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
@@ -27,7 +28,6 @@ from jaxsmw.io import Landmarks, MeshData, read_landmark_file, write_landmark_fi
 from jaxsmw.runtime.cache import Store
 
 VERTICES = 1000
-SETTINGS = CollectionSettings(edges_per_shape=2)
 
 
 def renumbered(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:
@@ -56,7 +56,7 @@ def work(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(meshes, work):
-    return match_collection(meshes, preset="paper", settings=SETTINGS, mirror="no", directory=work)
+    return match_collection(meshes, preset="paper", edges_per_shape=2, mirror="no", directory=work)
 
 
 def error(collection, shapes, i, j):
@@ -114,15 +114,16 @@ def test_bad_numbers_of_shapes_are_refused(found):
                 method(*numbers)
 
 
-def test_equal_names_are_numbered(meshes):
+@pytest.mark.usefixtures("unchecked")
+def test_equal_names_are_numbered_and_numpy_numbers_accepted(meshes):
     alike = [replace(mesh, name="mesh") for mesh in meshes[:3]]
-    collection = match_collection(alike, preset="paper", settings=SETTINGS, mirror="no")
+    collection = match_collection(alike, preset="paper", edges_per_shape=np.int64(2), mirror="no")
     assert list(collection.names) == ["mesh 0", "mesh 1", "mesh 2"]
 
 
 def test_the_template_can_be_chosen(meshes, work):
     chosen = match_collection(
-        meshes, preset="paper", settings=SETTINGS, mirror="no", directory=work, template=3
+        meshes, preset="paper", edges_per_shape=2, mirror="no", directory=work, template=3
     )
     assert chosen.template == 3
     with pytest.raises(InputError, match="at least two meshes"):
@@ -130,7 +131,7 @@ def test_the_template_can_be_chosen(meshes, work):
 
 
 def test_a_second_call_matches_nothing_and_gives_the_same_result(meshes, work, found, matched):
-    again = match_collection(meshes, preset="paper", settings=SETTINGS, mirror="no", directory=work)
+    again = match_collection(meshes, preset="paper", edges_per_shape=2, mirror="no", directory=work)
     assert matched == []
     for first, second in zip(found.registered, again.registered, strict=True):
         np.testing.assert_array_equal(first.vertices, second.vertices)
@@ -147,7 +148,7 @@ def test_an_interrupted_call_continues(meshes, found, matched, tmp_path):
 
     def run(progress=None):
         return match_collection(
-            meshes, preset="paper", settings=SETTINGS, mirror="no", directory=tmp_path, progress=progress
+            meshes, preset="paper", edges_per_shape=2, mirror="no", directory=tmp_path, progress=progress
         )
 
     with pytest.raises(Interrupted):
@@ -168,7 +169,7 @@ def test_an_interrupted_call_continues(meshes, found, matched, tmp_path):
 def test_an_added_mesh_is_matched_alone(meshes, matched, tmp_path):
     def run(number):
         return match_collection(
-            meshes[:number], preset="paper", settings=SETTINGS, mirror="no", directory=tmp_path
+            meshes[:number], preset="paper", edges_per_shape=2, mirror="no", directory=tmp_path
         )
 
     run(4)
@@ -183,7 +184,7 @@ def test_an_unusable_mesh_is_left_out_and_named(meshes, found, work):
     # A single triangle has too few vertices.
     triangle = make_mesh(np.eye(3), np.array([[0, 1, 2]]), name="triangle")
     result = match_collection(
-        [*meshes, triangle], preset="paper", settings=SETTINGS, mirror="no", directory=work
+        [*meshes, triangle], preset="paper", edges_per_shape=2, mirror="no", directory=work
     )
     assert list(result.left_out) == ["triangle"] and "3 vertices" in result.left_out["triangle"]
     assert result.names == found.names
@@ -193,7 +194,6 @@ def test_an_unusable_mesh_is_left_out_and_named(meshes, found, work):
 def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch):
     """The first match of one pair maps every vertex to the mirror image of its match."""
     original = edge_matcher.match_edges
-    settings = CollectionSettings(edges_per_shape=2)
 
     def corrupting(tasks, *arguments):
         tasks = list(tasks)
@@ -211,7 +211,7 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
             yield edge
 
     monkeypatch.setattr(edge_matcher, "match_edges", corrupting)
-    options = {"preset": "paper", "settings": settings, "mirror": "no", "directory": tmp_path}
+    options = {"preset": "paper", "edges_per_shape": 2, "mirror": "no", "directory": tmp_path}
     result = match_collection(meshes, **options)
     (edge,) = (edge for edge in result.edges if (edge.source, edge.target) == (1, 3))
     assert edge.decision == "replaced"
@@ -239,7 +239,7 @@ def test_a_mesh_whose_matches_all_fail_is_named(meshes, monkeypatch):
 
     monkeypatch.setattr(edge_matcher, "match_edges", failing)
     with pytest.raises(ArithmeticError, match="failed numerically: shape4"):
-        match_collection(meshes, preset="paper", settings=SETTINGS, mirror="no")
+        match_collection(meshes, preset="paper", edges_per_shape=2, mirror="no")
 
 
 def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
@@ -264,7 +264,9 @@ def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
         ({"seed": -1}, "seed is -1"),
         ({"seed": "0"}, "seed is '0'"),
         ({"stiffness": 0}, "stiffness is 0: give a positive finite number"),
-        ({"settings": None}, "settings is None"),
+        ({"edges_per_shape": 0}, "edges_per_shape is 0: give "),
+        ({"edges_per_shape": np.inf}, "edges_per_shape is inf: give "),
+        ({"edges_per_shape": None}, "edges_per_shape is None: give "),
         ({"directory": "no/such/directory"}, "is not a directory"),
     ],
 )
@@ -278,7 +280,7 @@ def test_tasks_of_workers_are_kept_in_the_directory(meshes, work, found, monkeyp
     monkeypatch.setattr(edge_matcher, "TemporaryDirectory", None)
     with ThreadPoolExecutor(1) as executor:
         again = match_collection(
-            meshes, preset="paper", settings=SETTINGS, mirror="no", directory=work, executor=executor
+            meshes, preset="paper", edges_per_shape=2, mirror="no", directory=work, executor=executor
         )
     assert again.edges == found.edges
 
@@ -301,7 +303,7 @@ def test_workers_give_the_same_maps(meshes, found, tmp_path):
 
     with open_executor(2) as executor:
         result = match_collection(
-            meshes, preset="paper", settings=SETTINGS, mirror="no", directory=tmp_path, executor=executor
+            meshes, preset="paper", edges_per_shape=2, mirror="no", directory=tmp_path, executor=executor
         )
     for i, j in permutations(range(5), 2):
         assert (result.pointwise_map(i, j) == found.pointwise_map(i, j)).mean() > 0.99
@@ -315,7 +317,7 @@ def signed_volume(mesh: Mesh) -> float:
 def test_meshes_of_the_other_hand_can_be_named(meshes, found):
     some = [mesh.mirrored() if number == 1 else mesh for number, mesh in enumerate(meshes)]
     result = match_collection(
-        some, preset="paper", settings=SETTINGS, mirror=[False, True, False, False, False]
+        some, preset="paper", edges_per_shape=2, mirror=[False, True, False, False, False]
     )
     assert result.mirrored.tolist() == [False, True, False, False, False]
     for target in (0, 4):
@@ -333,7 +335,7 @@ def test_shapes_of_the_other_hand_are_recognised(tmp_path):
         moved = Rotation.random(random_state=seed).apply(lump.vertices + noise)
         lumps.append(make_mesh(moved, lump.faces, name=f"lump{seed}"))
     lumps[2] = lumps[2].mirrored()
-    result = match_collection(lumps, preset="paper", settings=SETTINGS)
+    result = match_collection(lumps, preset="paper", edges_per_shape=2)
     assert result.mirrored.tolist() == [False, False, True, False]
     assert any("other hand" in sentence and "lump2" in sentence for sentence in result.sentences())
     for i, j in permutations(range(4), 2):
@@ -356,7 +358,7 @@ def test_real_people_through_the_template(shared):
     names = [f"tr_reg_{number:03}" for number in (0, 7, 12)]
     people = [read_mesh(data / "off" / f"{name}.off") for name in names]
     truth = [np.loadtxt(data / "corres" / f"{name}.vts", dtype=int) - 1 for name in names]
-    result = match_collection(people, settings=CollectionSettings(edges_per_shape=2.5), mirror="no")
+    result = match_collection(people, edges_per_shape=2.5, mirror="no")
     errors = []
     for i, j in permutations(range(3), 2):
         offsets = people[j].vertices[result.pointwise_map(i, j)[truth[i]]] - people[j].vertices[truth[j]]
@@ -386,7 +388,7 @@ def directory(meshes, tmp_path_factory):
 
 def test_the_help_states_the_defaults_of_the_library(run):
     text = " ".join(run("collection", "--help").output.split())
-    assert f"(default: {CollectionSettings().edges_per_shape})" in text
+    assert f"(default: {EDGES_PER_SHAPE})" in text
     assert "(default: accurate)" in text
 
 

@@ -19,7 +19,7 @@ import pytest
 
 import jaxsmw
 from jaxsmw import RESULTS, creature_pair, geodesic_error, write_mesh
-from jaxsmw.cli.parser import make_parser
+from jaxsmw.cli.run import make_parser
 from jaxsmw.evaluation import GroundTruth
 
 ROOT = Path(__file__).parents[1]
@@ -126,7 +126,7 @@ def test_commands_can_be_parsed(page, monkeypatch):
     def refuse(parser: argparse.ArgumentParser, message: str) -> None:
         raise ValueError(f"{page}: {parser.prog}: {message}")
 
-    monkeypatch.setattr("jaxsmw.cli.parser.Parser.error", refuse)
+    monkeypatch.setattr("jaxsmw.cli.run.Parser.error", refuse)
     for command in commands(page):
         program, *arguments = shlex.split(command)
         if program == "jaxsmw":

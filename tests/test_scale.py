@@ -13,7 +13,6 @@ from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
 from jaxsmw.creature import creature_pair
 from jaxsmw.geometry import estimate_scale
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.scale import ScaleSettings
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import paired_spectra
 from jaxsmw.matching.scores import distortion
@@ -173,5 +172,5 @@ def test_the_scale_of_real_parts_is_found(shared, name):
     pairs = choose_pairs(open_data_set(shared / "data" / "shrec16_partial"), None, 0)
     (pair,) = (pair for pair in pairs if name in pair.name)
     part, full = map(read_mesh, pair.meshes)
-    found = estimate_scale(replace(part, vertices=0.37 * part.vertices), full, ScaleSettings())
+    found = estimate_scale(replace(part, vertices=0.37 * part.vertices), full)
     assert found.scale == pytest.approx(1 / 0.37, rel=0.05)

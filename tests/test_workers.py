@@ -100,7 +100,7 @@ def test_warnings_of_workers_are_issued_in_the_calling_process(capfd):
     assert "Warning" not in capfd.readouterr().err
 
 
-def fill() -> int:
+def fill(_: None) -> int:
     """Compiles a program in the worker, and makes the next task release all programs."""
     compilation._LARGEST_SHARE = 0.0
     global double
@@ -109,11 +109,11 @@ def fill() -> int:
     return double._cache_size()
 
 
-def programs() -> int:
+def programs(_: None) -> int:
     return double._cache_size()
 
 
 def test_workers_release_programs_before_each_task():
     with Workers(1) as workers:
-        assert workers.submit(fill).result() == 1
-        assert workers.submit(programs).result() == 0
+        assert dict(run_tasks(fill, {"fill": None}, workers)) == {"fill": 1}
+        assert dict(run_tasks(programs, {"count": None}, workers)) == {"count": 0}

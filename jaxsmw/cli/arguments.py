@@ -19,10 +19,7 @@ MAP_FORMS = "a text file with one target vertex per line, a .npy file, or a .mat
 
 
 def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int]:
-    """Return an argument type that accepts whole numbers from `least` to `most`, both included.
-
-    The argument type raises `argparse.ArgumentTypeError` for any other text.
-    """
+    """Return an argument type that accepts whole numbers from `least` to `most`, both included."""
 
     def convert(text: str) -> int:
         try:
@@ -39,10 +36,7 @@ def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int
 
 
 def path(text: str) -> str:
-    """Return `text` if a file or directory could have this name. The file or directory need not exist.
-
-    **Raises:** `argparse.ArgumentTypeError` if `text` is empty, or no file can have this name.
-    """
+    """An argument type for names that a file or directory could have, whether or not it exists."""
     if not text:
         raise argparse.ArgumentTypeError("the name is empty: give the name of a file or directory")
     try:
@@ -58,7 +52,7 @@ def path(text: str) -> str:
 
 
 def shortened(text: str) -> str:
-    """Shorten a text for a message. A long text is cut, and an ellipsis marks the cut."""
+    """Shorten a text for a message."""
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
 
 
@@ -139,22 +133,28 @@ def add_partial_of_any_scale(parser: argparse.ArgumentParser) -> None:
 
 
 def _scale(text: str) -> float | Scale:
-    """Return the number in a value of `--scale`, or `unknown` if this is the value.
-
-    **Raises:** `argparse.ArgumentTypeError` if the value is neither a positive number nor `unknown`.
-    """
     (unknown,) = get_args(Scale)
     if text == unknown:
         return unknown
+    if (number := _finite(text)) > 0:
+        return number
+    raise argparse.ArgumentTypeError(f"{shortened(text)!r} is no scale: give a positive number or {unknown}")
+
+
+def positive_number(text: str) -> float:
+    """An argument type for positive numbers."""
+    if (number := _finite(text)) > 0:
+        return number
+    raise argparse.ArgumentTypeError(f"{shortened(text)!r} is not a positive number")
+
+
+def _finite(text: str) -> float:
+    """Return a finite number; NaN for any other text."""
     try:
         number = float(text)
     except ValueError:
-        number = math.nan
-    if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(
-            f"{shortened(text)!r} is no scale: give a positive number or {unknown}"
-        )
-    return number
+        return math.nan
+    return number if math.isfinite(number) else math.nan
 
 
 def add_up(parser: argparse.ArgumentParser) -> None:
@@ -168,17 +168,7 @@ def add_up(parser: argparse.ArgumentParser) -> None:
 
 
 def refuse_without(options: argparse.Namespace, needed: str, is_given: bool, *names: str) -> None:
-    """Refuse options that have no effect because another option is missing.
-
-    **Arguments:**
-
-    - `options`: the parsed options.
-    - `needed`: the name of the required option, for the message.
-    - `is_given`: whether the user gave the option `needed`.
-    - `names`: the attributes of `options` that have no effect without `needed`.
-
-    **Raises:** `InputError` that names the first given option that has no effect.
-    """
+    """Refuse the options `names`, which have no effect, unless the option `needed` is given."""
     for name in names:
         value = getattr(options, name)
         if not is_given and value is not None and value is not False:

@@ -54,15 +54,7 @@ def add_bank(parser: argparse._ActionsContainer) -> None:
 
 
 def make_bank(name: str | None, number_of_filters: int | None) -> FilterBank:
-    """Return a filter bank.
-
-    **Arguments:**
-
-    - `name`: a key of `BANKS`; None for the bank of the MWP paper.
-    - `number_of_filters`: the number of filters; None for the default number of the bank.
-
-    **Raises:** `InputError` if the bank cannot have this number of filters.
-    """
+    """Return the filter bank with a name in `BANKS`, by default the bank of the MWP paper."""
     from jaxsmw.core import banks
 
     name = name or _PAPER_BANK

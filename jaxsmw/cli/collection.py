@@ -6,11 +6,11 @@ import argparse
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, MirrorCollection, PresetName
+from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, EDGES_PER_SHAPE, MirrorCollection, PresetName
 from jaxsmw.cli.arguments import add_weld, path, refuse_without, whole_number
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
@@ -89,7 +89,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--edges",
         metavar="N",
         type=whole_number(1, _MOST_EDGES),
-        help=f"number of matched pairs divided by the number of meshes, at most {_MOST_EDGES} (default: 4)",
+        default=EDGES_PER_SHAPE,
+        help=f"number of matched pairs divided by the number of meshes, at most {_MOST_EDGES} (default: "
+        "%(default)s)",
     )
     parser.add_argument(
         "--scale",
@@ -146,22 +148,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Match all meshes of a directory, and write maps, registered meshes, the shape model and a page.
-
-    **Raises:** `InputError` if an option or the directory cannot be used, or if fewer than two meshes can be
-    matched. `ArithmeticError` if a computation fails.
-    """
+    """Match all meshes of a directory, and write maps, registered meshes, the shape model and a page."""
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         files = _mesh_files(options)
         _check(options, files)
         from jaxsmw.collection.files import RESULT_DIRECTORIES, check_replaceable, replace_results
+        from jaxsmw.io.landmark_files import read_landmark_file
         from jaxsmw.io.landmarks import check_frame
         from jaxsmw.runtime.files import make_directory, remove_leftovers
         from jaxsmw.runtime.journal import claimed_directory
     with stopwatch.step("reading"):
         _note_other_files(options)
-        landmarks = _read_landmarks(options)
+        landmarks = read_landmark_file(options.landmarks) if options.landmarks else None
         data, unreadable = _read(files, weld=options.weld)
     for option in ("template", "landmarks_of", "attributes_of"):
         if (file := getattr(options, option)) and Path(file).name not in data:
@@ -199,11 +198,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
-    """Return a dictionary from the name of each mesh file of a collection to its path, in alphabetical order.
-
-    **Raises:** `InputError` if the directory cannot be read or contains fewer than two mesh files, or if a
-    file of `--exclude` is not in the directory.
-    """
+    """Return the paths of the mesh files that are not excluded, by their names and in alphabetical order."""
     from jaxsmw.io.mesh_data import MESH_SUFFIXES
     from jaxsmw.wording import count_of
 
@@ -261,10 +256,7 @@ def _note_other_files(options: argparse.Namespace) -> None:
 
 
 def _inside(options: argparse.Namespace, option: str, file: str, files: Mapping[str, Path]) -> str:
-    """Return the path of a mesh in the directory. The user gives either the path or only the file name.
-
-    **Raises:** `InputError` if there is no such mesh.
-    """
+    """Return the path of a mesh in the directory. The user gives either the path or only the file name."""
     for given in (file, os.path.join(options.directory, file)):
         if Path(file).name in files and _same(given, files[Path(file).name]):
             return given
@@ -345,10 +337,7 @@ def _landmark_suffix(file: str) -> str:
 
 
 def _mesh_of(landmarks: str, files: Mapping[str, Path]) -> str:
-    """Return the mesh file that has the same name as a landmark file, apart from the suffix.
-
-    **Raises:** `InputError` if there is not exactly one such mesh.
-    """
+    """Return the mesh file that has the same name as a landmark file, apart from the suffix."""
     stem = Path(landmarks).name[: -len(_landmark_suffix(landmarks))]
     found = [str(file) for name, file in files.items() if Path(name).stem == stem]
     if len(found) != 1:
@@ -360,13 +349,7 @@ def _mesh_of(landmarks: str, files: Mapping[str, Path]) -> str:
 
 
 def _read(files: Mapping[str, Path], *, weld: bool) -> tuple[dict[str, MeshData], dict[str, str]]:
-    """Read all meshes.
-
-    **Returns:** A dictionary from file names to meshes, and a dictionary from the name of each unreadable
-    file to the reason why it cannot be read.
-
-    **Raises:** `InputError` if fewer than two meshes can be read.
-    """
+    """Return the meshes by their file names, and the reasons why other files cannot be read."""
     from jaxsmw.io.mesh_data import read_mesh_data
 
     data, unreadable = {}, {}
@@ -384,10 +367,7 @@ def _read(files: Mapping[str, Path], *, weld: bool) -> tuple[dict[str, MeshData]
 
 
 def _keep_template(options: argparse.Namespace, data: Mapping[str, MeshData]) -> None:
-    """Choose the template of the earlier results in the output directory, unless `--template` is given.
-
-    With another template, vertex numbers would have another meaning in all registered meshes.
-    """
+    """Keep the template of earlier results, because another one would renumber all registered meshes."""
     from jaxsmw.collection.files import read_template
 
     earlier = None if options.template else read_template(Path(options.output))
@@ -399,21 +379,12 @@ def _keep_template(options: argparse.Namespace, data: Mapping[str, MeshData]) ->
             )
 
 
-def _read_landmarks(options: argparse.Namespace) -> Landmarks | None:
-    if not options.landmarks:
-        return None
-    from jaxsmw.io.landmark_files import read_landmark_file
-
-    return read_landmark_file(options.landmarks)
-
-
 @contextmanager
 def _executor(options: argparse.Namespace) -> Iterator[Executor | None]:
     from jaxsmw.runtime.workers import open_executor
 
     if not (options.workers or options.scheduler):
-        with nullcontext():
-            yield None
+        yield None
         return
     with quiet_children(), open_executor(options.workers or 1, options.scheduler) as executor:
         yield executor
@@ -428,11 +399,7 @@ def _provenance(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
 
 def _names(data: Mapping[str, MeshData]) -> list[str]:
-    """Return a unique name for each mesh: the file name without suffix, such as `cat` for `cat.ply`.
-
-    If two names are equal, underscores replace the dots of all file names, as in `cat_ply`. If two of the new
-    names are also equal, the complete file names are used.
-    """
+    """Return a unique name for each mesh, such as `cat` for `cat.ply`, or `cat_ply` if there are two cats."""
     stems = [Path(name).stem for name in data]
     for names in (stems, [name.replace(".", "_") for name in data]):
         if len(set(names)) == len(names):
@@ -446,11 +413,8 @@ def _match(
     from tqdm import tqdm
 
     from jaxsmw.collection.matching import match_collection
-    from jaxsmw.collection.settings import CollectionSettings
 
-    settings = CollectionSettings()
-    if options.edges:
-        settings = CollectionSettings(edges_per_shape=float(options.edges))
+    mirrored = {Path(file).name for file in options.mirrored}
     bars: dict[str, tqdm] = {}
 
     def progress(step: str, done: int, number: int) -> None:
@@ -466,19 +430,13 @@ def _match(
         names=_names(data),
         preset=options.preset,
         template=None if options.template is None else list(data).index(Path(options.template).name),
-        mirror=_mirror(options, data),
-        settings=settings,
+        mirror=[name in mirrored for name in data] if mirrored else options.mirror,
+        edges_per_shape=options.edges,
         seed=options.seed,
         directory=work,
         executor=executor,
         progress=progress,
     )
-
-
-def _mirror(options: argparse.Namespace, data: Mapping[str, MeshData]) -> MirrorCollection | list[bool]:
-    """Return the argument `mirror` of `match_collection`."""
-    mirrored = {Path(file).name for file in options.mirrored}
-    return [name in mirrored for name in data] if mirrored else options.mirror
 
 
 def _measures(model: ShapeModel) -> dict[str, Any]:
@@ -548,19 +506,8 @@ def _write(
     if options.attributes_of:
         files += write_attributes(collection, sources["attributes_of"], kept, directory, options.suffix)
     shared = _provenance(options)
-    changeable = [
-        "edges",
-        "exclude",
-        "template",
-        "mirrored",
-        "scale",
-        "modes",
-        "suffix",
-        "landmarks",
-        "attributes_of",
-    ]
-    changeable += ["workers", "scheduler"]  # these options hardly change the results, but change the times
-    settings = shared["settings"] | {name: getattr(options, name) for name in changeable}
+    unlisted = ("directory", "output", "quiet", "run")
+    settings = {name: value for name, value in vars(options).items() if name not in unlisted}
     provenance = {**shared, "settings": settings, "machine": machine()}
     write_summary(collection, measures, directory, provenance, [*files, directory / "index.html"])
     template = collection.meshes[collection.template]
@@ -589,10 +536,6 @@ def _write(
 
 
 def _number(collection: Collection, name: str, file: str) -> int:
-    """Return the number of the mesh `name`.
-
-    **Raises:** `InputError` if the collection left this mesh out. The message begins with `file`.
-    """
     if name not in collection.names:
         raise InputError(f"{file}: was left out of the collection: choose another mesh.")
     return collection.names.index(name)

@@ -13,10 +13,12 @@ from jaxsmw.cli.outputs import report_written
 
 if TYPE_CHECKING:
     import numpy as np
-    from jaxtyping import Float
+    from jaxtyping import Float, Int64
 
+    from jaxsmw.choices import Axis
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
+    from jaxsmw.geometry.geodesics import SurfacePoints
     from jaxsmw.io.landmarks import Landmarks
     from jaxsmw.matching.correspondence import Correspondence
     from jaxsmw.transfer.registered_mesh import RegisteredMesh
@@ -27,28 +29,15 @@ def measure_match(
     truth: GroundTruth | None,
     settings: Mapping[str, Any],
     stopwatch: Stopwatch,
-    others: Mapping[str, Any],
+    others: Mapping[str, Int64[np.ndarray, " m"] | SurfacePoints],
 ) -> dict[str, GeodesicError]:
-    """Measure the geodesic errors of the maps of a match.
+    """Measure the geodesic errors of the initial map, `others` and the refined map, by their names.
 
-    **Arguments:**
-
-    - `truth`: the ground truth, or None.
-    - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
-    - `stopwatch`: the stopwatch to which the time of the measurement is added.
-    - `others`: further maps to measure, a dictionary with the names of the maps as keys. The initial map and
-      the refined map are always measured.
-
-    **Returns:** A dictionary from the name of each map to its errors. The names are `initial`, the names in
-    `others`, and `refined`. The dictionary is empty if there is no ground truth.
+    The result is empty if there is no ground truth.
     """
     if truth is None:
         return {}
-    maps = {
-        "initial": correspondence.initial_map,
-        **others,
-        "refined": correspondence.pointwise_map,
-    }
+    maps = {"initial": correspondence.initial_map, **others, "refined": correspondence.pointwise_map}
     with stopwatch.step("geodesic errors"):
         return measure_errors(correspondence.mesh_y, maps, truth, settings)
 
@@ -86,20 +75,11 @@ def write_match_report(
     options: argparse.Namespace,
     stopwatch: Stopwatch,
     *,
-    up: Any,
+    up: Axis | None,
     registered: RegisteredMesh | None = None,
     landmarks: tuple[Landmarks, Landmarks] | None = None,
 ) -> None:
-    """Write the report of a match to a directory. The report's summary contains the options of the command.
-
-    **Arguments:**
-
-    - `errors`: the dictionary that `measure_match` returns.
-    - `up`: the axis of the meshes that points up in pictures; None to guess the axis.
-    - `registered`: the registered mesh if it was already computed; None otherwise.
-    - `landmarks`: the landmarks on the source and on the target. The interactive page of the
-      report shows these landmarks when it is opened.
-    """
+    """Write the report of a match to a directory; its summary contains the options of the command."""
     from jaxsmw.report.summary import write_report
 
     report_progress("report ...")

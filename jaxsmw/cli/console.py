@@ -16,21 +16,13 @@ _logger = logging.getLogger("jaxsmw")
 
 
 def show(text: str) -> None:
-    """Print a result, which can have several lines, on standard output.
-
-    **Raises:** `BrokenPipeError` if standard output is a pipe that its reader has closed. `InputError` if
-    standard output cannot be written for any other reason.
-    """
+    """Print a result, which can have several lines, on standard output."""
     with _writing_output():
         print("\n".join(map(printable, text.split("\n"))), flush=True)
 
 
 def flush_output() -> None:
-    """Flush the buffer of standard output.
-
-    **Raises:** `BrokenPipeError` if standard output is a pipe that its reader has closed. `InputError` if
-    standard output cannot be written for any other reason.
-    """
+    """Flush the buffer of standard output."""
     with _writing_output():
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -38,6 +30,7 @@ def flush_output() -> None:
 
 @contextmanager
 def _writing_output() -> Iterator[None]:
+    """Raise `BrokenPipeError` if the reader of standard output has ended, `InputError` for other failures."""
     try:
         yield
     except OSError as error:
@@ -84,34 +77,23 @@ class Stopwatch:
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Return a context manager that records the time of its block as a step with the given name.
-
-        If several steps have the same name, their times are added up.
-        """
+        """Record the time of the block as a step. Times of several steps with one name are added up."""
         began = time.perf_counter()
         yield
         self.add({name: time.perf_counter() - began})
 
     def add(self, seconds: dict[str, float]) -> None:
-        """Add the times of further steps.
-
-        **Arguments:**
-
-        - `seconds`: a dictionary from the name of each step to its time in seconds.
-        """
+        """Add the times of further steps, in seconds."""
         for name, more in seconds.items():
             self._seconds[name] = self._seconds.get(name, 0.0) + more
 
     def steps(self) -> dict[str, float]:
-        """Return a dictionary from the name of each step to its time so far, in seconds.
-
-        The entry `other` is the time outside of all steps.
-        """
+        """Return the time of each step in seconds; `other` is the time outside of all steps."""
         total = time.perf_counter() - self._began
         return {**self._seconds, "other": total - sum(self._seconds.values())}
 
     def summary(self) -> str:
-        """Return the total time and the time of each step, in seconds, as text."""
+        """Return the total time and the time of each step as text."""
         steps = self.steps()
         listed = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in steps.items())
         return f"{sum(steps.values()):.2f} s: {listed}"

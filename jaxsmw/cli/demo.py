@@ -7,8 +7,8 @@ import argparse
 from jaxsmw.cli.arguments import path, whole_number
 from jaxsmw.cli.conclusion import estimate_error, measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, show
-from jaxsmw.cli.inputs import check_initial_map, initial_map_files
-from jaxsmw.cli.method import add_method, check_preset, match_meshes
+from jaxsmw.cli.inputs import initial_map_files
+from jaxsmw.cli.method import add_method, check_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_written
 
 HELP = "generate a creature in two poses, match the poses and write a report"
@@ -46,15 +46,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Generate a creature in two poses, match the poses, and write the meshes, the map and the report.
-
-    **Raises:** `InputError` if an option cannot be used or an output cannot be written. `ArithmeticError` if
-    a computation fails.
-    """
+    """Generate a creature in two poses, match the poses, and write the meshes, the map and the report."""
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
-        check_preset(options)
-        check_initial_map(options.init)
+        check_method(options)
         _check_output(options)
         from jaxsmw.creature import creature_pair
         from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth

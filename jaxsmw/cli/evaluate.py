@@ -59,10 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Print the errors of all maps, and write the requested files.
-
-    **Raises:** `InputError` if an option or a file cannot be used.
-    """
+    """Print the errors of all maps, and write the requested files."""
     check_evaluation(options)
     refuse_without(options, "--page", bool(options.page), "partial", "up")
     inputs = [options.source, options.target, *options.map, *options.ground_truth]

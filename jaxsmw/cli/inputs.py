@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, cast, get_args
 
 from jaxsmw.choices import IndexBase, MatchInit
 from jaxsmw.cli.arguments import path
@@ -23,12 +23,7 @@ if TYPE_CHECKING:
 
 
 def check_inputs(*paths: str | None) -> None:
-    """Check that the input files of a command exist, before libraries are imported for a second.
-
-    Paths that are None are ignored.
-
-    **Raises:** `InputError` if a file does not exist or is not a regular file.
-    """
+    """Check that input files exist, before libraries are imported for a second."""
     from jaxsmw.runtime.files import size_of_file
 
     for file in filter(None, paths):
@@ -36,10 +31,7 @@ def check_inputs(*paths: str | None) -> None:
 
 
 def read_mesh_file(file: str, *, weld: bool) -> Mesh:
-    """Read a mesh, and print a summary of it on standard error unless `--quiet` is given.
-
-    **Raises:** `InputError` if `jaxsmw.read_mesh` refuses the file.
-    """
+    """Read a mesh, and print a summary of it as progress messages."""
     from jaxsmw.io.mesh_files import read_mesh
 
     mesh = read_mesh(file, weld=weld)
@@ -56,20 +48,10 @@ def report_mesh(file: str, mesh: Mesh) -> None:
         report_progress(f"{file}: {line}")
 
 
-def describe_mesh(mesh: Mesh) -> list[str]:
-    """Return sentences that describe a mesh: its notes, its size and its defects."""
-    from jaxsmw.geometry.mesh import diagnose
-
-    return [*mesh.notes, *diagnose(mesh).sentences()]
-
-
 def read_truth(
     files: Sequence[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
 ) -> GroundTruth:
-    """Read the ground truth of a pair with `jaxsmw.read_ground_truth`.
-
-    **Raises:** `InputError` if the files cannot be read or do not fit the meshes.
-    """
+    """Read the ground truth of a pair."""
     from jaxsmw.evaluation.ground_truth import read_ground_truth
 
     for file in files:
@@ -80,12 +62,7 @@ def read_truth(
 def read_maps(
     files: Sequence[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
 ) -> dict[str, Int64[np.ndarray, " m"]]:
-    """Read pointwise maps X -> Y with `jaxsmw.read_pointwise_map`.
-
-    **Returns:** A dictionary from the name of each file to its map, an array (m,) of 0-based vertices of Y.
-
-    **Raises:** `InputError` if a file cannot be read or does not fit the meshes.
-    """
+    """Read pointwise maps X -> Y. The keys of the result are the file names."""
     from jaxsmw.io.map_files import read_pointwise_map
 
     maps = {}
@@ -95,14 +72,8 @@ def read_maps(
     return maps
 
 
-def initial_map(text: str) -> str:
-    """Return `text` if the option `--init` accepts this value.
-
-    The option accepts the names of initial maps, `landmarks:FILE`, `landmarks:SOURCE_FILE,TARGET_FILE` and
-    `map:FILE`.
-
-    **Raises:** `argparse.ArgumentTypeError` for any other text.
-    """
+def initial_map_choice(text: str) -> str:
+    """An argument type for the values of `--init`."""
     kind, _, file = text.partition(":")
     if file and kind in ("landmarks", "map"):
         for name in initial_map_files(text):
@@ -114,10 +85,7 @@ def initial_map(text: str) -> str:
 
 
 def initial_map_files(init: str) -> list[str]:
-    """Return the file names that a value of `--init` contains.
-
-    For `landmarks:A,B`, the names are A and B. If a file named `A,B` exists, its name is returned instead.
-    """
+    """Return the file names in a value of `--init`. In `landmarks:A,B`, the comma may belong to one name."""
     kind, _, file = init.partition(":")
     source, _, target = file.partition(",")
     if kind == "landmarks" and source and target and not os.path.lexists(file):
@@ -125,13 +93,8 @@ def initial_map_files(init: str) -> list[str]:
     return [file] if file else []
 
 
-def check_initial_map(init: str) -> None:
-    """Check the landmark files in a value of `--init`, before any mesh is read.
-
-    **Raises:** `InputError` if the value names only one file and this file contains positions of landmarks,
-    because landmarks on both meshes are needed. `InputError` is also raised if the value names two files and
-    one of them has an unknown format.
-    """
+def check_initial_map_files(init: str) -> None:
+    """Check the landmark files in a value of `--init`, before any mesh is read."""
     files = initial_map_files(init)
     if not init.startswith("landmarks:"):
         return
@@ -149,7 +112,7 @@ def check_initial_map(init: str) -> None:
 
 
 def _has_positions(file: str) -> bool:
-    """Return whether a table contains positions of landmarks instead of pairs of vertices."""
+    """Return whether a table contains positions of landmarks, and not pairs of vertices."""
     from jaxsmw.io.landmark_files import read_landmark_file
     from jaxsmw.io.map_files import Table
 
@@ -162,18 +125,15 @@ def _has_positions(file: str) -> bool:
     return False
 
 
-def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None) -> Any:
-    """Convert a value of `--init` to the argument `init` of `jaxsmw.match`.
-
-    **Returns:** The name of an initial map, landmarks (l, 2), or a pointwise map (m,). Vertices are 0-based.
-
-    **Raises:** `InputError` if the file cannot be read or does not fit the meshes.
-    """
+def read_initial_map(
+    init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
+) -> MatchInit | Int64[np.ndarray, "l 2"] | Int64[np.ndarray, " m"]:
+    """Convert a value of `--init` to the argument `init` of `jaxsmw.match`."""
     from jaxsmw.io.map_files import read_landmarks, read_pointwise_map
 
     match initial_map_files(init):
         case []:
-            return init
+            return cast("MatchInit", init)
         case [file]:
             _note_index_base(file, index_base)
             read = read_landmarks if init.startswith("landmarks:") else read_pointwise_map
@@ -183,11 +143,7 @@ def read_initial_map(init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: Index
 
 
 def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int64[np.ndarray, "l 2"]:
-    """Read landmarks on the source and on the target, and match them by name.
-
-    **Returns:** An array (l, 2) with one row for each name that is in both files. A row contains the vertex
-    of X nearest to the source landmark, and the vertex of Y nearest to the target landmark.
-    """
+    """Read landmarks on X and on Y, and return the nearest vertices of those with a name in both files."""
     from jaxsmw.io.landmark_files import read_landmark_file
     from jaxsmw.io.landmarks import match_landmarks
     from jaxsmw.transfer.landmarks import nearest_vertices

@@ -36,10 +36,9 @@ _ending = allocate_lock()
 
 
 def end_when_interrupted() -> None:
-    """Install a handler that ends this process on SIGINT, SIGTERM and SIGHUP.
+    """Install a handler that ends this process on signals, except those that were ignored when it started.
 
-    If a signal was already ignored when the process started, no handler is installed for it. The function
-    must be called in the main thread.
+    The function must be called in the main thread.
     """
     handled = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
     if not handled:
@@ -55,13 +54,7 @@ def end_when_interrupted() -> None:
 
 
 def announce_consequence(consequence: str) -> None:
-    """Replace the message that an interruption prints. Commands with a progress bar call this function.
-
-    **Arguments:**
-
-    - `consequence`: a clause that says what happens to the results of an interrupted command. The clause does
-      not end with a full stop.
-    """
+    """Make an interruption say what happens to results. Commands with a progress bar call this function."""
     global _message
     # The message begins with a newline because the cursor is at the end of the progress bar.
     _message = f"\njaxsmw: interrupted; {consequence}.\n"
@@ -69,12 +62,11 @@ def announce_consequence(consequence: str) -> None:
 
 @contextmanager
 def quiet_children() -> Iterator[None]:
-    """Return a context manager that prevents child processes from printing messages on interruption.
+    """Prevent processes that this thread starts in the block from printing messages on interruption.
 
-    The context manager applies to processes that this thread starts in the block. On Ctrl-C, a terminal also
-    sends SIGINT to these processes. Therefore the context manager blocks SIGINT in this thread, and the child
-    processes inherit this setting. Another thread of this process still receives SIGINT. The context manager
-    also silences the warning of Python's resource tracker about leaked semaphores.
+    On Ctrl-C, a terminal also sends SIGINT to child processes. They inherit from this thread that SIGINT is
+    blocked. Another thread of this process still receives SIGINT. The warning of Python's resource tracker
+    about leaked semaphores is silenced, too.
     """
     from multiprocessing.resource_tracker import ensure_running
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jaxsmw.cli.arguments import (
     add_index_base,
@@ -18,18 +18,21 @@ from jaxsmw.cli.arguments import (
 from jaxsmw.cli.conclusion import estimate_error, measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, show
 from jaxsmw.cli.inputs import (
-    check_initial_map,
     check_inputs,
     initial_map_files,
     read_mesh_file,
     read_truth,
 )
 from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
-from jaxsmw.cli.method import add_method, check_preset, match_meshes
+from jaxsmw.cli.method import add_method, check_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Int64, Shaped
+
+    from jaxsmw.geometry.geodesics import SurfacePoints
     from jaxsmw.matching.correspondence import Correspondence
 
 HELP = "match two meshes and write the map"
@@ -101,10 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Match two meshes, write the requested files, and print the quality, the errors and the times.
-
-    **Raises:** `InputError` if an option or a file cannot be used. `ArithmeticError` if a computation fails.
-    """
+    """Match two meshes, write the requested files, and print the quality, the errors and the times."""
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         _check(options)
@@ -145,8 +145,7 @@ def run(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
     init_files = initial_map_files(options.init)
-    check_preset(options)
-    check_initial_map(options.init)
+    check_method(options)
     check_evaluation(options)
     refuse_without(options, "--partial", options.partial, "scale", "overlap")
     refuse_without(options, "--report", bool(options.report), "up")
@@ -189,23 +188,19 @@ def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]
 
 def _write_files(
     options: argparse.Namespace, correspondence: Correspondence, stopwatch: Stopwatch
-) -> dict[str, Any]:
-    """Write all files except the expected errors and the report.
-
-    **Returns:** A dictionary from names to the requested maps. The names are `one-to-one` (a pointwise map)
-    and `surface` (points on the surface of Y).
-    """
+) -> dict[str, Int64[np.ndarray, " m"] | SurfacePoints]:
+    """Write all files except the expected errors and the report. Return the further maps to measure."""
     from jaxsmw.io.map_files import write_pointwise_map
 
-    others: dict[str, Any] = {}
+    others: dict[str, Int64[np.ndarray, " m"] | SurfacePoints] = {}
     with stopwatch.step("writing"):
         write_pointwise_map(options.output, correspondence.pointwise_map)
     report_written(options.output)
     if options.one_to_one:
         report_progress("one-to-one map ...")
         with stopwatch.step("one-to-one map"):
-            others["one-to-one"] = correspondence.one_to_one()
-            write_pointwise_map(options.one_to_one, others["one-to-one"])
+            others["one-to-one"] = one_to_one = correspondence.one_to_one()
+            write_pointwise_map(options.one_to_one, one_to_one)
         report_written(options.one_to_one)
     if options.surface_points or options.texture:
         report_progress("points on the surface ...")
@@ -218,7 +213,7 @@ def _write_files(
     return others
 
 
-def _write_points(options: argparse.Namespace, correspondence: Correspondence, points: Any) -> None:
+def _write_points(options: argparse.Namespace, correspondence: Correspondence, points: SurfacePoints) -> None:
     """Write the surface points and the texture."""
     if options.surface_points:
         from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
@@ -248,11 +243,11 @@ def _write_overlap(file: str, correspondence: Correspondence, stopwatch: Stopwat
     )
 
 
-def _write_numbers(file: str, numbers: Any, form: str = "%.6f") -> None:
+def _write_numbers(file: str, numbers: Shaped[np.ndarray, " m"], form: str = "%.6f") -> None:
     """Write one number per line."""
-    import numpy as np
+    from numpy import savetxt
 
     from jaxsmw.runtime.files import atomic_write
 
     with atomic_write(file) as temporary:
-        np.savetxt(temporary, numbers, form)
+        savetxt(temporary, numbers, form)

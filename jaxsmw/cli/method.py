@@ -21,11 +21,10 @@ from jaxsmw.choices import (
 from jaxsmw.cli.arguments import add_eigenproblem, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.inputs import initial_map, read_initial_map
+from jaxsmw.cli.inputs import check_initial_map_files, initial_map_choice, read_initial_map
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
-    from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
     from jaxsmw.geometry.mesh import Mesh
     from jaxsmw.matching.correspondence import Correspondence
     from jaxsmw.matching.stages import Stage
@@ -61,7 +60,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--init",
         metavar="INITIAL_MAP",
-        type=initial_map,
+        type=initial_map_choice,
         default=DEFAULT_MATCH_INIT,
         help=f"initial map: {', '.join(get_args(MatchInit))}, landmarks:FILE, "
         "landmarks:SOURCE_FILE,TARGET_FILE or map:FILE (default: "
@@ -145,24 +144,18 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
     )
 
 
-def check_preset(options: argparse.Namespace) -> None:
-    """Refuse any `--preset` other than `paper` if an option changes the MWP paper's method.
-
-    **Raises:** `InputError` that names the first option that changes the method.
-    """
+def check_method(options: argparse.Namespace) -> None:
+    """Check the landmark files of `--init`, and refuse changes to presets other than `paper`."""
     if options.preset not in (None, _PAPER) and (changes := _changes(options)):
         raise InputError(
             f"{changes[0]}: changes the paper's method, but --preset {options.preset} is another method: "
             "leave one of the two options out."
         )
+    check_initial_map_files(options.init)
 
 
 def preset_name(options: argparse.Namespace) -> PresetName:
-    """Return the name of the preset to use.
-
-    If `--preset` is missing, and an option changes the paper's method, the preset is `paper`. If `--preset`
-    and all such options are missing, the default preset is used.
-    """
+    """Return the name of the preset to use; by default `paper` if an option changes the paper's method."""
     return options.preset or (_PAPER if _changes(options) else DEFAULT_PRESET)
 
 
@@ -189,20 +182,7 @@ def match_meshes(
     scale: float | Scale | None = None,
     index_base: IndexBase | None = None,
 ) -> Correspondence:
-    """Match two meshes with the options of `add_method`.
-
-    **Arguments:**
-
-    - `options`: the parsed options.
-    - `mesh_x`, `mesh_y`: the source X and the target Y.
-    - `stopwatch`: the stopwatch to which the times of the match are added.
-    - `partial`: whether one mesh is a partial shape and the other mesh the full shape.
-    - `scale`: the scale of a partial pair; see `jaxsmw.match`. None means 1.
-    - `index_base`: the index of the first vertex in a file of `--init`, 0 or 1; None for the default of the
-      file's format.
-
-    **Raises:** `InputError` if an option does not fit the meshes. `ArithmeticError` if a computation fails.
-    """
+    """Match two meshes with the options of `add_method`, and print their scale and hand if unknown."""
     import jax
 
     from jaxsmw.matching.match import match
@@ -229,57 +209,38 @@ def match_meshes(
     stopwatch.add(correspondence.seconds)
     if isinstance(scale, str):
         show(f"scale:       {correspondence.pair.scale:.4g} (lengths on the target / lengths on the source)")
-    if correspondence.mirrored or correspondence.mirror_evidence is not None:
-        _say_hand(correspondence)
-    return correspondence
-
-
-def _say_hand(correspondence: Correspondence) -> None:
-    """Print whether the source itself or its mirror image was matched."""
-    took = "the mirror image of the source" if correspondence.mirrored else "the source itself"
     evidence = correspondence.mirror_evidence
-    known = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"
-    show(f"hand:        {took}{known}")
+    if correspondence.mirrored or evidence is not None:
+        took = "the mirror image of the source" if correspondence.mirrored else "the source itself"
+        known = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"
+        show(f"hand:        {took}{known}")
+    return correspondence
 
 
 def _changed_stage(options: argparse.Namespace) -> Stage:
     """Return a stage that runs the MWP paper's method with the changes that the options request."""
+    from jaxsmw.core import solutions
+    from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
     from jaxsmw.matching.stages import Stage
 
-    settings: dict[str, Any] = {
+    method: dict[str, Any] = {"search": options.search} if options.search else {}
+    if options.bank or options.filters:
+        method["bank"] = make_bank(options.bank, options.filters)
+    if options.solution:
+        name, arguments = _SOLUTIONS[options.solution]
+        method["solution"] = getattr(solutions, name)(*arguments)
+    refiner = WaveletPreservation(**method)
+    filtering = isinstance(refiner.solution, solutions.Filtering)
+    if options.bank and filtering and (bounds := bounds_unless_tight(refiner.bank)):
+        lower, upper = bounds
+        say(
+            f"note: {options.bank} is not a tight frame (frame bounds {lower:.2g} and {upper:.2g}), but "
+            "filtering is meant for tight frames; --solution least-squares is exact for all banks."
+        )
+    settings = {
         "number_of_eigenvectors": options.eigenvectors,
         "iterations": options.iterations,
         "number_of_samples": options.samples,
         "stop_when_unchanged": options.stop_when_unchanged,
     }
-    return Stage(_changed_refiner(options), **_given(settings))
-
-
-def _changed_refiner(options: argparse.Namespace) -> WaveletPreservation:
-    from jaxsmw.core import solutions
-    from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-
-    settings: dict[str, Any] = {"search": options.search}
-    if options.bank or options.filters:
-        settings["bank"] = make_bank(options.bank, options.filters)
-    if options.solution:
-        name, arguments = _SOLUTIONS[options.solution]
-        settings["solution"] = getattr(solutions, name)(*arguments)
-    refiner = WaveletPreservation(**_given(settings))
-    if options.bank and isinstance(refiner.solution, solutions.Filtering):
-        _note_loose_frame(options.bank, bounds_unless_tight(refiner.bank))
-    return refiner
-
-
-def _note_loose_frame(name: str, bounds: tuple[float, float] | None) -> None:
-    if bounds:
-        lower, upper = bounds
-        say(
-            f"note: {name} is not a tight frame (frame bounds {lower:.2g} and {upper:.2g}), but filtering is "
-            "meant for tight frames; --solution least-squares is exact for all banks."
-        )
-
-
-def _given(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings that are not None. For all other settings, the library uses its defaults."""
-    return {name: value for name, value in settings.items() if value is not None}
+    return Stage(refiner, **{name: value for name, value in settings.items() if value is not None})

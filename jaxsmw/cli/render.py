@@ -46,10 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Draw a mesh or a correspondence, or write a page with one or several correspondences.
-
-    **Raises:** `InputError` if an option or a file cannot be used.
-    """
+    """Draw a mesh or a correspondence, or write a page with one or several correspondences."""
     page = is_page(options.output)
     _check(options, page)
     mesh_x = read_mesh_file(options.source, weld=options.weld)

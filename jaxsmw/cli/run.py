@@ -1,19 +1,22 @@
-"""The execution of one command, from its arguments to its exit code."""
+"""The command line: the parser of all commands, and the execution of one of them."""
 
 from __future__ import annotations
 
+import argparse
+import re
+import sys
 import warnings
 from collections.abc import Sequence
+from typing import Any, NoReturn
 
-from jaxsmw.cli.console import flush_output, log_to_console, say
-from jaxsmw.cli.parser import make_parser
+from jaxsmw.cli import benchmark, cache, collection, demo, evaluate, match, render, spectrum, transfer
+from jaxsmw.cli.arguments import add_quiet, shortened
+from jaxsmw.cli.console import flush_output, log_to_console, say, show
 from jaxsmw.errors import InputError
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run a command, and print one sentence on standard error if it fails.
-
-    `arguments` are the words of the command line after `jaxsmw`.
+    """Run the command with the given words after `jaxsmw`, and print one sentence if it fails.
 
     **Returns:** The exit code: 0 for success, 2 for bad input, 1 for any other failure.
     """
@@ -65,3 +68,96 @@ def _run(arguments: Sequence[str]) -> None:
         check_working_directory()
         cache_compiled_programs()
         options.run(options)
+
+
+# The help lists the commands in this order.
+_COMMANDS = {
+    "demo": demo,
+    "match": match,
+    "transfer": transfer,
+    "collection": collection,
+    "evaluate": evaluate,
+    "benchmark": benchmark,
+    "spectrum": spectrum,
+    "render": render,
+    "cache": cache,
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that prints one sentence for bad arguments and exits with code 2."""
+
+    def __init__(self, **settings: Any) -> None:
+        # Abbreviated options are not allowed, because a new option with the same beginning would make an
+        # abbreviation ambiguous.
+        super().__init__(allow_abbrev=False, **settings)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse unknown options first. For `--outptu`, argparse would report that `--output` is missing."""
+        words = sys.argv[1:] if args is None else list(args)
+        if (unknown := self._unknown_option(words)) is not None:
+            import difflib
+
+            nearest = difflib.get_close_matches(unknown, self._option_string_actions, n=1)
+            cure = f": did you mean {nearest[0]}?" if nearest else ""
+            self.error(f"unknown option {shortened(unknown)!r}{cure}")
+        return super().parse_known_args(words, namespace)
+
+    def _unknown_option(self, words: Sequence[str]) -> str | None:
+        """Return the name of the first unknown option. The name of `--x=3` is `--x`."""
+        known = self._option_string_actions
+        if not {"-h", "--help"}.isdisjoint(words):
+            return None
+        for i, word in enumerate(words):
+            if word == "--" or (self._subparsers and not word.startswith("-")):
+                # Only positional arguments follow `--`. The options of a command follow its name.
+                return None
+            name = word.partition("=")[0]
+            # Like argparse, treat negative numbers and words with blanks as values.
+            if name in known or " " in word or not re.match(r"-(?!\.?\d).", word):
+                continue
+            # The words `--up -z` are not reported here: argparse reports that the value of `--up` is missing.
+            if len(word) > 2 or i == 0 or words[i - 1] not in known or known[words[i - 1]].nargs == 0:
+                return name
+        return None
+
+    def print_help(self, file: Any = None) -> None:
+        """Print the help. Unlike argparse, raise an error if standard output cannot be written."""
+        show(self.format_help().rstrip())
+
+    def error(self, message: str) -> NoReturn:
+        """Print a message on standard error, and exit with code 2."""
+        say(f"{self.prog}: {message} (see {self.prog} --help)")
+        sys.exit(2)
+
+
+def make_parser() -> Parser:
+    """Return the parser of all commands. The attribute `run` of its result is the command's function."""
+    parser = Parser(
+        prog="jaxsmw",
+        description="Match two triangle meshes (OFF, OBJ, PLY, STL, VTK, glTF or MATLAB's MAT) of the same "
+        "kind of body in different poses: find for every vertex of one mesh the same point on the other.",
+    )
+    parser.add_argument("--version", action=_Version)
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    for name, command in _COMMANDS.items():
+        subparser = commands.add_parser(name, help=command.HELP)
+        command.add_arguments(subparser)
+        add_quiet(subparser)
+        subparser.set_defaults(run=command.run)
+    return parser
+
+
+class _Version(argparse.Action):
+    """Prints the version, which is looked up only on request, because the look-up is slow."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str) -> None:
+        super().__init__(
+            option_strings, argparse.SUPPRESS, nargs=0, default=argparse.SUPPRESS, help="print the version"
+        )
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        import jaxsmw
+
+        show(f"jaxsmw {jaxsmw.__version__}")
+        parser.exit()

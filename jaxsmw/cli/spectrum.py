@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 from jaxsmw.choices import NUMBER_OF_EIGENVECTORS
 from jaxsmw.cli.arguments import add_eigenproblem, add_weld, path, refuse_without, whole_number
 from jaxsmw.cli.banks import add_bank, make_bank
 from jaxsmw.cli.console import show
-from jaxsmw.cli.inputs import check_inputs, describe_mesh
+from jaxsmw.cli.inputs import check_inputs
 from jaxsmw.cli.outputs import check_outputs, report_written
-
-if TYPE_CHECKING:
-    import numpy as np
 
 HELP = "describe a mesh and compute its eigenbasis"
 
@@ -50,10 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Describe the mesh, print its eigenvalues, and write the requested files.
-
-    **Raises:** `InputError` if an option or a file cannot be used.
-    """
+    """Describe the mesh, print its eigenvalues, and write the requested files."""
     refuse_without(options, "--figure", bool(options.figure), "bank", "filters")
     check_inputs(options.mesh)
     check_outputs([options.mesh], files=[options.output], figures=[options.figure])
@@ -64,15 +57,18 @@ def run(options: argparse.Namespace) -> None:
     bank = make_bank(options.bank, options.filters)
     from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
     from jaxsmw.geometry.laplacian import choose_laplacian
+    from jaxsmw.geometry.mesh import diagnose
     from jaxsmw.io.mesh_files import read_mesh
 
     mesh = read_mesh(options.mesh, weld=options.weld)
     laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian
     pairs = eigenpairs(mesh, options.eigenvectors, laplacian=laplacian, eigensolver=options.eigensolver)
     eigenvalues, _, _ = pairs
-    show("\n".join(describe_mesh(mesh)))
+    show("\n".join([*mesh.notes, *diagnose(mesh).sentences()]))
     show(f"area {mesh.area:.6g}, {laplacian} Laplacian; eigenvalues of the surface scaled to area 1:")
-    show("\n".join(_lines(eigenvalues)))
+    for first in range(0, len(eigenvalues), _EIGENVALUES_PER_LINE):
+        row = eigenvalues[first : first + _EIGENVALUES_PER_LINE]
+        show(f"{first:5}  {' '.join(f'{value:9.2f}' for value in row)}")
     if options.output:
         import jax
 
@@ -87,12 +83,3 @@ def run(options: argparse.Namespace) -> None:
 
         save_figure(options.figure, draw_bank(bank, eigenvalues))
         report_written(options.figure)
-
-
-def _lines(eigenvalues: np.ndarray) -> list[str]:
-    """Return lines of eigenvalues. Each line begins with the 0-based index of its first eigenvalue."""
-    lines = []
-    for first in range(0, len(eigenvalues), _EIGENVALUES_PER_LINE):
-        row = " ".join(f"{value:9.2f}" for value in eigenvalues[first : first + _EIGENVALUES_PER_LINE])
-        lines.append(f"{first:5}  {row}")
-    return lines

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import math
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.cli.arguments import (
@@ -16,12 +15,13 @@ from jaxsmw.cli.arguments import (
     add_up,
     add_weld,
     path,
+    positive_number,
     refuse_without,
 )
 from jaxsmw.cli.conclusion import show_quality, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.inputs import check_initial_map, check_inputs, initial_map_files, read_maps, report_mesh
-from jaxsmw.cli.method import add_method, check_preset, given_method, match_meshes
+from jaxsmw.cli.inputs import check_inputs, initial_map_files, read_maps, report_mesh
+from jaxsmw.cli.method import add_method, check_method, given_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
 from jaxsmw.errors import InputError
 
@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stiffness",
         metavar="LENGTH",
-        type=_positive,
+        type=positive_number,
         help="length below which noise of the map is smoothed, in units of the square root of the target's "
         "area (default: 0.005)",
     )
@@ -101,21 +101,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_index_base(parser)
 
 
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text[:60]!r} is not a positive number")
-    return value
-
-
 def run(options: argparse.Namespace) -> None:
-    """Match two meshes or read a map, write the requested files, and print the quality and the times.
-
-    **Raises:** `InputError` if an option or a file cannot be used. `ArithmeticError` if a computation fails.
-    """
+    """Match two meshes or read a map, write the requested files, and print the quality and the times."""
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         _check(options)
@@ -196,8 +183,7 @@ def _check(options: argparse.Namespace) -> None:
     refuse_without(options, "--partial", options.partial, "scale")
     refuse_without(options, "--report", bool(options.report), "up")
     init_files = initial_map_files(options.init)
-    check_preset(options)
-    check_initial_map(options.init)
+    check_method(options)
     refuse_without(options, "--map or a file of --init", bool(options.map or init_files), "index_base")
     from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
     from jaxsmw.io.mesh_data import check_attribute_suffix, check_mesh_suffix
@@ -256,10 +242,7 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
 def _register(
     options: argparse.Namespace, source: MeshData, target: MeshData, stopwatch: Stopwatch
 ) -> tuple[Correspondence | None, RegisteredMesh]:
-    """Return the match, which is None if a map is given, and the registered mesh.
-
-    The match already contains its expected error.
-    """
+    """Return the match with its expected error, or None if a map is given, and the registered mesh."""
     from jaxsmw.matching.pair import Pair
     from jaxsmw.runtime.threads import one_blas_thread
     from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, points_of_map, register_mesh
@@ -301,11 +284,7 @@ def _transfer_landmarks(
     registered: RegisteredMesh,
     stopwatch: Stopwatch,
 ) -> Landmarks:
-    """Transfer the landmarks, print their expected errors, write them if requested, and return them.
-
-    `expected_error` is the expected error of each match (m,), as a fraction of sqrt(area of Y),
-    or None if a map was given.
-    """
+    """Transfer the landmarks, print their expected errors, write them if requested, and return them."""
     from jaxsmw.io.landmark_files import write_landmark_file
     from jaxsmw.transfer.landmarks import transfer_landmarks
 
@@ -321,7 +300,7 @@ def _transfer_landmarks(
 
 
 def _show_landmarks(found: TransferredLandmarks) -> None:
-    """Print the expected error of each landmark, in the unit of the target, and mark large errors."""
+    """Print the expected error of each landmark, and mark large errors."""
     if found.expected_errors is None:
         return
     import numpy as np
@@ -338,7 +317,7 @@ def _show_landmarks(found: TransferredLandmarks) -> None:
 _LARGE = 2
 
 
-def _write(file: str, data: Any, stopwatch: Stopwatch) -> None:
+def _write(file: str, data: MeshData, stopwatch: Stopwatch) -> None:
     """Write a mesh with its data, and print notes about data that the file does not contain."""
     from jaxsmw.io.mesh_data import write_mesh_data
 

@@ -4,20 +4,17 @@ from .hands import choose_hands
 from .matching import match_collection
 from .pairs import match_pairs
 from .result import Collection, MatchedEdge
-from .settings import CollectionSettings
-from .shape_models import Alignment, ShapeModel, align, shape_model
+from .shape_models import ProcrustesAlignment, ShapeModel, align, shape_model
 from .shapes import PreparedShape, prepare_shapes
-from .synchronization import Network, SynchronizationSettings, synchronize
+from .synchronization import Network, synchronize
 
 __all__ = [
-    "Alignment",
     "Collection",
-    "CollectionSettings",
     "MatchedEdge",
     "Network",
     "PreparedShape",
+    "ProcrustesAlignment",
     "ShapeModel",
-    "SynchronizationSettings",
     "align",
     "choose_edges",
     "choose_hands",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,17 +24,8 @@ _LARGEST = 0.5
 _SHARPNESS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 
 
-def check_pairs(pairs: Iterable[Any], number: int, kind: str) -> list[tuple[int, int]]:
-    """Return pairs of shapes as tuples of integers.
-
-    **Arguments:**
-
-    - `pairs`: the pairs, each with the numbers of two shapes.
-    - `number`: the number of shapes.
-    - `kind`: the name for a pair in error messages, for example `"given edge"`.
-
-    **Raises:** `InputError` if a pair does not consist of the numbers of two shapes.
-    """
+def check_pairs(pairs: Iterable[Iterable[object]], number: int, kind: str) -> list[tuple[int, int]]:
+    """Return pairs of the numbers of shapes as tuples. Messages call such a pair `kind`."""
     checked = []
     for position, pair in enumerate(pairs):
         try:
@@ -50,14 +40,7 @@ def check_pairs(pairs: Iterable[Any], number: int, kind: str) -> list[tuple[int,
 
 
 def triangles(edges: Sequence[Edge]) -> Int64[np.ndarray, "t 3"]:
-    """List the triangles of a graph.
-
-    **Arguments:**
-
-    - `edges`: the edges, each a tuple of two different shapes.
-
-    **Returns:** An array (t, 3), each row with the three shapes of a triangle in ascending order.
-    """
+    """List the triangles of a graph, each with its three shapes in ascending order."""
     neighbors: dict[int, set[int]] = {}
     for i, j in edges:
         neighbors.setdefault(min(i, j), set()).add(max(i, j))
@@ -77,16 +60,7 @@ def cycle_error(
     positions: Float64[np.ndarray, "i 3"],
     samples: Int64[np.ndarray, " s"],
 ) -> float:
-    """Return the mean distance between samples and their images after a cycle of three maps.
-
-    **Arguments:**
-
-    - `first`, `second`, `third`: the maps i -> j, j -> k and k -> i, as 0-based vertices.
-    - `positions`: the positions of the vertices of shape i, in units of the square root of the area.
-    - `samples`: the samples (s,), vertices of shape i.
-
-    **Returns:** The mean Euclidean distance, in the unit of `positions`. Distances above 0.5 count as 0.5.
-    """
+    """Return the mean distance between samples of i and their images after the maps i -> j -> k -> i."""
     images = third[second[first[samples]]]
     distances = np.linalg.norm(positions[images] - positions[samples], axis=1)
     return float(np.minimum(distances, _LARGEST).mean())
@@ -137,18 +111,10 @@ def estimate_edge_errors(
     samples: Sequence[Int64[np.ndarray, " _"]],
     prior: Float64[np.ndarray, " e"],
 ) -> tuple[Float64[np.ndarray, " e"], Float64[np.ndarray, " c"], Int64[np.ndarray, "c 3"]]:
-    """Compute the errors of all triangles of a graph, and estimate the error of each edge; see `edge_errors`.
+    """Estimate the errors of edges, given the maps of each edge (i, j) with the keys (i, j) and (j, i).
 
-    **Arguments:**
-
-    - `edges`: the edges (i, j).
-    - `maps`: the vertex maps of all edges in both directions. The keys of an edge are (i, j) and (j, i).
-    - `positions`: the positions of each shape's vertices, in units of the square root of the shape's area.
-    - `samples`: samples of each shape, as 0-based vertices.
-    - `prior`: the first estimate of each edge's error (e,).
-
-    **Returns:** The estimated errors of the edges (e,), the errors of the triangles (c,), and the edges of
-    the triangles (c, 3).
+    **Returns:** The arguments and the result of `edge_errors`: the estimated errors of the edges, the errors
+    of the triangles, and the edges of the triangles.
     """
     found = triangles(edges)
     row = {frozenset(edge): number for number, edge in enumerate(edges)}
@@ -173,13 +139,7 @@ def estimate_edge_errors(
 
 
 def find_outliers(errors: Mapping[Edge, float], limit: float) -> tuple[int, ...]:
-    """Return the shapes whose maps all have large errors, in ascending order.
-
-    **Arguments:**
-
-    - `errors`: the error of the map of each edge (i, j).
-    - `limit`: the smallest error that counts as large, in the unit of `errors`.
-    """
+    """Return the shapes whose maps all have an error of at least `limit`, in ascending order."""
     least: dict[int, float] = {}
     for edge, error in errors.items():
         for shape in edge:

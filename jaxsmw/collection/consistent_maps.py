@@ -11,10 +11,24 @@ from jaxtyping import Float64, Int64
 from jaxsmw.collection.consistency import Edge, estimate_edge_errors
 from jaxsmw.collection.edges import EdgeMap
 from jaxsmw.collection.result import MatchedEdge
-from jaxsmw.collection.settings import CollectionSettings
 from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.matching.shapes import PreparedShape
+
+# Lengths are in units of the square root of the area of each shape. Table R26 is in `docs/research_log.md`.
+# The number of samples of each shape at which cycles are compared.
+_CYCLE_SAMPLES = 200
+# An edge contradicts the collection if the mean distance between its maps and the maps through the template
+# is at least this value. The edge is then matched again, from the consistent map. (Table R26)
+_CONTRADICTED_FROM = 0.05
+# The error of an edge grows by this number times the squared logarithm of the distortion of its map. (Table
+# R26)
+_DISTORTION_WEIGHT = 2.0
+# A new map replaces the old map of an edge only if its distortion is at most this multiple of the old one.
+_DISTORTION_TOLERANCE = 1.02
+# A shape is an outlier if the errors of all its edges are at least this value. In collections of one kind of
+# body, every shape had an edge with an error of at most 0.04.
+OUTLIER_FROM = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +39,6 @@ class ConsistentMaps:
 
     - `shapes`: the N shapes.
     - `maps`: the map of each edge. An edge whose match failed has no map.
-    - `settings`: the settings of the collection.
     - `network`: the shapes, the maps and their estimated errors.
     - `template`: the index of the template in `shapes`.
     - `points`: for each shape, one `SurfacePoints` with an entry for each vertex of the template.
@@ -34,114 +47,81 @@ class ConsistentMaps:
 
     shapes: Sequence[PreparedShape]
     maps: Mapping[Edge, EdgeMap]
-    settings: CollectionSettings
     network: Network
     template: int
     points: Sequence[SurfacePoints]
     cycle_errors: Float64[np.ndarray, " c"]
 
     @classmethod
-    def of(
-        cls,
-        shapes: Sequence[PreparedShape],
-        maps: Mapping[Edge, EdgeMap],
-        settings: CollectionSettings,
-    ) -> ConsistentMaps:
-        """Estimate the errors of all edges from cycles, and synchronise the maps through `Network.medoid`.
-
-        **Arguments:**
-
-        - `shapes`: the N shapes.
-        - `maps`: the map of each edge. The edges must connect all shapes.
-        - `settings`: the settings of the collection.
-        """
+    def of(cls, shapes: Sequence[PreparedShape], maps: Mapping[Edge, EdgeMap]) -> ConsistentMaps:
+        """Synchronise the maps of edges that connect all shapes, through `Network.medoid`."""
         meshes, units = [shape.mesh for shape in shapes], [shape.mesh.area**0.5 for shape in shapes]
         points = _both_directions(maps)
-        distorted = settings.distortion_weight * _squared_log_distortions(maps)
+        # The distortion of an isometry is 1.
+        distortions = [max(found.distortion, 1.0) for found in maps.values()]
+        distorted = _DISTORTION_WEIGHT * np.log(distortions) ** 2
         prior = np.array([found.expected_error for found in maps.values()]) + distorted
         estimated, cycle_errors, _ = estimate_edge_errors(
             list(maps),
             {(i, j): found.nearest_corners(meshes[j]) for (i, j), found in points.items()},
             [mesh.vertices / unit for mesh, unit in zip(meshes, units, strict=True)],
-            [_cycle_samples(shape, settings.cycle_samples) for shape in shapes],
+            [_cycle_samples(shape) for shape in shapes],
             prior,
         )
         # A small cycle error can arise by chance, so the estimated error is raised to at least half of the
         # prior. Wrong maps can be consistent with each other, but their distortions are large. A penalty for
         # distortion is therefore added.
         errors = np.maximum(estimated, prior / 2) + distorted
-        network = Network(
-            meshes, points, dict(zip(maps, errors.tolist(), strict=True)), settings.synchronization
-        )
+        network = Network(meshes, points, dict(zip(maps, errors.tolist(), strict=True)))
         medoid = network.medoid()
-        return cls(shapes, maps, settings, network, medoid, synchronize(network, medoid), cycle_errors)
+        return cls(shapes, maps, network, medoid, synchronize(network, medoid), cycle_errors)
 
     def through(self, template: int) -> ConsistentMaps:
-        """Return the consistent maps through another template, the index of a shape in `shapes`."""
+        """Return the consistent maps through another template."""
         if template == self.template:
             return self
         return replace(self, template=template, points=synchronize(self.network, template))
 
     def residual(self, edge: Edge, network: Network | None = None) -> float:
-        """Return the mean distance between the maps of an edge and the maps through the template.
-
-        The residual is the larger of the residuals of both directions; see `Network.residual`.
-
-        **Arguments:**
-
-        - `edge`: the edge.
-        - `network`: a network with other maps of the edges. The default is the network of `self`.
-        """
+        """Return the larger `Network.residual` of both directions, for the maps in `network`."""
         (i, j), network = edge, network or self.network
         return max(network.residual(self.points, i, j), network.residual(self.points, j, i))
 
     def contradicted(self, edges: Iterable[Edge]) -> list[Edge]:
         """Return the edges whose match failed or whose maps contradict the consistent maps."""
-        limit = self.settings.contradicted_from
-        return [edge for edge in edges if edge not in self.maps or self.residual(edge) >= limit]
+        return [e for e in edges if e not in self.maps or self.residual(e) >= _CONTRADICTED_FROM]
 
     def vertex_map(self, i: int, j: int) -> Int64[np.ndarray, " m"]:
-        """Return the map of shape i (m vertices) to shape j through the template, as vertices of shape j."""
+        """Return the map of shape i to shape j through the template."""
         meshes = self.network.meshes
         return vertex_map_between(self.points[i], self.points[j], meshes[self.template], meshes[i], meshes[j])
 
     def improvements(self, again: Mapping[Edge, EdgeMap]) -> dict[Edge, EdgeMap]:
         """Return each new map that agrees better with the consistent maps than the edge's old map.
 
-        A new map is left out if its distortion exceeds the old distortion by more than the factor
-        `distortion_tolerance`. Such a map probably started from a wrong consistent map.
-
-        **Arguments:**
-
-        - `again`: new maps of some edges.
+        A new map with a larger distortion probably started from a wrong consistent map, and is left out.
         """
         better = {}
         errors = {edge: found.expected_error for edge, found in again.items()}
-        new = Network(self.network.meshes, _both_directions(again), errors, self.network.settings)
+        new = Network(self.network.meshes, _both_directions(again), errors)
         for edge, found in again.items():
             old, before = np.inf, np.inf
             if edge in self.maps:
                 old, before = self.maps[edge].distortion, self.residual(edge)
-            not_more_distorted = found.distortion <= old * self.settings.distortion_tolerance
+            not_more_distorted = found.distortion <= old * _DISTORTION_TOLERANCE
             if self.residual(edge, new) < before and not_more_distorted:
                 better[edge] = found
         return better
 
-    def describe_edge(self, edge: Edge, replaced: Container[Edge]) -> MatchedEdge:
-        """Return the scores of an edge, and how its map was used.
-
-        **Arguments:**
-
-        - `edge`: the edge.
-        - `replaced`: the edges whose first maps were replaced.
-        """
+    def matched_edge(self, edge: Edge, replaced: Container[Edge]) -> MatchedEdge:
+        """Return the scores of an edge, given the edges whose first maps were replaced."""
         if edge not in self.maps:
             return MatchedEdge(*edge, np.inf, np.inf, np.inf, np.inf, "contradicted", True)
         found, residual = self.maps[edge], self.residual(edge)
-        wrong = residual >= self.settings.contradicted_from
+        wrong = residual >= _CONTRADICTED_FROM
         decision = "contradicted" if wrong else "replaced" if edge in replaced else "kept"
         error = self.network.error(*edge)
-        doubtful = wrong or error >= self.settings.outlier_from
+        doubtful = wrong or error >= OUTLIER_FROM
         return MatchedEdge(*edge, found.expected_error, found.distortion, error, residual, decision, doubtful)
 
 
@@ -151,14 +131,8 @@ def _both_directions(maps: Mapping[Edge, EdgeMap]) -> dict[tuple[int, int], Surf
     return forward | {(j, i): found.backward for (i, j), found in maps.items()}
 
 
-def _squared_log_distortions(maps: Mapping[Edge, EdgeMap]) -> Float64[np.ndarray, " e"]:
-    """Return the squared logarithm of the distortion of each edge's map; zero for isometries."""
-    return np.log([max(found.distortion, 1.0) for found in maps.values()]) ** 2
-
-
-def _cycle_samples(shape: PreparedShape, number: int) -> Int64[np.ndarray, " s"]:
-    """Return about `number` vertices of a shape, from which cycle errors are computed."""
+def _cycle_samples(shape: PreparedShape) -> Int64[np.ndarray, " s"]:
     if shape.samples is None:
         used = np.flatnonzero(shape.mesh.referenced_vertices)
-        return used[:: max(1, len(used) // number)]
-    return np.asarray(shape.samples, np.int64)[:number]
+        return used[:: max(1, len(used) // _CYCLE_SAMPLES)]
+    return np.asarray(shape.samples, np.int64)[:_CYCLE_SAMPLES]

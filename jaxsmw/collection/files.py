@@ -37,15 +37,7 @@ RESULT_DIRECTORIES = ("maps", "registered", "landmarks", "attributes")
 
 
 def write_maps(collection: Collection, directory: Path) -> list[Path]:
-    """Write the maps between the template and all shapes, as 0-based vertices.
-
-    The file `NAME_from_template.txt` has one vertex of the shape NAME for each vertex of the template. The
-    file `NAME_to_template.txt` has one vertex of the template for each vertex of the shape.
-
-    **Returns:** The written files.
-
-    **Raises:** `InputError` if a file cannot be written.
-    """
+    """Write the maps between the template and all shapes, as 0-based vertices."""
     folder = make_directory(directory / "maps")
     written = []
     for shape, name in enumerate(collection.names):
@@ -57,22 +49,7 @@ def write_maps(collection: Collection, directory: Path) -> list[Path]:
 
 
 def write_registered(collection: Collection, template: MeshData, directory: Path, suffix: str) -> list[Path]:
-    """Write the registered mesh of each shape: the template's triangulation, with positions on the shape.
-
-    If a shape and the template have different values in `Collection.mirrored`, the corners of each face are
-    listed in reverse order. The normals of the registered mesh then point outward.
-
-    **Arguments:**
-
-    - `collection`: the collection.
-    - `template`: the template with its attributes, which all registered meshes receive.
-    - `directory`: the directory of the results.
-    - `suffix`: the suffix of the files, such as `.ply`.
-
-    **Returns:** The written files.
-
-    **Raises:** `InputError` if a file cannot be written.
-    """
+    """Write the registered mesh of each shape, with the attributes of the template."""
     folder = make_directory(directory / "registered")
     written = []
     for shape, registered in enumerate(collection.registered):
@@ -80,19 +57,19 @@ def write_registered(collection: Collection, template: MeshData, directory: Path
         if collection.mirrored[shape] != collection.mirrored[collection.template]:
             data = _turned(data)
         written.append(folder / f"{collection.names[shape]}{suffix}")
-        _write_mesh(written[-1], data, told=bool(shape))
+        _write_mesh(written[-1], data, first=shape == 0)
     return written
 
 
-def _write_mesh(path: Path, data: MeshData, *, told: bool) -> None:
-    """Write a mesh, and log the data that the file format cannot contain. If `told`, log nothing."""
+def _write_mesh(path: Path, data: MeshData, *, first: bool) -> None:
+    """Write a mesh. For the first mesh of a collection, log the data that the file format cannot contain."""
     warnings = write_mesh_data(path, data)
-    for warning in () if told else warnings:
+    for warning in warnings if first else ():
         logger.warning("%s", warning)
 
 
 def _turned(data: MeshData) -> MeshData:
-    """Return the mesh with reversed faces, so that the normals of a mirror image point outward."""
+    """Reverse the faces, so that the normals of a mirror image point outward."""
     texture = None if data.texture is None else (data.texture[0], data.texture[1][:, ::-1])
     mesh = replace(data.mesh, faces=np.ascontiguousarray(data.mesh.faces[:, ::-1]))
     return replace(data, mesh=mesh, faces=data.faces[:, ::-1], texture=texture)
@@ -101,29 +78,14 @@ def _turned(data: MeshData) -> MeshData:
 def write_attributes(
     collection: Collection, source: int, data: Sequence[MeshData], directory: Path, suffix: str
 ) -> list[Path]:
-    """Transfer the attributes of one mesh to all other meshes, and write these meshes.
-
-    See `jaxsmw.transfer.transfer_attributes`.
-
-    **Arguments:**
-
-    - `collection`: the collection.
-    - `source`: the 0-based index of the mesh whose attributes are transferred.
-    - `data`: all meshes with their attributes, in the order of `Collection.meshes`.
-    - `directory`: the directory of the results.
-    - `suffix`: the suffix of the files.
-
-    **Returns:** The written files.
-
-    **Raises:** `InputError` if a file cannot be written.
-    """
+    """Transfer the attributes of the mesh `source` to all other meshes, and write these meshes."""
     folder = make_directory(directory / "attributes")
     written: list[Path] = []
     for target, name in enumerate(collection.names):
         if target != source:
             registered = collection.registered_mesh(source, target)
             carried = transfer_attributes(data[source], registered, data[target])
-            _write_mesh(folder / f"{name}{suffix}", carried, told=bool(written))
+            _write_mesh(folder / f"{name}{suffix}", carried, first=not written)
             written.append(folder / f"{name}{suffix}")
     return written
 
@@ -131,19 +93,9 @@ def write_attributes(
 def write_landmarks(
     collection: Collection, source: int, landmarks: Landmarks, directory: Path, suffix: str
 ) -> tuple[list[Path], tuple[str, ...]]:
-    """Transfer the landmarks of one shape to all other shapes, and write the transferred landmarks.
-
-    **Arguments:**
-
-    - `collection`: the collection.
-    - `source`: the 0-based index of the shape on which `landmarks` are given.
-    - `landmarks`: the landmarks.
-    - `directory`: the directory of the results.
-    - `suffix`: the suffix of the files, such as `.mrk.json`.
+    """Transfer the landmarks of the shape `source` to all other shapes, and write them.
 
     **Returns:** The written files, and a sentence about each landmark far from the surface.
-
-    **Raises:** `InputError` if the landmarks do not lie on their shape, or a file cannot be written.
     """
     folder = make_directory(directory / "landmarks")
     written: list[Path] = []
@@ -158,17 +110,7 @@ def write_landmarks(
 
 
 def write_model(collection: Collection, model: ShapeModel, directory: Path, suffix: str) -> list[Path]:
-    """Write the mean shape, the modes (`modes.npz`) and the scores (`scores.csv`).
-
-    The file `modes.npz` contains `mean` (n, 3), `modes` (k, n, 3), `variances` (k,), `faces` (f, 3),
-    `weights` (n,), `matrices` (N, 3, 3) and `translations` (N, 3). A vertex of registered mesh i at position
-    v has the position `matrices[i] @ v + translations[i]` in the coordinates of the mean. The file
-    `scores.csv` has one row per mesh, in the same order, and one column per mode.
-
-    **Returns:** The written files.
-
-    **Raises:** `InputError` if a file cannot be written.
-    """
+    """Write the mean shape, the modes and the scores; see `docs/how_to/match_collection.md`."""
     template = collection.meshes[collection.template]
     mean, motion = Mesh(model.mean, template.faces, "mean"), model.alignment
     write_mesh_data(directory / f"mean{suffix}", MeshData(mean, template.faces))
@@ -201,18 +143,7 @@ def write_summary(
     provenance: Mapping[str, Any],
     files: Sequence[Path] = (),
 ) -> None:
-    """Write `collection.json`: the graph, the decisions, the errors, the times and the provenance.
-
-    **Arguments:**
-
-    - `collection`: the collection.
-    - `measures`: the figures of merit of the shape model.
-    - `directory`: the directory of the results.
-    - `provenance`: versions, settings and the machine.
-    - `files`: the files in `directory` that were written.
-
-    **Raises:** `InputError` if the file cannot be written.
-    """
+    """Write `collection.json`, with the figures of merit of the shape model and the other written files."""
     names = collection.names
     listed = sorted(file.relative_to(directory).as_posix() for file in files)
     contents = {
@@ -246,7 +177,7 @@ def write_summary(
         ],
         "cycle_error": {
             name: float(errors.mean()) if len(errors) else None
-            for name, errors in zip(("first", "final"), collection.cycle_errors or (), strict=False)
+            for name, errors in zip(("first", "final"), collection.cycle_errors, strict=True)
         },
         "shape_model": measures,
         "seconds": collection.seconds,
@@ -263,17 +194,7 @@ def read_template(directory: Path) -> str | None:
 
 
 def check_replaceable(directory: Path, names: Sequence[str]) -> None:
-    """Check that the results of a collection can be written to a directory without loss of other files.
-
-    **Arguments:**
-
-    - `directory`: the directory of the results, which need not exist.
-    - `names`: the names of the meshes of the collection.
-
-    **Raises:** `InputError` if the directory contains a file with the name of a result, but no
-    `provenance.json` of an earlier run. `InputError` is also raised if the directory contains results for
-    other meshes, and none of these meshes is in `names`.
-    """
+    """Refuse a directory with files of other origin, or with results for none of the meshes `names`."""
     if not (directory / "provenance.json").exists():
         if taken := [name for name in RESULT_FILES + RESULT_DIRECTORIES if (directory / name).exists()]:
             raise InputError(
@@ -291,18 +212,10 @@ def check_replaceable(directory: Path, names: Sequence[str]) -> None:
 
 
 def replace_results(new: Path, directory: Path) -> None:
-    """Move complete results to a directory, and remove the results of an earlier run.
+    """Move the complete results in `new` to a directory, and remove the results of an earlier run.
 
-    A file is removed if the earlier `collection.json` lists it, but the new `collection.json` does not. Such
-    files belong to meshes or options of the earlier run. The new `collection.json` is moved first, so that it
-    lists all results even if the process is killed.
-
-    **Arguments:**
-
-    - `new`: the directory with the new results. This directory is removed.
-    - `directory`: the directory of the results.
-
-    **Raises:** `InputError` if a file cannot be written.
+    An earlier result is removed if only the earlier `collection.json` lists it. The new `collection.json` is
+    moved first, so that it lists all results even if the process is killed.
     """
     summary = new / "collection.json"
     for file in set(_listed_files(directory / "collection.json")) - set(_listed_files(summary)):
@@ -327,10 +240,7 @@ Kind = TypeVar("Kind")
 
 
 def _in_summary(path: Path, name: str, kind: type[Kind]) -> Kind | None:
-    """Return a value in a `collection.json`.
-
-    The value is None if the file is missing or damaged, or if the value is not of the given kind.
-    """
+    """Return a value in a `collection.json`; None if the file is damaged or the value is of another kind."""
     with suppress(OSError, ValueError, RecursionError):
         found = json.loads(path.read_text("utf-8"))
         if isinstance(found, dict) and isinstance(found.get(name), kind):

@@ -8,24 +8,25 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.sparse.csgraph import minimum_spanning_tree
 
+from jaxsmw.choices import EDGES_PER_SHAPE
 from jaxsmw.collection.consistency import Edge, check_pairs
-from jaxsmw.collection.settings import CollectionSettings
 from jaxsmw.errors import InputError, check_number, check_whole_number
 from jaxsmw.matching.shapes import PreparedShape
 from jaxsmw.runtime.cache import Store
 
 # Low eigenvalues describe the proportions of a body. High eigenvalues depend on the mesh.
 _COMPARED_EIGENVALUES = 50
+# (Table R26 of docs/research_log.md)
+_RANDOM_SHARE = 0.25
 
 
 def shape_distances(shapes: Sequence[PreparedShape]) -> Float64[np.ndarray, "N N"]:
     """Compute how much the shapes of a collection differ, without matching them.
 
     The distance of two shapes is the root mean square of two parts, each divided by its median over all
-    pairs. The first part compares the logarithms of the eigenvalues of the Laplacian (Reuter, Wolter,
-    Peinecke, "Laplace-Beltrami spectra as Shape-DNA of surfaces and solids", 2006). The eigenvalues hardly
-    change with the pose. The second part compares the second moments of the descriptors over the surface.
-    Unlike the eigenvalues, these moments change with the pose.
+    pairs. The first part compares the logarithms of the eigenvalues of the Laplacian, which hardly change
+    with the pose (Reuter, Wolter, Peinecke, "Laplace-Beltrami spectra as Shape-DNA of surfaces and solids",
+    2006). The second part compares the second moments of the descriptors over the surface, which do change.
 
     **Arguments:**
 
@@ -59,22 +60,21 @@ def _moments(shape: PreparedShape) -> Float64[np.ndarray, " q"]:
 def choose_edges(
     distances: Float64[np.ndarray, "N N"],
     *,
-    edges_per_shape: float | int = 4,
-    random_share: float = 0.25,
+    edges_per_shape: float | int = EDGES_PER_SHAPE,
+    random_share: float = _RANDOM_SHARE,
     given: Sequence[Edge] = (),
     seed: int = 0,
 ) -> list[Edge]:
     """Choose the pairs of a collection that are matched.
 
-    The graph consists of three parts. The minimum spanning tree connects all shapes through similar shapes.
-    Edges to the nearest neighbours of each shape form cycles. The other edges are random. Random edges keep
-    the paths between any two shapes short. They also reveal errors that all similar shapes share.
+    The minimum spanning tree connects all shapes through similar shapes. Edges to the nearest neighbours of
+    each shape form cycles. The other edges are random: they keep the paths between any two shapes short, and
+    reveal errors that all similar shapes share.
 
     **Arguments:**
 
     - `distances`: the distances of the shapes (N, N), in any unit; see `shape_distances`.
-    - `edges_per_shape`: the number of edges divided by N. If the shapes form fewer pairs than this number of
-      edges, all pairs are chosen.
+    - `edges_per_shape`: the number of edges divided by N, if there are so many pairs.
     - `random_share`: the share of random edges, from 0 to 1.
     - `given`: edges that are already matched and are kept, as tuples (i, j) of 0-based numbers. If shapes
       were added to a collection, only edges of the added shapes are new.
@@ -83,9 +83,7 @@ def choose_edges(
     **Returns:** A list of the edges in ascending order. An edge is a tuple (i, j) of the 0-based numbers of
     two shapes, with i < j.
 
-    **Raises:** `InputError` if the distances are not a square matrix of finite numbers that are not negative.
-    `InputError` is also raised if the number of edges is not positive, the share is not from 0 to 1, the seed
-    is negative, or a given edge does not join two shapes.
+    **Raises:** `InputError` if an argument is not as described.
     """
     distances = np.asarray(distances)
     if not (
@@ -110,16 +108,13 @@ def choose_edges(
     wanted = [(i, j) for i in range(number) for j in range(i + 1, number) if not known >= {i, j}]
     new = number - len(known)
     most = min(len(wanted), round(edges_per_shape * new)) if known else round(edges_per_shape * number)
-    added: set[Edge] = set()
     # The tree prefers edges that are already matched. All lengths are positive, because SciPy ignores edges
     # of length zero.
     lengths = distances + 1e-6 * (1 + distances.max(initial=0))
     for edge in chosen:
         lengths[edge] *= 1e-6
     tree = minimum_spanning_tree(np.triu(lengths, 1)).tocoo()
-    added |= {
-        (min(i, j), max(i, j)) for i, j in zip(tree.row.tolist(), tree.col.tolist(), strict=True)
-    } - chosen
+    added = set(zip(tree.row.tolist(), tree.col.tolist(), strict=True)) - chosen
     generator = np.random.default_rng(seed)
     random = [wanted[row] for row in generator.permutation(len(wanted))]
     added |= set(random[: round(random_share * most)])
@@ -135,34 +130,24 @@ def choose_edges(
 
 
 def extended_graph(
-    shapes: Sequence[PreparedShape], settings: CollectionSettings, *, seed: int = 0, store: Store
+    shapes: Sequence[PreparedShape], edges_per_shape: float | int, *, seed: int, store: Store
 ) -> list[Edge]:
-    """Choose the pairs of a collection that are matched, and keep them in a store.
+    """Choose edges as `choose_edges` does, and keep those of an earlier call with the same store.
 
-    The edges of an earlier call with the same store, settings and seed are kept. Edges of removed shapes are
-    dropped, and edges of new shapes are added.
-
-    **Arguments:**
-
-    - `shapes`: the shapes, with names that differ from each other.
-    - `settings`: the settings of the graph.
-    - `seed`: the seed of the random edges.
-    - `store`: the store of the collection.
-
-    **Returns:** The edges (i, j) with i < j, in ascending order; see `choose_edges`.
+    Edges of removed shapes are dropped, and edges of new shapes are added. The names of shapes identify them.
     """
     names = [shape.mesh.name for shape in shapes]
-    inputs = (repr(settings.edges_per_shape), settings.random_share, seed)
+    inputs = (float(edges_per_shape), _RANDOM_SHARE, seed)
     stored = store.load("graph", inputs)
     given: list[Edge] = []
     if stored is not None:
         row = {name: number for number, name in enumerate(names)}
-        pairs = [(row.get(a), row.get(b)) for a, b in stored["edges"].reshape(-1, 2).tolist()]
-        given = [(min(a, b), max(a, b)) for a, b in pairs if a is not None and b is not None]
+        pairs = stored["edges"].reshape(-1, 2).tolist()
+        given = [(row[a], row[b]) for a, b in pairs if a in row and b in row]
     edges = choose_edges(
         shape_distances(shapes),
-        edges_per_shape=settings.edges_per_shape,
-        random_share=settings.random_share,
+        edges_per_shape=edges_per_shape,
+        random_share=_RANDOM_SHARE,
         given=given,
         seed=seed,
     )

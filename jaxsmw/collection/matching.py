@@ -10,15 +10,14 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, MirrorCollection
+from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, EDGES_PER_SHAPE, MirrorCollection
 from jaxsmw.collection.consistency import Edge, find_outliers
-from jaxsmw.collection.consistent_maps import ConsistentMaps
+from jaxsmw.collection.consistent_maps import OUTLIER_FROM, ConsistentMaps
 from jaxsmw.collection.edge_matcher import EdgeMatcher
 from jaxsmw.collection.edges import EdgeMap
 from jaxsmw.collection.graph import extended_graph
 from jaxsmw.collection.hands import choose_hands, compare_hands
 from jaxsmw.collection.result import Collection
-from jaxsmw.collection.settings import CollectionSettings
 from jaxsmw.collection.shapes import describe_shapes, prepare_usable_shapes
 from jaxsmw.errors import InputError, check_choice, check_number, check_whole_number
 from jaxsmw.geometry.geodesics import SurfacePoints
@@ -31,6 +30,9 @@ from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress, timed
 from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, register_mesh
 
+# The largest number of times that contradicted edges are matched again.
+_ROUNDS = 2
+
 
 def match_collection(
     meshes: Sequence[Mesh | MeshLike],
@@ -40,7 +42,7 @@ def match_collection(
     template: int | None = None,
     mirror: MirrorCollection | Sequence[bool] = DEFAULT_MIRROR,
     stiffness: float = DEFAULT_STIFFNESS,
-    settings: CollectionSettings = CollectionSettings(),  # noqa: B008 (immutable)
+    edges_per_shape: float | int = EDGES_PER_SHAPE,
     seed: int = 0,
     directory: Path | str | None = None,
     executor: Executor | None = None,
@@ -69,7 +71,8 @@ def match_collection(
       right jaws, need such a sequence.
     - `stiffness`: the stiffness of the registered meshes, a positive length in units of the square root of
       each shape's area; see `register_mesh`.
-    - `settings`: the `CollectionSettings`.
+    - `edges_per_shape`: the number of matched pairs divided by the number of shapes. More pairs cost time,
+      but hardly improve the maps beyond the default of 4.
     - `seed`: the seed of the random edges of the graph, an integer of at least 0.
     - `directory`: an existing directory in which finished steps are kept. A second call with the same
       directory continues an interrupted call. If the second call has additional meshes, only edges of the
@@ -102,8 +105,7 @@ def match_collection(
     if template is not None:
         template = check_whole_number("template", template, 0, len(meshes) - 1)
     check_number("stiffness", stiffness, positive=True)
-    if not isinstance(settings, CollectionSettings):
-        raise InputError(f"settings is {settings!r}: give CollectionSettings.")
+    check_number("edges_per_shape", edges_per_shape, positive=True)
     seed = check_whole_number("seed", seed, 0)
     check_devices(devices)
     if directory is not None and not Path(directory).is_dir():
@@ -129,7 +131,7 @@ def match_collection(
     with timed("descriptors", seconds):
         shapes, axes = describe_shapes(shapes, chosen, store)
     with timed("graph", seconds):
-        edges = extended_graph(shapes, settings, seed=seed, store=store)
+        edges = extended_graph(shapes, edges_per_shape, seed=seed, store=store)
     # Asymmetric shapes are matched from two initial maps, and expected errors decide between the two results.
     # Without repair, expected errors do not lead to the correct choice.
     aligned = chosen.repair is not None and any(decision.asymmetric for decision in decisions.values())
@@ -138,7 +140,7 @@ def match_collection(
         maps = matcher.match(dict.fromkeys(edges), "edges")
         _check_connected(maps, shapes)
     with timed("synchronization", seconds):
-        first = ConsistentMaps.of(shapes, maps, settings)
+        first = ConsistentMaps.of(shapes, maps)
         consistent, replaced = _match_contradicted(first, edges, matcher)
         if template is not None:
             consistent = consistent.through(list(usable).index(template))
@@ -151,7 +153,7 @@ def match_collection(
         for mesh, of_shape in zip(kept, points, strict=True):
             registered.append(register_mesh(kept[consistent.template], mesh, of_shape, stiffness=stiffness))
             report("registered meshes", len(registered), len(points))
-    described = [consistent.describe_edge(edge, replaced) for edge in edges]
+    described = [consistent.matched_edge(edge, replaced) for edge in edges]
     errors = {(edge.source, edge.target): edge.estimated_error for edge in described}
     return Collection(
         meshes=tuple(kept),
@@ -162,7 +164,7 @@ def match_collection(
         edges=tuple(described),
         axes=axes,
         cycle_errors=(first.cycle_errors, consistent.cycle_errors),
-        outliers=find_outliers(errors, settings.outlier_from),
+        outliers=find_outliers(errors, OUTLIER_FROM),
         left_out=left_out,
         seconds=seconds,
     )
@@ -221,8 +223,7 @@ def _match_contradicted(
     **Returns:** The final consistent maps, and the edges whose maps were replaced.
     """
     replaced: set[Edge] = set()
-    settings = consistent.settings
-    for _ in range(settings.rounds):
+    for _ in range(_ROUNDS):
         wrong = consistent.contradicted(edges)
         if not wrong:
             break
@@ -231,7 +232,7 @@ def _match_contradicted(
         if not better:
             break
         replaced |= set(better)
-        consistent = ConsistentMaps.of(matcher.shapes, {**consistent.maps, **better}, settings)
+        consistent = ConsistentMaps.of(matcher.shapes, {**consistent.maps, **better})
     return consistent, replaced
 
 

@@ -37,18 +37,17 @@ class MatchedEdge:
       without unit. The distortion is 1 for isometries, larger for worse maps, and infinite if the match
       failed.
     - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The
-      estimate is `penalty + max(cycle_error, (expected_error + penalty) / 2)`. The penalty grows with the
-      distortion of the map (`CollectionSettings.distortion_weight`). The cycle error is estimated from the
-      cycles of the graph (`edge_errors`). The estimate is infinite if the match failed.
+      estimate is `penalty + max(cycle_error, (expected_error + penalty) / 2)`. The penalty is twice
+      the squared logarithm of the distortion. The cycle error is estimated from the cycles of the graph
+      (`edge_errors`). The estimate is infinite if the match failed.
     - `residual`: the mean distance between this map and the consistent map, which goes through the template.
       The mean is at most 0.5. The mean is also computed for the reverse map, and the residual is the larger
       mean. If the match failed, the residual is infinite.
     - `decision`: `"kept"`, `"replaced"` or `"contradicted"`. `"replaced"` means that the first map
-      contradicted the other maps. A second match, started from the consistent map, replaced the first map.
+      contradicted the other maps, and a second match, started from the consistent map, replaced it.
       `"contradicted"` means that the map contradicts the other maps and has little weight, or that the match
       failed.
-    - `doubtful`: whether the map contradicts the other maps, or its estimated error is at least
-      `CollectionSettings.outlier_from`.
+    - `doubtful`: whether the map contradicts the other maps, or its estimated error is at least 0.1.
     """
 
     source: int
@@ -86,12 +85,10 @@ class Collection:
       left teeth. All points and positions refer to the meshes, not to the mirror images.
     - `registered`: for each shape, the `RegisteredMesh` of the template on the shape.
     - `edges`: the matched pairs, each a `MatchedEdge`.
-    - `axes`: the `DescriptorAxes` of the descriptors; None if the preset uses no descriptors.
     - `cycle_errors`: a pair of arrays (c,) and (d,) with the errors of all triangles of the graph. The first
       array was computed from the first maps of the edges, the second from the final maps. Each error is the
-      mean of three values, one for each shape of the triangle. The unit of a value is the square root of the
-      area of the shape. The attribute is None if a `Collection` was made without cycle errors;
-      `match_collection` always computes them.
+      mean over the three shapes of the triangle, in units of the square root of the area of each shape.
+    - `axes`: the `DescriptorAxes` of the descriptors; None if the preset uses no descriptors.
     - `outliers`: the numbers (positions in `meshes`) of the shapes that differ much from all other shapes.
       All maps of such a shape have large errors or distortions. The shape may be another kind of body.
     - `left_out`: a dictionary of the meshes that could not be matched. The keys are the names of the meshes,
@@ -105,8 +102,8 @@ class Collection:
     mirrored: Bool[np.ndarray, " N"]
     registered: tuple[RegisteredMesh, ...]
     edges: tuple[MatchedEdge, ...]
+    cycle_errors: tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, " d"]]
     axes: DescriptorAxes | None = None
-    cycle_errors: tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, " d"]] | None = None
     outliers: tuple[int, ...] = ()
     left_out: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
@@ -136,7 +133,7 @@ class Collection:
             f"{count_of(len(self.meshes), 'shape')}, {count_of(len(self.edges), 'matched pair')}; the "
             f"template is {self.names[self.template]}."
         ]
-        if self.cycle_errors is None or len(self.cycle_errors[0]):
+        if len(self.cycle_errors[0]):
             found.append(
                 f"Maps that agree with the other maps: {decisions['kept']}. Wrong maps that were replaced: "
                 f"{decisions['replaced']}. Maps that still contradict the others and hardly count: "
@@ -194,10 +191,8 @@ class Collection:
     def pointwise_map(self, source: int, target: int) -> Int64[np.ndarray, " m"]:
         """Return the map from `source` (m vertices) to `target`, as 0-based vertices of `target` (m,).
 
-        The map goes through the template.
-
-        The maps of all pairs are consistent: a vertex that is carried around a cycle returns to itself, up to
-        the rounding to vertices.
+        The map goes through the template. A vertex that is carried around a cycle therefore returns to
+        itself, up to the rounding to vertices.
 
         **Raises:** `InputError` if a number is not the number of a shape.
         """
@@ -234,17 +229,9 @@ class Collection:
     def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
         """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
 
-        Lengths are in the unit of the meshes. If `scale` is True, the mean has the average size of the
-        registered meshes. The weight of each vertex is its vertex area on the template. If a shape and the
-        template have different values in `mirrored`, the mirror image of the shape enters the model.
-
-        **Arguments:**
-
-        - `scale`: whether to remove differences in size. If the meshes have different units, use True.
-          Lengths then have no meaningful unit.
-        - `number_of_modes`: the largest number of modes; None for all modes.
-
-        **Returns:** A `ShapeModel` with n vertices.
+        The weight of each vertex is its vertex area on the template. If a shape and the template have
+        different values in `mirrored`, the mirror image of the shape enters the model. If the meshes have
+        different units, `scale` must be True.
         """
         return shape_model(
             [one.vertices * sign for one, sign in zip(self.registered, self.signs, strict=True)],

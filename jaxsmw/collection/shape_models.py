@@ -37,7 +37,7 @@ Shapes = Real[np.ndarray, "N n 3"] | Sequence[Real[np.ndarray, "_ 3"]]
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class ProcrustesAlignment:
     """The result of `align`. Vertex v of shape i moves to `scales[i] * rotations[i] @ v + translations[i]`.
 
     **Attributes:**
@@ -66,14 +66,13 @@ def align(
     scale: bool = False,
     weights: Real[np.ndarray, " _"] | None = None,
     reference: int = 0,
-) -> Alignment:
+) -> ProcrustesAlignment:
     """Align shapes to their mean, by generalised Procrustes analysis.
 
     Each round moves every shape to the mean, in the least-squares sense, and then updates the mean (Gower,
     "Generalized Procrustes analysis", Psychometrika 1975; Goodall, "Procrustes methods in the statistical
     analysis of shape", JRSS B 1991). The first mean is the reference shape. The rounds end when the mean
-    changes by less than 1e-10 of its size, or after 1000 rounds. The inner products of the coordinates of the
-    shapes are computed only once. Therefore the time of a round grows with N² and does not depend on n.
+    changes by less than 1e-10 of its size, or after 1000 rounds.
 
     The size of a shape is its centroid size: the square root of the weighted mean of the squared distances
     from the vertices to their weighted centroid.
@@ -82,18 +81,15 @@ def align(
 
     - `shapes`: the positions of n corresponding vertices on N shapes, as an array (N, n, 3) or a sequence of
       arrays (n, 3). Without `scale`, all shapes need the same unit of length.
-    - `scale`: whether to remove differences of size. If True, each shape is scaled to fit the mean in the
-      least-squares sense. All shapes are then scaled by one common factor, so that the mean has the average
-      size of the given shapes.
-    - `weights`: non-negative weights of the vertices (n,). If the weights are the vertex areas of one shape,
-      dense regions of the triangulation do not dominate. With None (the default), all weights are equal.
+    - `scale`: whether to scale each shape to fit the mean in the least-squares sense. One common factor then
+      gives the mean the average size of the given shapes.
+    - `weights`: non-negative weights of the vertices (n,), such as vertex areas, so that dense regions of the
+      triangulation do not dominate. By default, all weights are equal.
     - `reference`: the 0-based index of the shape whose rotation and centroid do not change.
 
-    **Returns:** An `Alignment`, in the unit of length of the shapes.
+    **Returns:** An `ProcrustesAlignment`, in the unit of length of the shapes.
 
-    **Raises:** `InputError` if there is no shape, if shapes have different numbers of vertices, if a
-    coordinate is not finite, or if a shape is a single point. `InputError` is also raised if the weights or
-    the reference do not fit the shapes, or `scale` is neither True nor False.
+    **Raises:** `InputError` if an argument is not as described, or a shape is a single point.
     """
     points = _checked(shapes)
     count, n, _ = points.shape
@@ -115,19 +111,11 @@ def align(
     for i, shape in enumerate(points):
         # Centred coordinates have small rounding errors, even if a shape is far from the origin.
         aligned[i] = scales[i] * ((shape - centroids[i]) @ rotations[i].T) + centroids[reference]
-    return Alignment(aligned, aligned.mean(axis=0), rotations, translations, scales, shares, scale)
+    return ProcrustesAlignment(aligned, aligned.mean(axis=0), rotations, translations, scales, shares, scale)
 
 
 class DistanceCurve(NamedTuple):
-    """A mean distance for each number of modes.
-
-    **Attributes:**
-
-    - `numbers_of_modes`: a tuple of the numbers of modes, in the given order.
-    - `mean`: an array with the mean of the distances for each number of modes, in the unit of length of the
-      shapes.
-    - `standard_error`: an array with the standard error of each mean, in the same unit.
-    """
+    """The mean of distances for each number of modes, and its standard error, in the unit of the shapes."""
 
     numbers_of_modes: tuple[int, ...]
     mean: Float64[np.ndarray, " numbers"]
@@ -145,7 +133,7 @@ class ShapeModel:
 
     **Attributes:**
 
-    - `alignment`: the `Alignment` of the N shapes.
+    - `alignment`: the `ProcrustesAlignment` of the N shapes.
     - `modes`: the displacements of each mode (k, n, 3), without unit. The modes are orthonormal in the inner
       product above. For each mode, the score with the largest absolute value is positive.
     - `variances`: the variance of the scores of each mode (k,), decreasing, in squared units of length. Sums
@@ -156,7 +144,7 @@ class ShapeModel:
       squared units of length.
     """
 
-    alignment: Alignment
+    alignment: ProcrustesAlignment
     modes: Float64[np.ndarray, "k n 3"]
     variances: Float64[np.ndarray, " k"]
     scores: Float64[np.ndarray, "N k"]
@@ -212,8 +200,7 @@ class ShapeModel:
         **Returns:** The scores (k,), in units of length. For a shape of the collection, the result equals the
         row of this shape in the attribute `scores`.
 
-        **Raises:** `InputError` if the shape has another number of vertices, a coordinate is not finite, or
-        the shape is a single point.
+        **Raises:** `InputError` if the shape has another number of vertices or is a single point.
         """
         shape = numeric_rows(shape, "vertices", "the shape").astype(np.float64)
         if len(shape) != len(self.mean):
@@ -233,22 +220,15 @@ class ShapeModel:
         return np.einsum("v,vc,kvc->k", self.weights, displacements, self.modes, optimize=True)
 
     def _common_factor(self, mean: Float64[np.ndarray, "n 3"]) -> float:
-        """Return the factor that `align` applies to shapes after their least-squares fit to the mean.
-
-        Every aligned shape A satisfies |A|² = factor * <A, mean>. Averaged over all shapes, the left
-        side is |mean|² plus the variance, and the right side is factor * |mean|².
-        """
+        """Return the factor that `align` applies to shapes after their least-squares fit to the mean."""
+        # Every aligned shape A satisfies |A|² = factor * <A, mean>. Averaged over all shapes, the left side
+        # is |mean|² plus the variance, and the right side is factor * |mean|².
         squared_mean = float(self.weights @ (mean**2).sum(axis=1))
         count = len(self.scores)
         return 1 + self.total_variance * (count - 1) / count / squared_mean
 
     def compactness(self) -> Float64[np.ndarray, " k"]:
-        """Return the cumulative shares of the total variance (k,).
-
-        Entry i is the share of the first i + 1 modes.
-
-        The last share is 1 if the model has all modes.
-        """
+        """Return the shares of the total variance (k,): entry i is the share of the first i + 1 modes."""
         # Without variance there are no modes, and the result is empty.
         return np.cumsum(self.variances) / (self.total_variance or 1.0)
 
@@ -264,11 +244,9 @@ class ShapeModel:
 
         - `numbers_of_modes`: numbers of modes, from 0 (the mean alone) to N - 2.
 
-        **Returns:** A `DistanceCurve`: the mean error of the N shapes for each number of modes, and its
-        standard error, in units of length.
+        **Returns:** A `DistanceCurve` of the errors of the N shapes.
 
-        **Raises:** `InputError` if there are fewer than two shapes, or if an entry of `numbers_of_modes` is
-        not a whole number from 0 to N - 2.
+        **Raises:** `InputError` if there are fewer than two shapes, or another number of modes is given.
         """
         count = len(self.scores)
         if count < 2:
@@ -303,11 +281,9 @@ class ShapeModel:
         - `samples`: the number of random shapes, at least 2.
         - `seed`: the random seed. The random numbers of a mode do not depend on `numbers_of_modes`.
 
-        **Returns:** A `DistanceCurve`: the mean distance for each number of modes, and its standard error, in
-        units of length.
+        **Returns:** A `DistanceCurve` of the distances of the random shapes.
 
-        **Raises:** `InputError` if `samples` is below 2, if `seed` is negative, or if an entry of
-        `numbers_of_modes` is not a whole number from 0 to k.
+        **Raises:** `InputError` if an argument is not as described.
         """
         samples = check_whole_number("samples", samples, 2)
         seed = check_whole_number("seed", seed, 0)
@@ -329,11 +305,7 @@ class ShapeModel:
     def _mean_lengths(
         self, fields: Float64[np.ndarray, "p r"], coordinates: Float64[np.ndarray, "N r"]
     ) -> Float64[np.ndarray, " p"]:
-        """Return for each displacement field the mean length of its displacements over the surface.
-
-        `fields` contains one displacement field per row, and `coordinates` contains one shape per row. The
-        rows are coordinates in the orthonormal basis of `_coordinates`.
-        """
+        """Return the mean lengths of displacement fields, given in the basis of `_coordinates`."""
         combinations = fields @ (coordinates / (coordinates**2).sum(axis=0)).T
         lengths = np.zeros(len(fields))
         for block, displacements in _displacements(self.alignment):
@@ -354,15 +326,9 @@ def shape_model(
 
     **Arguments:**
 
-    - `shapes`: the positions of n corresponding vertices on N shapes, as an array (N, n, 3) or a sequence of
-      arrays (n, 3). Without `scale`, all shapes need the same unit of length.
-    - `scale`: whether to remove differences of size, False by default; see `align`.
-    - `weights`: non-negative weights of the vertices (n,), such as vertex areas in any unit. With None (the
-      default), all weights are equal.
-    - `reference`: the 0-based index of the shape whose rotation and centroid do not change.
-    - `number_of_modes`: the largest number of modes; None (the default) for all modes. A model of N shapes
-      has at most N - 1 modes. Modes whose standard deviation is below 1e-6 of the size of the mean are
-      left out as rounding errors. One shape and identical shapes therefore have no modes.
+    - `shapes`, `scale`, `weights`, `reference`: the arguments of `align`.
+    - `number_of_modes`: the largest number of modes; None for all modes, at most N - 1. Modes whose standard
+      deviation is below 1e-6 of the size of the mean are left out as rounding errors.
 
     **Returns:** A `ShapeModel`, in the unit of length of the shapes.
 
@@ -383,7 +349,6 @@ def shape_model(
 
 
 def _checked(shapes: Shapes) -> Float64[np.ndarray, "N n 3"]:
-    """Return the shapes as one array in float64."""
     if not isinstance(shapes, Iterable) or len(shapes) == 0:
         raise InputError("there is no shape; give at least one shape.")
     shapes = [numeric_rows(shape, "vertices", f"shape {index}") for index, shape in enumerate(shapes)]
@@ -407,7 +372,6 @@ def _is_point(
 
 
 def _checked_weights(weights: Real[np.ndarray, " _"] | None, n: int) -> Float64[np.ndarray, " n"]:
-    """Return the weights of n vertices with the sum 1."""
     if weights is None:
         return np.full(n, 1 / n)
     values = _numbers("weights", weights)
@@ -420,7 +384,6 @@ def _checked_weights(weights: Real[np.ndarray, " _"] | None, n: int) -> Float64[
 
 
 def _numbers(name: str, values: object) -> Float64[np.ndarray, "*shape"]:
-    """Return numbers as an array."""
     array = np.asarray(values)
     if array.dtype.kind not in "iuf":
         raise InputError(f"the {name} are {array.dtype.name}: give numbers.")
@@ -428,7 +391,6 @@ def _numbers(name: str, values: object) -> Float64[np.ndarray, "*shape"]:
 
 
 def _checked_numbers(numbers: Sequence[int], most: int, reason: str) -> tuple[int, ...]:
-    """Check a list of numbers of modes, and return the numbers as a tuple."""
     if not isinstance(numbers, Iterable):
         raise InputError(f"numbers_of_modes is {numbers!r}: give a list of whole numbers.")
     checked = tuple(check_whole_number("the number of modes", number) for number in numbers)
@@ -443,7 +405,7 @@ def _inner_products(
     centroids: Float64[np.ndarray, "N 3"],
     weights: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "N 3 N 3"]:
-    """Return the weighted inner products of the centred coordinates of all shapes."""
+    """Return the weighted inner products of the centred coordinates, so that no round depends on n."""
     count = len(points)
     products = np.zeros((3 * count, 3 * count))
     for block in _blocks(len(weights)):
@@ -460,7 +422,7 @@ def _rotations_and_scales(
     *,
     scale: bool,
 ) -> tuple[Float64[np.ndarray, "N 3 3"], Float64[np.ndarray, " N"]]:
-    """Return the rotations and scales of all shapes, from the inner products of their centred coordinates."""
+    """Return the rotations and scales of all shapes, from their `_inner_products`."""
     count = len(squared_sizes)
     flat = products.reshape(3 * count, 3 * count)
     size = np.sqrt(squared_sizes).mean()
@@ -484,39 +446,33 @@ def _rotations_and_scales(
 
 
 def _squared_norm(combination: Float64[np.ndarray, "3 q"], products: Float64[np.ndarray, "q q"]) -> float:
-    """Return the squared norm of a linear combination of shapes.
-
-    `products` are the inner products of the coordinates of the shapes.
-    """
+    """Return the squared norm of a linear combination of shapes, given their inner products."""
     return max(float(np.sum((combination @ products) * combination)), 0.0)
 
 
 def _blocks(n: int) -> Iterator[slice]:
-    """Yield slices of at most `_BLOCK` vertices."""
     for start in range(0, n, _BLOCK):
         yield slice(start, min(start + _BLOCK, n))
 
 
-def _displacements(alignment: Alignment) -> Iterator[tuple[slice, Float64[np.ndarray, "N q"]]]:
+def _displacements(alignment: ProcrustesAlignment) -> Iterator[tuple[slice, Float64[np.ndarray, "N q"]]]:
     """Yield each block of vertices with its displacements from the mean, one row per shape."""
     for block in _blocks(len(alignment.mean)):
         yield block, (alignment.aligned[:, block] - alignment.mean[block]).reshape(len(alignment.aligned), -1)
 
 
-def _smallest_norm(alignment: Alignment) -> float:
-    """Return a limit. A mode is a rounding error if the norm of its scores is below this limit."""
+def _smallest_norm(alignment: ProcrustesAlignment) -> float:
+    """Return the norm of the scores of a mode below which the mode is a rounding error."""
     centered = alignment.mean - alignment.weights @ alignment.mean
     size = np.sqrt(alignment.weights @ (centered**2).sum(axis=1))
     return float(_SMALLEST_DEVIATION * size * np.sqrt(max(len(alignment.aligned) - 1, 1)))
 
 
-def _coordinates(alignment: Alignment) -> Float64[np.ndarray, "N r"]:
-    """Return the scores of all modes: the coordinates of the shapes in the orthonormal basis of the modes.
-
-    One QR decomposition per block of vertices reduces the displacements to an N x N matrix, which has the
-    same inner products. The small singular values of this matrix are accurate. The small eigenvalues of a
-    matrix of inner products would be less accurate.
-    """
+def _coordinates(alignment: ProcrustesAlignment) -> Float64[np.ndarray, "N r"]:
+    """Return the scores of all modes: the coordinates of the shapes in the orthonormal basis of the modes."""
+    # One QR decomposition per block of vertices reduces the displacements to an N x N matrix with the same
+    # inner products. Its small singular values are accurate, unlike small eigenvalues of a matrix of inner
+    # products.
     count = len(alignment.aligned)
     reduced = np.zeros((0, count))
     for block, displacements in _displacements(alignment):
@@ -532,7 +488,7 @@ def _coordinates(alignment: Alignment) -> Float64[np.ndarray, "N r"]:
 
 
 def _directions(centered: Float64[np.ndarray, "N r"], smallest: float) -> Float64[np.ndarray, "k r"]:
-    """Return orthonormal directions of decreasing variance. Rounding errors are left out."""
+    """Return orthonormal directions of decreasing variance, without rounding errors."""
     if centered.size == 0:
         return np.zeros((0, centered.shape[1]))
     _, values, right = np.linalg.svd(centered, full_matrices=False)
@@ -540,6 +496,5 @@ def _directions(centered: Float64[np.ndarray, "N r"], smallest: float) -> Float6
 
 
 def _curve(numbers: tuple[int, ...], distances: Float64[np.ndarray, "numbers p"]) -> DistanceCurve:
-    """Return the means of distances, and their standard errors."""
     error = distances.std(axis=1, ddof=1) / np.sqrt(distances.shape[1])
     return DistanceCurve(numbers, distances.mean(axis=1), error)

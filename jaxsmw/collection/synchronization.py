@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,42 +13,25 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from jaxsmw.collection.consistency import Edge
-from jaxsmw.errors import check_number, check_whole_number
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.padding import pad_rows, padded_size
 
-
-@dataclass(frozen=True)
-class SynchronizationSettings:
-    """The settings of `synchronize`. Lengths are in units of the square root of the area of each shape.
-
-    **Attributes:**
-
-    - `iterations` (Table R26): the number of iterations. Each iteration averages the points on every shape.
-    - `robust_scale` (Table R26): a distance from the mean. A point at this distance has half of the weight of
-      a point at the mean. Points of wrong maps are much farther away.
-    - `discontinuity_distance`: the largest distance at which the matches of a triangle's corners are
-      averaged. If the matches are farther apart, a point of the triangle follows the match of the nearest
-      corner.
-
-    **Raises:** `InputError` if a setting is not valid.
-    """
-
-    iterations: int = 5
-    robust_scale: float = 0.02
-    discontinuity_distance: float = 0.1
-
-    def __post_init__(self) -> None:
-        check_whole_number("iterations", self.iterations, 0)
-        check_number("robust_scale", self.robust_scale, positive=True)
-        check_number("discontinuity_distance", self.discontinuity_distance, positive=True)
+# Lengths are in units of the square root of the area of each shape. Table R26 is in `docs/research_log.md`.
+# Each iteration averages the points on every shape. (Table R26)
+_ITERATIONS = 5
+# A point at this distance from the mean has half of the weight of a point at the mean. Points of wrong maps
+# are much farther away. (Table R26)
+_ROBUST_SCALE = 0.02
+# If the matches of a triangle's corners are farther apart, a point of the triangle follows the match of the
+# nearest corner. Otherwise the matches are averaged.
+_DISCONTINUITY_DISTANCE = 0.1
 
 
 def vertices_as_points(mesh: Mesh) -> SurfacePoints:
-    """Return the surface point nearest to each vertex of a mesh, as `SurfacePoints` with n entries."""
+    """Return the surface point nearest to each vertex of a mesh."""
     return nearest_surface_points(mesh.vertices, mesh)[0]
 
 
@@ -58,19 +41,7 @@ def carry(
     images: Float64[np.ndarray, "n 3"],
     discontinuity_distance: float,
 ) -> Float64[np.ndarray, "p 3"]:
-    """Carry points on a mesh to another surface, by interpolating the matches of the corners.
-
-    **Arguments:**
-
-    - `points`: `SurfacePoints` on the mesh with p entries.
-    - `mesh`: the mesh (n vertices).
-    - `images`: the position of each vertex's match on the other surface (n, 3).
-    - `discontinuity_distance`: the largest distance between matches that are averaged, in the unit of
-      `images`.
-
-    **Returns:** The positions (p, 3) of the carried points, in the unit of `images`. The positions lie near
-    the other surface.
-    """
+    """Carry points to positions near another surface, between the matches `images` of the mesh's vertices."""
     corners = images[mesh.faces[points.faces]]
     main = np.take_along_axis(corners, points.weights.argmax(axis=1)[:, None, None], axis=1)
     torn = np.linalg.norm(corners - main, axis=2).max(axis=1) > discontinuity_distance
@@ -83,20 +54,7 @@ def robust_mean(
     start: Float[Array, "n 3"],
     scale: Float[Array, ""],
 ) -> Float[Array, "n 3"]:
-    """Average candidate positions of each point, such that distant candidates count little.
-
-    The weights are those of the Cauchy loss, which decrease with the squared distance from the current mean.
-    Five reweighted averages are computed. The function is traced JAX code.
-
-    **Arguments:**
-
-    - `candidates`: d candidate positions of each of n points (d, n, 3).
-    - `weights`: the weights of the d candidates (d,). All points use the same weights.
-    - `start`: the first estimate of each position (n, 3).
-    - `scale`: the distance at which a candidate has half of its weight.
-
-    **Returns:** The means (n, 3).
-    """
+    """Average d candidates for each point, with Cauchy's weights: half the weight at `scale`."""
 
     def iterate(mean: Float[Array, "n 3"], _: None) -> tuple[Float[Array, "n 3"], None]:
         squared = jnp.sum((candidates - mean[None]) ** 2, axis=2)
@@ -121,12 +79,11 @@ class Network:
     - `errors`: a dictionary with the estimated error of each edge, a float, with the key (i, j) for i < j.
       The error applies to the maps i -> j and j -> i. The error is a mean distance on the shape to which a
       map leads. Its unit is the square root of this shape's area.
-    - `settings`: the settings of the synchronisation, a `SynchronizationSettings`.
 
     **Attributes:**
 
-    - `meshes`, `errors`, `settings`: the arguments. The argument `maps` is not kept; the network stores the
-      positions of its points instead.
+    - `meshes`, `errors`: the arguments. The argument `maps` is not kept; the network stores the positions of
+      its points instead.
     - `units`: a list with the square root of the area of each mesh, in the unit of the mesh.
     """
 
@@ -135,9 +92,8 @@ class Network:
         meshes: Sequence[Mesh],
         maps: Mapping[tuple[int, int], SurfacePoints],
         errors: Mapping[Edge, float],
-        settings: SynchronizationSettings = SynchronizationSettings(),
     ):
-        self.meshes, self.errors, self.settings = meshes, errors, settings
+        self.meshes, self.errors = meshes, errors
         self.units = [mesh.area**0.5 for mesh in meshes]
         self._images = {(i, j): points.positions(meshes[j]) for (i, j), points in maps.items()}
         self._neighbors = [sorted(i for i, k in maps if k == j) for j in range(len(meshes))]
@@ -173,22 +129,19 @@ class Network:
         lengths, before = dijkstra(self.lengths(), directed=False, indices=template, return_predecessors=True)
         if not np.isfinite(lengths).all():
             raise ValueError("the graph is not connected: add edges between its parts")
-        points: list[SurfacePoints | None] = [None] * len(self.meshes)
-        points[template] = vertices_as_points(self.meshes[template])
+        points = {template: vertices_as_points(self.meshes[template])}
         for shape in np.argsort(lengths, kind="stable").tolist():
             if shape != template:
                 source = int(before[shape])
-                known = points[source]
-                assert known is not None
-                points[shape] = self._project(self.carried(known, source, shape), shape)
-        return [known for known in points if known is not None]
+                points[shape] = self._project(self.carried(points[source], source, shape), shape)
+        return [points[shape] for shape in range(len(self.meshes))]
 
     def carried(self, points: SurfacePoints, source: int, target: int) -> Float64[np.ndarray, "p 3"]:
         """Carry points on shape `source` along an edge. Return positions near to shape `target` (p, 3).
 
         The positions are in the unit of mesh `target`.
         """
-        limit = self.settings.discontinuity_distance * self.units[target]
+        limit = _DISCONTINUITY_DISTANCE * self.units[target]
         return carry(points, self.meshes[source], self._images[source, target], limit)
 
     def averaged(self, points: Sequence[SurfacePoints], template: int) -> list[SurfacePoints]:
@@ -214,7 +167,7 @@ class Network:
                 jnp.asarray(np.pad(candidates, padding), jnp.float32),
                 jnp.asarray(pad_rows(weights / weights.max(), self._most), jnp.float32),
                 jnp.asarray(pad_rows(start, size), jnp.float32),
-                jnp.asarray(self.settings.robust_scale, jnp.float32),
+                jnp.asarray(_ROBUST_SCALE, jnp.float32),
             )
             return self._project(np.asarray(found, np.float64)[:n] * unit + center, shape)
 
@@ -251,7 +204,7 @@ def synchronize(network: Network, template: int) -> list[SurfacePoints]:
     **Raises:** `ValueError` if a shape has no path to the template.
     """
     points = network.along_best_paths(template)
-    for _ in range(network.settings.iterations):
+    for _ in range(_ITERATIONS):
         points = network.averaged(points, template)
     return points
 
@@ -259,16 +212,7 @@ def synchronize(network: Network, template: int) -> list[SurfacePoints]:
 def vertex_map_between(
     points_x: SurfacePoints, points_y: SurfacePoints, template: Mesh, mesh_x: Mesh, mesh_y: Mesh
 ) -> Int64[np.ndarray, " m"]:
-    """Compute the vertex map X -> Y through the template.
-
-    **Arguments:**
-
-    - `points_x`, `points_y`: the points on X and on Y that correspond to the template's vertices.
-    - `template`: the template.
-    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
-
-    **Returns:** The map (m,), as 0-based vertices of Y.
-    """
+    """Return the map X -> Y through the template, whose vertices match `points_x` and `points_y`."""
     registered = replace(template, vertices=points_x.positions(mesh_x))
     on_template, _ = nearest_surface_points(mesh_x.vertices, registered)
     images = on_template.positions(replace(template, vertices=points_y.positions(mesh_y)))

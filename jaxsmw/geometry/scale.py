@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,35 +14,29 @@ from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
-
-@dataclass(frozen=True)
-class ScaleSettings:
-    """The settings of `estimate_scale`. Lengths are in units of the square root of the full shape's area.
-
-    Table R33 is in `docs/research_log.md`.
-
-    **Attributes:**
-
-    - `shares`: the tested ratios of the partial shape's area to the full shape's area.
-    - `samples` (Table R33): the approximate number of samples of the full shape.
-    - `radii` (Table R33): the radii of SHOT, as multiples of 0.06.
-    - `distances` (Table R33): two samples of the partial shape are compared with their matches only if the
-      distance between the samples is in this range. Larger distances vary more between poses.
-    - `angle_tolerance` (Table R33): two samples are compared with their matches only if three angles at the
-      samples are similar to the corresponding angles at the matches. The cosines of the angles must differ
-      by less than this number. One angle is between the two normals. The other two angles are between each
-      normal and the line that connects the two points.
-    - `tolerance`: two ratios agree if their logarithms differ by less than this number.
-    - `uncertain_below` (Table R33): an estimate with a smaller support is uncertain.
-    """
-
-    shares: tuple[float, ...] = (0.08, 0.11, 0.15, 0.2, 0.27, 0.36, 0.49, 0.66, 0.9)
-    samples: int = 3000
-    radii: tuple[float, ...] = (1.0, 2.0)
-    distances: tuple[float, float] = (0.05, 0.4)
-    angle_tolerance: float = 0.15
-    tolerance: float = 0.05
-    uncertain_below: float = 1.5
+# Lengths are in units of the square root of the full shape's area. Table R33 is in `docs/research_log.md`.
+# The tested ratios of the partial shape's area to the full shape's area.
+_SHARES = (0.08, 0.11, 0.15, 0.2, 0.27, 0.36, 0.49, 0.66, 0.9)
+# The approximate number of samples of the full shape. (Table R33)
+_SAMPLES = 3000
+# The radii of SHOT, as multiples of `SHOT_RADIUS`. (Table R33)
+_RADII = (1.0, 2.0)
+# Two samples of the partial shape are compared with their matches only if the distance between the samples is
+# in this range. Larger distances vary more between poses. (Table R33)
+_DISTANCES = (0.05, 0.4)
+# Two samples are compared with their matches only if the cosines of three angles differ by less than this
+# number: the angles between both normals, and between each normal and the line that connects the points.
+# (Table R33)
+_ANGLE_TOLERANCE = 0.15
+# Two ratios agree if their logarithms differ by less than this number.
+_TOLERANCE = 0.05
+# An estimate with a smaller support is uncertain. (Table R33)
+_UNCERTAIN_BELOW = 1.5
+# The largest absolute logarithm of the most frequent ratio. At larger values, the tested share is so wrong
+# that the SHOT radii on the two shapes differ too much.
+_FARTHEST = 0.3
+# If fewer pairs than this number are compared, their ratios can agree by chance.
+_FEWEST = 30
 
 
 class ScaleEstimate(NamedTuple):
@@ -54,7 +47,7 @@ class ScaleEstimate(NamedTuple):
     - `scale`: the factor by which lengths on X are multiplied to become lengths in the unit of Y, a float.
     - `support`: the mean number of other matches that confirm a match, a float without unit. Two matches
       confirm each other if the distance on X, times `scale`, is nearly the distance on Y.
-    - `uncertain`: whether `support` is below `ScaleSettings.uncertain_below`, so that the scale can be wrong.
+    - `uncertain`: whether `support` is below 1.5, so that the scale can be wrong.
     """
 
     scale: float
@@ -62,11 +55,7 @@ class ScaleEstimate(NamedTuple):
     uncertain: bool
 
 
-def estimate_scale(
-    mesh_x: Mesh,
-    mesh_y: Mesh,
-    settings: ScaleSettings = ScaleSettings(),
-) -> ScaleEstimate:
+def estimate_scale(mesh_x: Mesh, mesh_y: Mesh) -> ScaleEstimate:
     """Estimate the relative scale of a partial shape and a full shape.
 
     The shape with the longer boundary, relative to the square root of its area, is taken as the partial
@@ -82,11 +71,8 @@ def estimate_scale(
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: a partial shape and a full shape, in either order and in any units of length.
-    - `settings`: the `ScaleSettings` of the search.
 
-    **Returns:** A `ScaleEstimate` with the attributes `scale` and `support`, which are floats, and
-    `uncertain`, a Boolean. Lengths on X are multiplied by `scale` to become lengths in the unit of Y, even if
-    Y is the partial shape.
+    **Returns:** A `ScaleEstimate`. Its scale leads from X to Y, even if Y is the partial shape.
 
     **Raises:** `InputError` if neither mesh has a boundary, or if the meshes are too coarse.
     """
@@ -99,16 +85,16 @@ def estimate_scale(
         )
     x_is_part = boundary_x >= boundary_y
     part, full = (mesh_x, mesh_y) if x_is_part else (mesh_y, mesh_x)
-    described = _describe(full, 1.0, settings)
+    sampled = _sample(full, 1.0)
 
     def vote(share: float) -> _Vote:
         try:
-            return _vote(_describe(part, share, settings), described, share, settings)
+            return _vote(_sample(part, share), sampled, share)
         except InputError:  # the samples are too sparse for SHOT
             return _Vote(share, 0.0)
 
     with one_blas_thread():
-        best = max(map(vote, settings.shares), key=lambda found: found.support)
+        best = max(map(vote, _SHARES), key=lambda found: found.support)
         # The corrected share is tested too. SHOT then has the same radius on both shapes, so more
         # descriptors match.
         best = max(best, vote(best.share), key=lambda found: found.support)
@@ -118,12 +104,11 @@ def estimate_scale(
             "scale as a number, or finer meshes."
         )
     from_part = float(np.sqrt(best.share * full.area / part.area))
-    return ScaleEstimate(
-        from_part if x_is_part else 1 / from_part, best.support, best.support < settings.uncertain_below
-    )
+    scale = from_part if x_is_part else 1 / from_part
+    return ScaleEstimate(scale, best.support, best.support < _UNCERTAIN_BELOW)
 
 
-class _Described(NamedTuple):
+class _Samples(NamedTuple):
     """The samples of a shape: positions in the unit of the full shape, normals and descriptors."""
 
     positions: Float[np.ndarray, "s 3"]
@@ -144,45 +129,44 @@ def relative_boundary(mesh: Mesh) -> float:
     return float(lengths.sum() / mesh.area**0.5)
 
 
-def _describe(mesh: Mesh, share: float, settings: ScaleSettings) -> _Described:
+def _sample(mesh: Mesh, share: float) -> _Samples:
     """Return samples with descriptors. `share` is the shape's area divided by the full shape's area."""
     unit = (mesh.area / share) ** 0.5
-    samples = poisson_disk_samples(mesh, max(1, round(settings.samples * share)))
+    samples = poisson_disk_samples(mesh, max(1, round(_SAMPLES * share)))
     with warnings.catch_warnings():
         # SHOT's warning about sparse samples is ignored, because sparse samples only lower the support.
         warnings.simplefilter("ignore")
         shot = side_by_side(
             lambda radius: shot_descriptors(mesh, radius=radius * SHOT_RADIUS / share**0.5, samples=samples),
-            *settings.radii,
+            *_RADII,
         )
     vertices = samples.vertices
-    return _Described(mesh.vertices[vertices] / unit, mesh.vertex_normals[vertices], np.hstack(shot))
+    return _Samples(mesh.vertices[vertices] / unit, mesh.vertex_normals[vertices], np.hstack(shot))
 
 
-def _vote(part: _Described, full: _Described, share: float, settings: ScaleSettings) -> _Vote:
+def _vote(part: _Samples, full: _Samples, share: float) -> _Vote:
     """Return the corrected share and the support for a tested share (see `estimate_scale`)."""
     rows, matches = _mutually_nearest(part.descriptors, full.descriptors)
     before, angles_before = _pair_features(part, rows)
     after, angles_after = _pair_features(full, matches)
-    least, most = settings.distances
+    least, most = _DISTANCES
     compared = (least < before) & (before < most) & (after > 0)
-    compared &= np.all(np.abs(angles_before - angles_after) < settings.angle_tolerance, axis=1)
+    compared &= np.all(np.abs(angles_before - angles_after) < _ANGLE_TOLERANCE, axis=1)
     ratios = np.sort(np.log(after[compared] / before[compared]))
     if len(ratios) < _FEWEST:
         return _Vote(share, 0.0)
     # Two ratios agree if their logarithms differ by at most the tolerance. `counts` contains the number of
     # ratios that agree with each ratio. The ratio with the largest count is called the most frequent ratio.
-    tolerance = settings.tolerance
-    counts = np.searchsorted(ratios, ratios + tolerance) - np.searchsorted(ratios, ratios - tolerance)
+    counts = np.searchsorted(ratios, ratios + _TOLERANCE) - np.searchsorted(ratios, ratios - _TOLERANCE)
     counts = np.where(np.abs(ratios) < _FARTHEST, counts, 0)
-    near = ratios[np.abs(ratios - ratios[np.argmax(counts)]) < tolerance]
+    near = ratios[np.abs(ratios - ratios[np.argmax(counts)]) < _TOLERANCE]
     return _Vote(share * float(np.exp(2 * np.mean(near))), 2 * float(counts.max()) / len(rows))
 
 
 def _pair_features(
-    shape: _Described, rows: Int64[np.ndarray, " p"]
+    shape: _Samples, rows: Int64[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, " q"], Float[np.ndarray, "q 3"]]:
-    """Return the distance and the cosines of three angles (see `ScaleSettings`) for each pair of samples."""
+    """Return the distance and the cosines of the three angles for each pair of samples."""
     first, second = np.triu_indices(len(rows), 1)
     positions, normals = shape.positions[rows], shape.normals[rows]
     lines = positions[second] - positions[first]
@@ -201,10 +185,3 @@ def _mutually_nearest(
     forward, backward = products.argmax(axis=1), products.argmax(axis=0)
     rows = np.flatnonzero(backward[forward] == np.arange(len(x)))
     return rows, forward[rows]
-
-
-# The largest absolute logarithm of the most frequent ratio. At larger values, the tested share is so wrong
-# that the SHOT radii on the two shapes differ too much.
-_FARTHEST = 0.3
-# If fewer pairs than this number are compared, their ratios can agree by chance.
-_FEWEST = 30

@@ -3,7 +3,7 @@
 The name of an entry contains a hash of all values on which the result depends, so an entry never becomes
 outdated. Entries are written atomically, so any number of processes can share the directory without locks.
 Checksums are verified when an entry is read. The directory can be deleted at any time, because missing
-results are computed again.
+results are computed again. joblib's `Memory` has no checksums: after one flipped bit it returned wrong data.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import platformdirs
@@ -38,11 +37,12 @@ _PROGRAMS = re.compile(r"programs-[0-9a-f]{16}")
 _PROGRAM_FILES = ("-cache", "-atime", CHECKSUMS)
 
 
-def cached(
-    kind: str,
-    inputs: Sequence[np.ndarray | str | int | float],
-    compute: Callable[[], dict[str, np.ndarray]],
-) -> dict[str, np.ndarray]:
+Inputs = Sequence[np.ndarray | str | int | float]
+"""All values on which a result depends, in a fixed order."""
+Arrays = dict[str, np.ndarray]
+
+
+def cached(kind: str, inputs: Inputs, compute: Callable[[], Arrays]) -> Arrays:
     """Return the result of `compute`, or read the result from the disk if it was computed before.
 
     The environment variable `JAXSMW_CACHE` names the directory of the cache. The default is the user's cache
@@ -55,10 +55,9 @@ def cached(
 
     - `kind`: the first part of the entry's name, in lower-case words joined by hyphens.
     - `inputs`: all values on which the result depends, in a fixed order.
-    - `compute`: a function without arguments, which returns the result as a dictionary from names to arrays.
+    - `compute`: a function that returns the result as a dictionary from names to arrays.
 
-    **Returns:** The result of `compute`. A result that was read from the disk is identical to the computed
-    result, bit for bit.
+    **Returns:** The result of `compute`, bit for bit.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
@@ -86,48 +85,32 @@ def cached(
 
 
 class Store:
-    """A store of results in a directory. Each file name contains a hash of the inputs of the result.
+    """A store of results in an existing directory; without a directory, the store keeps nothing.
 
-    **Arguments:**
-
-    - `directory`: an existing directory; None (the default) for a store that keeps nothing.
+    `cached` documents the arguments of the methods. `save` and `get` raise `OSError` or `InputError` if the
+    result cannot be written.
     """
 
     def __init__(self, directory: Path | None = None):
         self.directory = directory
 
-    def load(
-        self, kind: str, inputs: Sequence[np.ndarray | str | int | float]
-    ) -> dict[str, np.ndarray] | None:
-        """Return a stored result, or None if it is missing or damaged; see `cached` for the arguments."""
+    def load(self, kind: str, inputs: Inputs) -> Arrays | None:
+        """Return a stored result, or None if it is missing or damaged."""
         if self.directory is None:
             return None
         key = _key(kind, inputs)
         return _load(self._path(kind, key), key)
 
-    def save(
-        self, kind: str, inputs: Sequence[np.ndarray | str | int | float], arrays: Mapping[str, np.ndarray]
-    ) -> None:
-        """Store a result; see `cached` for the arguments.
-
-        **Raises:** `OSError` or `InputError` if the result cannot be written.
-        """
+    def save(self, kind: str, inputs: Inputs, arrays: Mapping[str, np.ndarray]) -> None:
+        """Store a result."""
         if self.directory is None:
             return
         key = _key(kind, inputs)
         with atomic_write(self._path(kind, key)) as temporary:
             np.savez(temporary, contents=np.array([key, *arrays]), **arrays)  # type: ignore[arg-type]
 
-    def get(
-        self,
-        kind: str,
-        inputs: Sequence[np.ndarray | str | int | float],
-        compute: Callable[[], dict[str, np.ndarray]],
-    ) -> dict[str, np.ndarray]:
-        """Return a stored result, or compute and store the result; see `cached` for the arguments.
-
-        **Raises:** `OSError` or `InputError` if the result cannot be written.
-        """
+    def get(self, kind: str, inputs: Inputs, compute: Callable[[], Arrays]) -> Arrays:
+        """Return a stored result, or compute and store it."""
         arrays = self.load(kind, inputs)
         if arrays is None:
             arrays = compute()
@@ -144,10 +127,7 @@ _recomputing: ContextVar[bool] = ContextVar("recomputing", default=False)
 
 @contextmanager
 def recomputing() -> Iterator[None]:
-    """Make `cached` compute all results again within the `with` block, to measure computation times.
-
-    The results are still written to the cache.
-    """
+    """Make `cached` compute and write all results again within the block, to measure computation times."""
     token = _recomputing.set(True)
     try:
         yield
@@ -158,17 +138,16 @@ def recomputing() -> Iterator[None]:
 def cache_compiled_programs() -> None:
     """Make JAX store compiled programs on disk for later processes, and remove damaged programs.
 
-    The programs are stored in the directory of the cache and take at most 0.25 GiB. This function sets
-    environment variables of JAX, so it must run before JAX is imported. If the user has set one of these
-    variables, the function changes none of them. Each type of processor has its own directory, because JAX
-    does not distinguish processors. Machines with different processors can therefore share the disk. The
-    function also silences JAX's warnings about programs that cannot be stored or loaded.
+    The programs take at most 0.25 GiB. This function sets environment variables of JAX, so it must run before
+    JAX is imported. If the user has set one of these variables, the function changes none of them.
 
     **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
     """
     place = cache_directory()
     if place is None:
         return
+    # Each type of processor has its own directory, because JAX does not distinguish them, and machines with
+    # different processors can share the disk.
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
         processor = next(line for line in lines if line.startswith(("flags", "Features")))
@@ -204,24 +183,11 @@ def cache_compiled_programs() -> None:
         warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
 
 
-class Content(NamedTuple):
-    """The files of one kind in the cache.
+def cache_contents() -> dict[str, list[int]]:
+    """Return the sizes of the files of each kind in bytes; kinds with large files come first.
 
-    **Attributes:**
-
-    - `kind`: the kind of the entries, as passed to `cached`; `"compiled programs"` for the programs of JAX,
-      or `"temporary files"` for files that a killed process left behind.
-    - `files`: the number of files.
-    - `size`: the total size in bytes.
-    """
-
-    kind: str
-    files: int
-    size: int
-
-
-def cache_contents() -> list[Content]:
-    """Return the contents of the cache, sorted by size. The list is empty if the cache is disabled.
+    A kind is that of entries as passed to `cached`, `"compiled programs"` for the programs of JAX, or
+    `"temporary files"` for files that a killed process left behind.
 
     **Raises:** `InputError` if the directory cannot be read.
     """
@@ -229,14 +195,11 @@ def cache_contents() -> list[Content]:
     for kind, path in _own_files():
         with suppress(FileNotFoundError):  # another process may remove files
             sizes.setdefault(kind, []).append(path.stat().st_size)
-    found = [Content(kind, len(each), sum(each)) for kind, each in sizes.items()]
-    return sorted(found, key=lambda content: -content.size)
+    return dict(sorted(sizes.items(), key=lambda item: -sum(item[1])))
 
 
 def clear_cache() -> None:
-    """Remove all entries and all compiled programs. Other files in the directory are kept.
-
-    Commands that run at the same time compute removed entries again.
+    """Remove all entries and all compiled programs. Commands that run at the same time compute them again.
 
     **Raises:** `InputError` if a file cannot be removed.
     """
@@ -250,10 +213,7 @@ def clear_cache() -> None:
 
 
 def _own_files() -> Iterator[tuple[str, Path]]:
-    """Yield the kind and the path of each file in the cache; see `Content`.
-
-    **Raises:** `InputError` if the directory cannot be read.
-    """
+    """Yield the kind and the path of each file in the cache; other files in the directory are left out."""
     place = cache_directory()
     if place is None:
         return
@@ -277,10 +237,7 @@ def _own_files() -> Iterator[tuple[str, Path]]:
 
 
 def cache_directory() -> Path | None:
-    """Return the directory of the cache.
-
-    The result is None if the cache is disabled, or if the user has no home directory.
-    """
+    """Return the directory of the cache; None if it is disabled or the user has no home directory."""
     if (place := os.environ.get("JAXSMW_CACHE")) is not None:
         return None if place in ("", "off") else Path(place)
     try:
@@ -304,7 +261,7 @@ def cache_limit() -> float:
     return limit * 2**30
 
 
-def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
+def _key(kind: str, inputs: Inputs) -> str:
     digest = hashlib.sha256()
     for value in (_FORMAT, kind, *inputs):
         array = np.asarray(value)
@@ -315,8 +272,7 @@ def _key(kind: str, inputs: Sequence[np.ndarray | str | int | float]) -> str:
     return digest.hexdigest()
 
 
-def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
-    """Return the arrays of an entry, or None if the entry is missing, is damaged or has another key."""
+def _load(path: Path, key: str) -> Arrays | None:
     # Reading a damaged file can raise any exception. The result is then computed again.
     with suppress(Exception), path.open("rb") as file, np.load(file, allow_pickle=False) as entry:
         arrays = {name: entry[name] for name in entry.files}
@@ -329,7 +285,7 @@ def _load(path: Path, key: str) -> dict[str, np.ndarray] | None:
 
 
 def _remove_oldest(directory: Path, limit: float) -> None:
-    """Remove the least recently used files until the files of the cache take at most `limit` bytes."""
+    """Remove the least recently used entries until they take at most `limit` bytes."""
     files = []
     for entry in os.scandir(directory):
         with suppress(FileNotFoundError):  # another process may also remove files

@@ -1,10 +1,15 @@
-"""Reading and atomic writing of files. Every failure raises an `InputError` with a one-sentence message."""
+"""Reading and atomic writing of files. Every failure raises an `InputError` with a one-sentence message.
+
+No library serves: filelock locks files of its own, so it cannot tell the temporary files of killed processes
+from those of living ones, and python-atomicwrites is no longer maintained.
+"""
 
 from __future__ import annotations
 
 import os
 import re
 import stat
+import sys
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -13,41 +18,27 @@ from tempfile import TemporaryFile
 
 from jaxsmw.errors import InputError
 
-try:
+if sys.platform != "win32":
     import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
-LARGEST_FILE = 2**30
-"""The size of the largest file that is read as a whole, in bytes (1 GiB).
+# A text file of this size, in bytes, describes a mesh of ten million vertices. Parsing it needs up to 15 GiB
+# of memory.
+_LARGEST_FILE = 2**30
 
-A text file of 1 GiB describes a mesh of ten million vertices. Parsing such a file needs up to 15 GiB of
-memory.
-"""
+FilePath = str | os.PathLike[str]
 
 
 def largest_contents(size_of_file: int) -> int:
-    """Return the largest number of bytes to which a compressed file may unpack.
+    """Return the largest number of bytes to which a compressed file of a given size may unpack.
 
-    A limit is necessary because a malicious file can unpack to a thousand times its size. Contents of up to 1
-    GiB are always accepted, because a mesh of ten million vertices has this size. Only files of eigenvectors
-    are expected to unpack to more than 1 GiB. A compressed file of eigenvectors is hardly smaller than its
-    contents. Contents of more than 1 GiB may therefore be at most four times as large as the compressed file.
-
-    `size_of_file` is the size of the compressed file, in bytes.
+    A malicious file can unpack to a thousand times its size. Contents of 1 GiB are a mesh of ten million
+    vertices. Only eigenvectors are larger, and compression hardly makes them smaller.
     """
     return max(2**30, 4 * size_of_file)
 
 
-def read_bytes(path: str | os.PathLike[str], *, largest: int | None = LARGEST_FILE) -> bytes:
-    """Read a whole file.
-
-    **Arguments:**
-
-    - `path`: the path of a regular file. Pipes and devices are refused, because reading them may never end.
-    - `largest`: the largest permitted size of the file in bytes; None for no limit.
-
-    **Returns:** The contents of the file.
+def read_bytes(path: FilePath, *, largest: int | None = _LARGEST_FILE) -> bytes:
+    """Read a whole regular file of at most `largest` bytes. Reading pipes and devices may never end.
 
     **Raises:** `InputError` if the file does not exist, is not a regular file, is too large, cannot be read,
     or changes while it is read.
@@ -69,7 +60,7 @@ def read_bytes(path: str | os.PathLike[str], *, largest: int | None = LARGEST_FI
     return contents
 
 
-def size_of_file(path: str | os.PathLike[str]) -> int:
+def size_of_file(path: FilePath) -> int:
     """Return the size of a regular file in bytes.
 
     **Raises:** `InputError` if the file does not exist, is not a regular file, or cannot be accessed.
@@ -77,7 +68,7 @@ def size_of_file(path: str | os.PathLike[str]) -> int:
     return _status(path).st_size
 
 
-def _status(path: str | os.PathLike[str]) -> os.stat_result:
+def _status(path: FilePath) -> os.stat_result:
     try:
         status = os.stat(path)
     except FileNotFoundError:
@@ -89,29 +80,21 @@ def _status(path: str | os.PathLike[str]) -> os.stat_result:
     return status
 
 
-def _unreadable(path: str | os.PathLike[str], error: OSError | ValueError) -> InputError:
+def _unreadable(path: FilePath, error: OSError | ValueError) -> InputError:
     return InputError(f"{path}: cannot be read ({_reason(error)}): check the path and its permissions.")
 
 
 @contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Provide a temporary path to write to, and move the file to `path` when the block succeeds.
+def atomic_write(path: FilePath) -> Iterator[Path]:
+    """Provide an empty temporary file to write to, and move the file to `path` when the block succeeds.
 
     If the block raises an exception, the temporary file is removed, and `path` is unchanged. The temporary
-    file is in the directory of `path`, so the move is atomic. The temporary file has the suffix of `path`,
-    because writers such as `numpy.savez` and `savefig` depend on the suffix. If `path` is a symbolic link,
-    the target of the link is replaced. Temporary files that killed processes left in the directory are
-    removed first.
+    file has the suffix of `path`, because writers such as `numpy.savez` and `savefig` depend on it. If `path`
+    is a symbolic link, the target of the link is replaced. Temporary files that killed processes left in the
+    directory are removed first.
 
-    **Returns:**
-
-    A context manager that yields the temporary `Path`. The temporary file exists and is empty.
-
-    **Raises:**
-
-    `InputError` is raised before the block starts if the directory does not exist, the name is not valid, or
-    permissions forbid writing. `InputError` is also raised if the block raises an `OSError`, for example
-    because the disk is full.
+    **Raises:** `InputError` before the block if `path` cannot be written, and for each `OSError` in the
+    block.
     """
     target = _target(path)
     temporary = _temporary(target)
@@ -144,12 +127,8 @@ _without_leftovers: set[Path] = set()
 
 
 def _create_locked(temporary: Path) -> int | None:
-    """Create an empty file and lock it, so that no other process takes it for a leftover.
-
-    **Returns:** The open file descriptor. The lock ends when the descriptor is closed, or with the process.
-    Without locks (Windows), the file is closed, because Windows does not move open files. The result is None.
-    """
-    if fcntl is None:
+    """Create a file that is locked until its descriptor is closed, so that it is not taken for a leftover."""
+    if sys.platform == "win32":  # Windows does not move open files
         temporary.touch(exist_ok=False)
         return None
     while True:
@@ -163,7 +142,7 @@ def _create_locked(temporary: Path) -> int | None:
 
 def _lock(descriptor: int, *, wait: bool) -> bool:
     """Lock a file, and return whether this worked. Some systems and file systems have no locks."""
-    if fcntl is None:
+    if sys.platform == "win32":
         return False
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -173,12 +152,8 @@ def _lock(descriptor: int, *, wait: bool) -> bool:
 
 
 def can_lock(directory: Path) -> bool:
-    """Return whether files in a directory can be locked. Some network file systems have no locks.
-
-    If no file can be created, the result is False. On Windows the result is True, because its file systems
-    have locks.
-    """
-    if fcntl is None:
+    """Return whether files can be created in a directory and locked, as some network file systems cannot."""
+    if sys.platform == "win32":  # its file systems have locks
         return True
     with suppress(OSError), TemporaryFile(dir=directory) as file:
         return _lock(file.fileno(), wait=False)
@@ -186,43 +161,23 @@ def can_lock(directory: Path) -> bool:
 
 
 def remove_unfinished() -> None:
-    """Remove the temporary files of all open blocks of `atomic_write`.
-
-    A signal handler calls this function before it ends the process, because `finally` clauses do not run
-    then.
-    """
+    """Remove the temporary files of open blocks of `atomic_write`, before a signal ends this process."""
     for temporary in _unfinished.copy():
         with suppress(OSError):
             temporary.unlink()
 
 
 def remove_leftovers(directory: Path) -> None:
-    """Remove the temporary files that killed processes left in a directory.
-
-    The file of a living process is locked, and stays. On systems and file systems without locks, all files
-    stay. If the directory does not exist, nothing happens.
-    """
+    """Remove the temporary files that killed processes left in a directory. Files without locks stay."""
     with suppress(OSError):
-        for name in os.listdir(directory):
-            if _TEMPORARY.fullmatch(name):
-                with suppress(OSError):
-                    _remove_unlocked(directory / name)
-
-
-def _remove_unlocked(file: Path) -> None:
-    descriptor = os.open(file, os.O_RDWR)
-    try:
-        if _lock(descriptor, wait=False):
-            file.unlink()
-    finally:
-        os.close(descriptor)
+        for name in filter(_TEMPORARY.fullmatch, os.listdir(directory)):
+            with suppress(OSError), open(directory / name, "r+b") as file:
+                if _lock(file.fileno(), wait=False):
+                    (directory / name).unlink()
 
 
 def check_working_directory() -> None:
-    """Check that the working directory exists, because relative paths depend on it.
-
-    **Raises:** `InputError` if the working directory was removed.
-    """
+    """Check that the working directory exists, because relative paths depend on it."""
     try:
         os.getcwd()
     except OSError as error:
@@ -231,13 +186,8 @@ def check_working_directory() -> None:
         ) from error
 
 
-def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check that `atomic_write` can write a file. The check leaves no new file.
-
-    **Raises:**
-
-    `InputError` if the directory does not exist, the name is not valid, or permissions forbid writing.
-    """
+def check_writable(path: FilePath) -> None:
+    """Check that `atomic_write` can write a file. The check leaves no new file."""
     target = _target(path)
     temporary = _temporary(target)
     try:
@@ -249,7 +199,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         raise _unwritable(path, error) from error
 
 
-def _target(path: str | os.PathLike[str]) -> Path:
+def _target(path: FilePath) -> Path:
     """Return a path with all symbolic links resolved."""
     try:
         return Path(os.path.realpath(path))
@@ -266,12 +216,8 @@ def _temporary(target: Path) -> Path:
     return target.parent / f".{uuid.uuid4().hex}{target.suffix}"
 
 
-def _check_target(path: str | os.PathLike[str], target: Path) -> None:
-    """Refuse an output path at which no regular file can be written.
-
-    **Raises:** `InputError` if the target cannot be written as a regular file; `OSError` if the operating
-    system does not accept the name.
-    """
+def _check_target(path: FilePath, target: Path) -> None:
+    """Refuse an output path at which no regular file can be written."""
     if os.fspath(path) == "-":
         raise InputError("-: cannot be written because it is no file name: choose the name of a file.")
     if os.fspath(path).endswith(("/", os.sep)):
@@ -293,7 +239,7 @@ def _check_target(path: str | os.PathLike[str], target: Path) -> None:
         )
 
 
-def _unwritable(path: str | os.PathLike[str], error: OSError | ValueError) -> InputError:
+def _unwritable(path: FilePath, error: OSError | ValueError) -> InputError:
     return InputError(
         f"{path}: cannot be written ({_reason(error)}): choose a valid name, in a directory with free space "
         "where you may create files."
@@ -305,13 +251,8 @@ def _reason(error: OSError | ValueError) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
-def check_directory(path: str | os.PathLike[str]) -> None:
-    """Check that `make_directory` can succeed. The check leaves no new directory.
-
-    **Raises:**
-
-    `InputError` if the directory cannot be created, or if no file can be written to the directory.
-    """
+def check_directory(path: FilePath) -> None:
+    """Check that `make_directory` can succeed. The check leaves no new directory."""
     missing = [place for place in (Path(path), *Path(path).parents) if not os.path.lexists(place)]
     try:
         make_directory(path)
@@ -321,12 +262,8 @@ def check_directory(path: str | os.PathLike[str]) -> None:
                 place.rmdir()
 
 
-def make_directory(path: str | os.PathLike[str]) -> Path:
-    """Create a directory and its parents, unless they exist, and return the path of the directory.
-
-    **Raises:** `InputError` if the directory cannot be created, or if no file can be written to the
-    directory.
-    """
+def make_directory(path: FilePath) -> Path:
+    """Create a directory and its parents, unless they exist, and check that files can be written there."""
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:  # `ValueError` if the name contains a null character

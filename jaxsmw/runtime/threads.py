@@ -26,15 +26,12 @@ def one_blas_thread() -> AbstractContextManager[object]:
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """Return the loaded linear-algebra libraries. The result is cached, because the lookup is slow."""
+    """Return the loaded linear-algebra libraries, whose lookup is slow."""
     return ThreadpoolController()
 
 
 def side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[Result, Result]:
-    """Return the results of a function for X and for Y, computed at the same time in two threads.
-
-    If the function raises an exception in a thread, `side_by_side` raises this exception.
-    """
+    """Return the results of a function for X and for Y, computed at the same time in two threads."""
     # Both threads share one context of `one_blas_thread`. With one context per thread, the first thread to
     # end would also remove the limit for the other thread.
     with one_blas_thread(), ThreadPoolExecutor(2) as executor:
