@@ -7,7 +7,14 @@ import os
 from pathlib import Path
 from typing import get_args
 
-from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap, MethodName, PeerName, ProtocolName
+from jaxsmw.choices import (
+    DEFAULT_INITIAL_MAP,
+    DEFAULT_MATCH_INIT,
+    MatchInit,
+    MethodName,
+    PeerName,
+    ProtocolName,
+)
 from jaxsmw.cli.arguments import path, whole_number
 from jaxsmw.cli.console import report_progress, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
@@ -54,9 +61,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--init",
         metavar="INITIAL_MAP",
         type=path,
-        default=DEFAULT_INITIAL_MAP,
-        help=f"initial map of all methods: {', '.join(get_args(InitialMap))}, or a directory with maps "
-        "in files named X_Y.map (default: %(default)s)",
+        help=f"initial map of all methods: {', '.join(get_args(MatchInit))}, or a directory with maps "
+        f"in files named X_Y.map (default: {DEFAULT_MATCH_INIT}). With {DEFAULT_MATCH_INIT}, all methods "
+        f"start from {DEFAULT_INITIAL_MAP}, and accurate also from aligned if the shapes are asymmetric",
     )
     parser.add_argument(
         "--mirrored",
@@ -145,7 +152,8 @@ def _measure(options: argparse.Namespace) -> None:
         pairs = choose_pairs(data_set, options.pairs, options.seed)
     else:
         pairs = protocol_pairs(options.protocol, data_set)
-    settings = Settings(options.init, options.mirrored, options.evaluation_samples, options.seed)
+    init = options.init or DEFAULT_MATCH_INIT
+    settings = Settings(init, options.mirrored, options.evaluation_samples, options.seed)
     methods = find_methods(options.methods) if options.methods else suited_methods(pairs)
     output = options.output or f"jaxsmw-benchmark-{data_set.name}"
     check_outputs([options.pairs], directories=[(output, ())])

@@ -55,7 +55,7 @@ import jax.scipy as jsp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.benchmark.opponents.presets import Refined
+from jaxsmw.benchmark.opponents.baselines import Refined
 from jaxsmw.core.banks import FilterBank, Identity
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.products import product

@@ -76,7 +76,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Int32
 
-from jaxsmw.benchmark.opponents.base import Method, MethodInput, check_spectrum
+from jaxsmw.benchmark.opponents.base import (
+    Method,
+    MethodInput,
+    PointwiseMap,
+    check_spectrum,
+    successful,
+)
 from jaxsmw.core.checks import all_finite
 from jaxsmw.core.functional_map import dual_eigenvectors, encode
 from jaxsmw.core.pointwise_map import decode
@@ -462,8 +468,7 @@ class PartialFunctionalMaps(Method):
     iterations: int = 5
     partial_only: bool = True
 
-    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Return the map X -> Y and the status code; see `Method`."""
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
         assert pair.meshes is not None
         spectra = pair.seen_in(
             Stage(
@@ -475,7 +480,7 @@ class PartialFunctionalMaps(Method):
         found = compiled(partial_functional_map)(
             *spectra, gradient, pair.initial_map, iterations=self.iterations
         )
-        return found.pointwise_map, found.result
+        return successful(found.pointwise_map, found.result)
 
 
 PARTIAL_FUNCTIONAL_MAPS = PartialFunctionalMaps(

@@ -5,7 +5,7 @@ The methods need optional packages, and are available only if these packages are
     pip install 'jaxsmw[benchmark,peers]'
 
 `PyFM` and `Geomfum` receive the same spectra and initial maps as all other compared methods, and run on the
-same number of cores. Both methods use the settings of the ZoomOut paper (see `zoomout`): the number of
+same number of cores. Both methods use the settings of the ZoomOut paper (see `baselines`): the number of
 eigenvectors k is 20, 25, ..., 120, and every iteration uses all vertices.
 
 - `PyFM` calls the function `zoomout_refine` of Robin Magnet's pyFM (`pyfmaps` on the package index) with
@@ -19,13 +19,11 @@ import abc
 from dataclasses import dataclass
 from importlib.util import find_spec
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float64, Int, Int64
+from jaxtyping import Float64, Int64
 
-from jaxsmw.benchmark.opponents.base import Method, MethodInput
-from jaxsmw.benchmark.opponents.zoomout import FIRST_EIGENVECTORS, LAST_EIGENVECTORS, ZOOMOUT_STEP
-from jaxsmw.core.results import RESULTS
+from jaxsmw.benchmark.opponents.base import Method, MethodInput, PointwiseMap
+from jaxsmw.benchmark.opponents.baselines import ZOOMOUT
 from jaxsmw.core.spectrum import Spectrum
 
 
@@ -41,17 +39,16 @@ class Peer(Method):
     - `package`: the name under which the other library is imported.
     """
 
-    number_of_eigenvectors = LAST_EIGENVECTORS
+    number_of_eigenvectors = ZOOMOUT.number_of_eigenvectors
     full_only = True
     package: str
 
-    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Return the map X -> Y and the status code; see `Method`."""
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
         x, y = (_Shape.of(spectrum) for spectrum in (pair.spectrum_x, pair.spectrum_y))
         initial_map = np.searchsorted(y.vertices, np.asarray(pair.initial_map)[x.vertices])
         found = np.zeros(pair.initial_map.shape, np.int32)
         found[x.vertices] = y.vertices[self.refine(initial_map, x, y)]
-        return jnp.asarray(found), RESULTS.successful  # type: ignore[return-value]
+        return found
 
     @abc.abstractmethod
     def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
@@ -103,8 +100,8 @@ class PyFM(Peer):
         areas = diags_array(x.areas).tocsr()
         first = p2p_to_FM(
             initial_map,
-            y.eigenvectors[:, :FIRST_EIGENVECTORS],
-            x.eigenvectors[:, :FIRST_EIGENVECTORS],
+            y.eigenvectors[:, : ZOOMOUT.first],
+            x.eigenvectors[:, : ZOOMOUT.first],
             A2=areas,
         )
         _, found = zoomout_refine(
@@ -112,7 +109,7 @@ class PyFM(Peer):
             y.eigenvectors,
             x.eigenvectors,
             nit=_STEPS,
-            step=ZOOMOUT_STEP,
+            step=ZOOMOUT.step,
             A2=areas,
             return_p2p=True,
             n_jobs=1,
@@ -132,12 +129,12 @@ class Geomfum(Peer):
         from geomfum.refine import ZoomOut
 
         bases = [EigenBasis(shape.eigenvalues, shape.eigenvectors) for shape in (y, x)]
-        first = FmFromP2pConverter()(initial_map, *(basis.truncate(FIRST_EIGENVECTORS) for basis in bases))
-        refined = ZoomOut(nit=_STEPS, step=ZOOMOUT_STEP)(first, *bases)
+        first = FmFromP2pConverter()(initial_map, *(basis.truncate(ZOOMOUT.first) for basis in bases))
+        refined = ZoomOut(nit=_STEPS, step=ZOOMOUT.step)(first, *bases)
         return np.asarray(P2pFromFmConverter()(refined, *bases))
 
 
-_STEPS = (LAST_EIGENVECTORS - FIRST_EIGENVECTORS) // ZOOMOUT_STEP
+_STEPS = (ZOOMOUT.number_of_eigenvectors - ZOOMOUT.first) // ZOOMOUT.step
 
 
 def installed_peers() -> dict[str, Method]:

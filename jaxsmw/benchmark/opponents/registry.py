@@ -8,15 +8,21 @@ from pathlib import Path
 
 from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.benchmark.opponents.base import Method
+from jaxsmw.benchmark.opponents.baselines import (
+    ACCURATE,
+    MWP,
+    MWP_SAMPLED,
+    NO_FILTER,
+    SPECTRAL_ICP,
+    UNREFINED,
+    ZOOMOUT,
+    ZOOMOUT_SAMPLED,
+    PublishedMaps,
+)
 from jaxsmw.benchmark.opponents.cpd import CPD
-from jaxsmw.benchmark.opponents.initial_map import UNREFINED
 from jaxsmw.benchmark.opponents.partial_functional_maps import PARTIAL_FUNCTIONAL_MAPS
 from jaxsmw.benchmark.opponents.peers import installed_peers
-from jaxsmw.benchmark.opponents.presets import ACCURATE, MWP, MWP_SAMPLED
-from jaxsmw.benchmark.opponents.published_maps import PublishedMaps
 from jaxsmw.benchmark.opponents.smooth_shells import SMOOTH_SHELLS
-from jaxsmw.benchmark.opponents.spectral_icp import NO_FILTER, SPECTRAL_ICP
-from jaxsmw.benchmark.opponents.zoomout import ZOOMOUT, ZOOMOUT_SAMPLED
 from jaxsmw.errors import InputError
 
 METHODS: dict[str, Method] = {

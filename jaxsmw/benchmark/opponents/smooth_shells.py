@@ -45,11 +45,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Float64, Int, Int64
+from jaxtyping import Float, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from jaxsmw.benchmark.opponents.base import Method, MethodInput
-from jaxsmw.core.results import RESULTS
+from jaxsmw.benchmark.opponents.base import Method, MethodInput, PointwiseMap
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
@@ -480,8 +479,7 @@ class SmoothShells(Method):
     full_only: bool = True
     last_level: int = 500
 
-    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Return the map X -> Y and the status code; see `Method`."""
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
         assert pair.meshes is not None
         descriptors = []
         for mesh, spectrum in zip(pair.meshes, (pair.spectrum_x, pair.spectrum_y), strict=True):
@@ -490,9 +488,7 @@ class SmoothShells(Method):
                 np.asarray(spectrum.descriptors)[: len(mesh.vertices), : self.number_of_descriptors]
             )
         with recomputing():
-            found = smooth_shells(*pair.meshes, *descriptors, number_of_eigenvectors=self.last_level)
-        padded = pad_rows(found, pair.initial_map.shape[0])
-        return jnp.asarray(padded, jnp.int32), RESULTS.successful  # type: ignore[return-value]
+            return smooth_shells(*pair.meshes, *descriptors, number_of_eigenvectors=self.last_level)
 
 
 SMOOTH_SHELLS = SmoothShells(
