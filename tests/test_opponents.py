@@ -10,8 +10,7 @@ from synthetic import bumpy_mesh, random_spectrum
 
 from jaxsmw.benchmark.opponents.base import MethodInput
 from jaxsmw.benchmark.opponents.baselines import Refined, Unrefined, ZoomOut
-from jaxsmw.benchmark.opponents.peers import installed_peers
-from jaxsmw.benchmark.opponents.registry import METHODS
+from jaxsmw.benchmark.opponents.registry import METHODS, PEERS, known_methods
 from jaxsmw.benchmark.opponents.smooth_shells import SmoothShells
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.eigenbasis import compute_spectrum
@@ -99,7 +98,7 @@ def test_all_methods_repair_a_noisy_initial_map():
 @pytest.mark.filterwarnings("ignore::ImportWarning")
 def test_other_libraries_run_the_same_zoomout():
     """Other libraries receive no padding and no unreferenced vertices. Returned maps use our vertex numbers."""
-    peers = installed_peers()
+    peers = {name: method for name, method in known_methods().items() if name in PEERS}
     if not peers:
         pytest.skip("neither pyFM nor geomfum is installed: pip install '.[peers]'")
     generator = np.random.default_rng(0)

@@ -26,7 +26,7 @@ from jaxsmw.benchmark.measurement import (
     measure_shape,
 )
 from jaxsmw.benchmark.opponents.base import Method
-from jaxsmw.benchmark.opponents.registry import MOST_EIGENVECTORS
+from jaxsmw.benchmark.opponents.registry import METHODS
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.journal import Journal, Row, claimed_directory
 from jaxsmw.runtime.provenance import code_digest, commit, measured_code, versions
@@ -128,14 +128,12 @@ def run_benchmark(
 
 
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
-    """Return the number of eigenvectors to precompute.
+    """Return the number of eigenvectors to precompute, which suffices for `methods` and for all of `METHODS`.
 
-    All results in a directory must be measured with the same number of eigenvectors, because the time of the
-    precomputation depends on this number. The returned number is at least `MOST_EIGENVECTORS`, which suffices
-    for all of `METHODS`. A later benchmark of other methods therefore usually has the same number, and can
-    add its results to the same directory.
+    The time of the precomputation depends on this number, so all results in a directory have the same number.
+    A later benchmark of other methods usually has this number as well, and can add its results.
     """
-    return max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
+    return max(method.number_of_eigenvectors for method in (*METHODS.values(), *methods.values()))
 
 
 def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[str, Any]]:

@@ -7,13 +7,12 @@ import os
 from pathlib import Path
 from typing import get_args
 
+from jaxsmw.benchmark.opponents.registry import METHODS, PEERS
+from jaxsmw.benchmark.protocols import PROTOCOLS
 from jaxsmw.choices import (
     DEFAULT_INITIAL_MAP,
     DEFAULT_MATCH_INIT,
     MatchInit,
-    MethodName,
-    PeerName,
-    ProtocolName,
 )
 from jaxsmw.cli.arguments import path, whole_number
 from jaxsmw.cli.console import report_progress, show
@@ -40,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=path,
         nargs="+",
         help="methods to measure (default: all methods that suit the pairs): "
-        f"{', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} if these libraries are "
-        "installed. For a method of another program, give the directory of its maps, in files named X_Y.map. "
+        f"{', '.join(METHODS)}; {', '.join(PEERS)} if these libraries are installed. For a method of another "
+        "program, give the directory of its maps, in files named X_Y.map. "
         "cpd and smooth-shells take 20 to 30 seconds per pair. pfm matches partial shapes only",
     )
     pairs = parser.add_mutually_exclusive_group()
@@ -54,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pairs.add_argument(
         "--protocol",
         metavar="NAME",
-        choices=get_args(ProtocolName),
+        choices=list(PROTOCOLS),
         help="the pairs on which papers report errors: %(choices)s. The data set must be complete",
     )
     parser.add_argument(

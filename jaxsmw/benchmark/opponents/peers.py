@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -136,8 +135,4 @@ class Geomfum(Peer):
 
 _STEPS = (ZOOMOUT.number_of_eigenvectors - ZOOMOUT.first) // ZOOMOUT.step
 
-
-def installed_peers() -> dict[str, Method]:
-    """Return the methods whose packages are installed, as a dictionary from name to method."""
-    peers: dict[str, Peer] = {"pyfm-zoomout": PyFM(), "geomfum-zoomout": Geomfum()}
-    return {name: peer for name, peer in peers.items() if find_spec(peer.package)}
+PYFM, GEOMFUM = PyFM(), Geomfum()
