@@ -13,7 +13,7 @@ from test_shortcuts import bent_tube
 
 from jaxsmw import Correspondence, Mesh, creature_pair, geodesic_error, make_mesh, match, read_mesh
 from jaxsmw.benchmark.datasets import DataPair
-from jaxsmw.benchmark.measurement import FIGURES, Settings, Task, measure_pair, measure_shape
+from jaxsmw.benchmark.measurement import FIGURES, Settings, measure_pair, measure_shape
 from jaxsmw.benchmark.opponents.baselines import Unrefined
 from jaxsmw.benchmark.opponents.registry import METHODS
 from jaxsmw.evaluation import coverage
@@ -97,7 +97,7 @@ def test_the_method_accurate_gives_the_map_of_match(case, tmp_path):
     np.savetxt(tmp_path / "x_y.map", np.arange(len(source.vertices)) + 1, fmt="%d")
     pair = DataPair("x", "y", *files, partial=partial)
     settings = Settings(str(tmp_path) if init == "map" else init, evaluated_points=300)
-    (row,) = measure_pair(Task(pair, {"accurate": METHODS["accurate"]}), settings, 30)
+    (row,) = measure_pair((pair, {"accurate": METHODS["accurate"]}), settings, 30)
 
     meshes = [read_mesh(path) for path in files]
     start = np.arange(len(source.vertices)) if init == "map" else init
@@ -146,8 +146,8 @@ def test_a_method_that_fails_does_not_stop_other_methods(tmp_path):
 
     write_mesh(tmp_path / "x.off", bumpy_mesh(3))
     pair = DataPair("x", "x", tmp_path / "x.off", tmp_path / "x.off")
-    task = Task(pair, {"broken": Broken(), "initial": METHODS["initial"]})
-    broken, initial = measure_pair(task, Settings("hks", evaluated_points=50), 10)
+    methods = {"broken": Broken(), "initial": METHODS["initial"]}
+    broken, initial = measure_pair((pair, methods), Settings("hks", evaluated_points=50), 10)
     assert broken["result"] == "it went wrong" and broken["mean"] == broken["seconds"] == "nan"
     assert initial["result"] == "successful" and float(initial["mean"]) < 0.1
 

@@ -256,11 +256,7 @@ def _meshes(directory: Path) -> dict[str, Path]:
 
 
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
-    """Find the meshes whose names match a pattern, and return a dictionary from their names to their files.
-
-    Only the first folder that contains a mesh with a matching name is used. The directory itself is searched
-    before the folders below it.
-    """
+    """Return the meshes whose names match a pattern, in the first folder that contains such a mesh."""
     folders = [directory, *sorted(folder for folder in directory.rglob("*") if folder.is_dir())]
     for folder in folders:
         found = {name: file for name, file in _meshes(folder).items() if names.fullmatch(name)}
@@ -379,10 +375,7 @@ def _listed_first(
     listed: Iterable[tuple[str, str]] | None,
     known: Iterable[tuple[str, str]],
 ) -> _Pairs:
-    """Return two lists: the listed pairs, and the unlisted pairs with ground truth.
-
-    If `listed` is None, the first list contains all pairs with ground truth.
-    """
+    """Return the listed pairs (all pairs if there is no list), and the other pairs with ground truth."""
     wanted = dict.fromkeys(known if listed is None else listed)
     others = (names for names in known if names not in wanted)
     return [pair(*names) for names in wanted], [pair(*names) for names in others]
@@ -525,11 +518,7 @@ def _characters(directory: Path) -> _Pairs | None:
 
 
 def _identical(names: str) -> Callable[[Path], _Pairs | None]:
-    """Return a function that opens a data set if its mesh names match the pattern `names`.
-
-    These data sets have no ground-truth files, because vertex i of one shape corresponds to vertex i of every
-    other shape of its class.
-    """
+    """Return a function that opens a data set in which vertex i corresponds to vertex i of all shapes."""
     pattern = re.compile(names)
 
     def open_layout(directory: Path) -> _Pairs | None:

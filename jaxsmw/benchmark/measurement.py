@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.journal import Row
 from jaxsmw.benchmark.opponents.base import Method, MethodInput
 from jaxsmw.benchmark.opponents.baselines import PublishedMaps, read_published_map
 from jaxsmw.choices import DEFAULT_MATCH_INIT, MatchInit
@@ -32,7 +33,6 @@ from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.io.mesh_files import read_mesh
 from jaxsmw.matching.pair import Pair
 from jaxsmw.runtime.cache import recomputing
-from jaxsmw.runtime.journal import Row
 from jaxsmw.runtime.provenance import machine
 from jaxsmw.runtime.threads import one_blas_thread
 
@@ -152,20 +152,6 @@ class Settings:
             PublishedMaps(Path(self.init)).check(pairs)
 
 
-@dataclass(frozen=True)
-class Task:
-    """A task of a benchmark: several methods to run on one pair.
-
-    **Attributes:**
-
-    - `pair`: the pair.
-    - `methods`: a dictionary from the names of the methods to the methods.
-    """
-
-    pair: DataPair
-    methods: dict[str, Method]
-
-
 def file_digest(file: Path) -> str:
     """Return a short hash of the contents of a file.
 
@@ -206,15 +192,17 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[
     return [{"shape": name, "digest": file_digest(file), "vertices": len(mesh.vertices), **seconds}]
 
 
-def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) -> list[Row]:
-    """Match a pair with every method of a task, and measure the errors of the maps.
+def measure_pair(
+    task: tuple[DataPair, Mapping[str, Method]], settings: Settings, number_of_eigenvectors: int
+) -> list[Row]:
+    """Match a pair with several methods, and measure the errors of the maps.
 
     **Arguments:**
 
-    - `task`: the pair and the methods.
+    - `task`: the pair, and a dictionary from the names of the methods to the methods.
     - `settings`: the settings of the benchmark.
-    - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape. This number must be at
-      least as large as the `number_of_eigenvectors` of every method in the task.
+    - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape, at least the
+      `number_of_eigenvectors` of every method.
 
     **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. The statistics
     and the seconds of a method that failed are NaN.
@@ -222,7 +210,7 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
     **Raises:** `InputError` if a file cannot be read, or if the pair cannot be prepared; `ArithmeticError` if
     the computation of an initial map fails numerically.
     """
-    data = task.pair
+    data, methods = task
     mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)
     truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
     if settings.mirrored:
@@ -233,10 +221,10 @@ def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) ->
         names=data.names,
         init=settings.init if settings.is_named else read_published_map(given, data.names, (mesh_x, mesh_y)),
         number_of_eigenvectors=number_of_eigenvectors,
-        number_of_descriptors=max(method.number_of_descriptors for method in task.methods.values()),
+        number_of_descriptors=max(method.number_of_descriptors for method in methods.values()),
     )
     rows = []
-    for name, method in task.methods.items():
+    for name, method in methods.items():
         try:
             pointwise_map, seconds = _timed(name, method, pair)
             ending = "successful"
@@ -296,11 +284,7 @@ def _evaluate(
     truths: Mapping[str, GroundTruth],
     settings: Settings,
 ) -> Row:
-    """Evaluate a map with every ground truth, and return the statistics with the smallest mean error.
-
-    `truths` is a dictionary with the ground truth `"direct"` and, if requested, the ground truth
-    `"mirrored"`.
-    """
+    """Return the statistics of a map for the ground truth, by name, that has the smallest mean error."""
     errors = {
         name: geodesic_error(
             mesh_y, pointwise_map, truth, number_of_samples=settings.evaluated_points, seed=settings.seed

@@ -67,10 +67,7 @@ class _MissingError(Exception):
 
 
 def _between(data_set: DataSet, names: Iterable[tuple[str, str]]) -> list[DataPair]:
-    """Return the pairs with the given names.
-
-    **Raises:** `_MissingError` if the data set lacks one of the shapes or one of the ground truths.
-    """
+    """Return the pairs with the given names, or raise `_MissingError`."""
     names, shapes = list(names), data_set.shapes
     if missing := [shape for shape in dict.fromkeys(chain.from_iterable(names)) if shape not in shapes]:
         count = f" and {len(missing) - 3} more" if len(missing) > 3 else ""

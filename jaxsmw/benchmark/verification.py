@@ -14,11 +14,11 @@ import numpy as np
 
 from jaxsmw.benchmark.benchmark import run_benchmark
 from jaxsmw.benchmark.datasets import DataPair, DataSet
+from jaxsmw.benchmark.journal import Journal, Row
 from jaxsmw.benchmark.measurement import RESULT_COLUMNS, Settings
 from jaxsmw.benchmark.opponents.base import Method
 from jaxsmw.choices import MatchInit
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.journal import Journal, Row
 
 # This share of the stored pairs is measured again.
 _SHARE = 0.1
@@ -169,10 +169,7 @@ def _key(row: Row) -> tuple[str, str, str]:
 
 
 def _stored_settings(path: Path) -> dict[str, Any]:
-    """Return the settings in a file `provenance.json`.
-
-    **Raises:** `InputError` if the file cannot be read, or contains no settings of a benchmark.
-    """
+    """Return the settings in a file `provenance.json`, or raise `InputError`."""
     try:
         settings = json.loads(path.read_text("utf-8"))["settings"]
         return {name: settings[name] for name in ("init", "mirrored", "evaluated_points", "seed")}

@@ -158,7 +158,7 @@ def run(options: argparse.Namespace) -> None:
         from jaxsmw.collection.files import RESULT_DIRECTORIES, check_replaceable, replace_results
         from jaxsmw.io.landmarks import check_frame
         from jaxsmw.runtime.files import make_directory, remove_leftovers
-        from jaxsmw.runtime.journal import claimed_directory
+        from jaxsmw.runtime.provenance import claimed_directory
     with stopwatch.step("reading"):
         _note_other_files(options)
         landmarks = _read_landmarks(options)

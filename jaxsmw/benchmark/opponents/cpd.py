@@ -320,11 +320,7 @@ def _drift(
 
 
 class _State(NamedTuple):
-    """The state of EM between two iterations.
-
-    `objective` is the value of the objective before the most recent M-step. `change` is the relative change
-    of `objective` in the most recent iteration.
-    """
+    """The state of EM; `objective` is its value before the last M-step, and `change` its relative change."""
 
     coefficients: Float[Array, "rank d"]
     variance: Float[Array, ""]
@@ -334,10 +330,7 @@ class _State(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """The result of the E-step: the log-likelihood, and sums over the probabilities P (n, m).
-
-    `weighted_data` is `P X`, `per_centroid` is `P 1`, and `per_point` is `P^T 1`.
-    """
+    """The result of the E-step: `P X`, `P 1` and `P^T 1` for the probabilities P, and the log-likelihood."""
 
     weighted_data: Float[Array, "n d"]
     per_centroid: Float[Array, " n"]
@@ -348,10 +341,7 @@ class _Expected(NamedTuple):
 def _normalized(
     points: Float[Array, "n d"], mask: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n d"], Float[Array, " d"], Float[Array, ""]]:
-    """Shift and scale points to zero mean and mean squared norm 1. Masked points become zero.
-
-    **Returns:** The new points, the mean of the given points, and the scale by which they were divided.
-    """
+    """Return points of zero mean and mean squared norm 1, the mean of the given points, and their scale."""
     count = jnp.sum(mask).astype(points.dtype)
     mean = jnp.sum(jnp.where(mask[:, None], points, 0), axis=0) / count
     centered = jnp.where(mask[:, None], points - mean[None, :], 0)

@@ -62,15 +62,7 @@ class Peer(Method):
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """The spectrum of a shape at its u referenced vertices, converted to float64 for other libraries.
-
-    **Attributes:**
-
-    - `vertices`: the indices of the referenced vertices in the mesh (u,).
-    - `eigenvalues`: the eigenvalues (k,).
-    - `eigenvectors`: the eigenvectors (u, k).
-    - `areas`: the vertex areas (u,).
-    """
+    """The spectrum of a shape at its u referenced vertices, converted to float64 for other libraries."""
 
     vertices: Int64[np.ndarray, " u"]
     eigenvalues: Float64[np.ndarray, " k"]

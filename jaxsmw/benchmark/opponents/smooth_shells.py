@@ -80,40 +80,26 @@ _RIDGE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """A shape of area 1 without unreferenced vertices. Its center is the origin.
-
-    **Attributes:**
-
-    - `mesh`: the mesh, with n vertices and f faces.
-    - `positions`: the positions of the vertices (n, 3).
-    - `eigenvalues`, `eigenvectors`: the eigenvalues (k,) and the eigenvectors (n, k).
-    - `dual`: the eigenvectors multiplied by the vertex areas (n, k). `dual.T` computes coefficients.
-    - `descriptors`: the descriptors (n, c), each with mean square 1.
-    - `differences`: a sparse matrix (e, n). Row e is the difference between the ends of edge e.
-    - `weights`: the cotangent weight of each edge (e,), which is positive.
-    """
+    """A shape of area 1 without unreferenced vertices. Its center is the origin."""
 
     mesh: Mesh
     positions: Float64[np.ndarray, "n 3"]
     eigenvalues: Float64[np.ndarray, " k"]
     eigenvectors: Float64[np.ndarray, "n k"]
-    dual: Float64[np.ndarray, "n k"]
-    descriptors: Float64[np.ndarray, "n c"]
-    differences: sp.csr_array
-    weights: Float64[np.ndarray, " e"]
+    dual: Float64[np.ndarray, "n k"]  # `dual.T` computes coefficients
+    descriptors: Float64[np.ndarray, "n c"]  # with mean square 1
+    differences: sp.csr_array  # row e (e, n) is the difference between the ends of edge e
+    weights: Float64[np.ndarray, " e"]  # cotangent weights
 
     @classmethod
     def of(cls, mesh: Mesh, descriptors: Float[np.ndarray, "n c"], number_of_eigenvectors: int) -> _Surface:
-        """Compute the `_Surface` of a mesh in which all vertices are referenced.
-
-        Edges with negative weights are left out (our choice), because the energy would otherwise have no
-        minimum.
-        """
+        """Compute the `_Surface` of a mesh in which all vertices are referenced."""
         spectrum = compute_spectrum(mesh, number_of_eigenvectors)
         areas = np.asarray(spectrum.vertex_areas, np.float64)
         eigenvectors = np.asarray(spectrum.eigenvectors, np.float64)
         positions = mesh.vertices / np.sqrt(mesh.area)
         above = sp.coo_array(sp.triu(assemble_laplacian(mesh)[0], 1))
+        # Edges with negative weights are left out (our choice). With them, the energy would have no minimum.
         kept = above.data < 0
         ends = np.stack([above.row[kept], above.col[kept]], axis=1)
         rows = np.repeat(np.arange(len(ends)), 2)
@@ -168,15 +154,7 @@ class _Surface:
 
 
 class _Shell(NamedTuple):
-    """The smooth shell of level K at s vertices, which are all vertices or samples.
-
-    **Attributes:**
-
-    - `eigenvalues`, `eigenvectors`: the first K eigenvalues (K,), and the eigenvectors (s, K).
-    - `dual`: a matrix (s, K). `dual.T` computes the coefficients of functions.
-    - `positions`, `normals`, `descriptors`: the smooth positions (s, 3), their normals (s, 3), and the
-      descriptors (s, c).
-    """
+    """The smooth shell of level K at s vertices, which are all vertices or samples."""
 
     eigenvalues: Float64[np.ndarray, " K"]
     eigenvectors: Float64[np.ndarray, "s K"]
@@ -212,12 +190,9 @@ class _Shell(NamedTuple):
     def coefficients_after(
         self, targets: Float64[np.ndarray, "s 3"], rigid: Float64[np.ndarray, "K 3"]
     ) -> Float64[np.ndarray, "K 3"]:
-        """Return the coefficients of positions near `targets`, whose Laplacian is near another one.
-
-        The positions p minimise `|p - targets|^2` plus `_RIGIDITY` times a Dirichlet energy. `rigid` contains
-        the coefficients of the Laplacian at which the Dirichlet energy alone has its minimum. In the
-        eigenvectors, the linear system is diagonal.
-        """
+        """Return the coefficients of positions that are near `targets` and as rigid as possible."""
+        # The positions p minimise `|p - targets|^2` plus `_RIGIDITY` times a Dirichlet energy, at whose
+        # minimum the Laplacian has the coefficients `rigid`. In the eigenvectors, the system is diagonal.
         fitted = self.dual.T @ targets
         return (fitted + _RIGIDITY * rigid) / (1 + _RIGIDITY * self.eigenvalues[:, None])
 
@@ -325,10 +300,8 @@ def _levels(first: int, last: int, growth: float) -> Iterator[int]:
 
 
 def _nearest(queries: Float64[np.ndarray, "s d"], database: Float64[np.ndarray, "r d"]) -> np.ndarray:
-    """Return, for each query, the index of the nearest row of the database.
-
-    JAX compiles one program for each size. The columns are therefore padded to a power of two.
-    """
+    """Return, for each query, the index of the nearest row of the database."""
+    # JAX compiles one program for each size.
     columns = 2 ** (queries.shape[1] - 1).bit_length()
     padded = (jnp.asarray(pad_rows(points.T, columns).T, jnp.float32) for points in (queries, database))
     return np.asarray(compiled(nearest_neighbor)(*padded)).astype(np.int64)
@@ -362,14 +335,7 @@ def _best_matches(surfaces: tuple[_Surface, _Surface], last: int, proposals: int
 def _extended(
     x: _Shell, y: _Shell, few_x: _Shell, few_y: _Shell, matches: Int64[np.ndarray, " s"]
 ) -> Int64[np.ndarray, " m"]:
-    """Extend matches of samples to all vertices. The coefficients of the matches give a smooth map.
-
-    **Arguments:**
-
-    - `x`, `y`: the shells of X and Y at all vertices.
-    - `few_x`, `few_y`: the same shells at samples.
-    - `matches`: for each sample of X (s,), a sample of Y.
-    """
+    """Extend matches of samples to all vertices. The coefficients of the matches give a smooth map."""
     mapped = x.eigenvectors @ _mapped(few_x, few_y, matches)
     return _nearest(
         np.hstack([mapped, x.weighted_descriptors]), np.hstack([y.points, y.weighted_descriptors])
@@ -384,12 +350,10 @@ class _Pose(NamedTuple):
 
 
 def _aligned(sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndarray, "3 3"]) -> _Pose:
-    """Align the shells of the samples, level by level, after a rotation of X.
+    """Align the shells of the samples, level by level, after a rotation of X."""
 
-    The rotation of X is known, so the deformation need not estimate rotations (our choice). The deformation
-    is near to the rotated shell in the same Dirichlet energy as in `_refined`.
-    """
-
+    # The rotation of X is known, so the deformation need not estimate rotations (our choice). The deformation
+    # is near to the rotated shell in the same Dirichlet energy as in `_refined`.
     def turned(shell: _Shell, turn: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "s d"]:
         return shell._replace(positions=shell.positions @ turn.T, normals=shell.normals @ turn.T).points
 
@@ -446,16 +410,7 @@ def _as_rigid_as_possible(
     targets: Float64[np.ndarray, "s 3"],
     positions: Float64[np.ndarray, "s 3"],
 ) -> Float64[np.ndarray, "s 3"]:
-    """Move a shell near to target positions, as rigidly as possible (Sorkine, Alexa 2007).
-
-    Two steps alternate: the best rotation of each vertex, and the best positions in the shell's eigenvectors.
-
-    **Arguments:**
-
-    - `surface`, `shell`: the surface and its shell, at all vertices.
-    - `targets`: the positions of the matches.
-    - `positions`: the moved positions of the previous level, from which the first rotations follow.
-    """
+    """Move a shell near to target positions, as rigidly as possible (Sorkine, Alexa 2007)."""
     for _ in range(_ROUNDS):
         rotations = surface.rotations_to(shell.positions, positions)
         rigid = shell.eigenvectors.T @ surface.turned_laplacian(shell.positions, rotations)
