@@ -25,9 +25,9 @@ TURN = Rotation.from_euler("xyz", [100, 40, -70], degrees=True).as_matrix()
 
 
 @pytest.fixture(scope="module")
-def surface() -> steps._Surface:
+def surface() -> steps._UnitSurface:
     mesh = bumpy_mesh(3)
-    return steps._Surface.of(mesh, np.zeros((len(mesh.vertices), 0)), 60)
+    return steps._UnitSurface.of(mesh, np.zeros((len(mesh.vertices), 0)), 60)
 
 
 def turned_copy(mesh: Mesh) -> tuple[Mesh, np.ndarray]:

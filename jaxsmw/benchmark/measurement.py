@@ -85,9 +85,9 @@ RESULT_COLUMNS: dict[str, Callable[[str], Any]] = {
 """A dictionary from the name of each column of `results.csv` to the function that parses its values.
 
 The file contains one row for each pair and method. `result` is `successful`, or a sentence that explains why
-the method failed. `seconds` is the wall time from the initial map to the final map, without compilation; see
-`Method.measure` and, for the presets of `jaxsmw.match`, `Matched`.
-`truth` is the ground truth with which the errors were computed, `direct` or `mirrored`.
+the method failed. `seconds` is the wall time from the initial map to the final map, without compilation
+(`docs/evaluation.md`). `truth` is the ground truth with which the errors were computed, `direct` or
+`mirrored`.
 """
 
 SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {

@@ -283,7 +283,7 @@ def _drift(
     factor = kernel_factor(y, centroids_mask, width=width, rank=rank)
     d, points = data.shape[1], jnp.sum(data_mask).astype(x.dtype)
 
-    def step(state: _State) -> _State:
+    def step(state: _DriftState) -> _DriftState:
         moved = y + product(factor, state.coefficients)
         expected = _expectation(x, data_mask, moved, centroids_mask, state.variance, outliers)
         objective = (
@@ -292,7 +292,7 @@ def _drift(
             - expected.log_likelihood
         )
         coefficients = _maximization(expected, y, factor, stiffness * state.variance)
-        return _State(
+        return _DriftState(
             coefficients,
             _variance(expected, x, y + product(factor, coefficients)),
             objective,
@@ -300,12 +300,12 @@ def _drift(
             iterations=state.iterations + 1,
         )
 
-    def goes_on(state: _State) -> Bool[Array, ""]:
+    def goes_on(state: _DriftState) -> Bool[Array, ""]:
         drifting = (state.change > tolerance) & (state.variance > _LEAST_VARIANCE)
         return drifting & (state.iterations < iterations)
 
     infinite = jnp.asarray(jnp.inf, x.dtype)
-    initial = _State(
+    initial = _DriftState(
         jnp.zeros((rank, d), x.dtype),
         # The initial variance is the mean squared distance between data and centroids, divided by d. This
         # value is 2 / d, because both sets have zero mean and a mean squared norm of 1.
@@ -319,7 +319,7 @@ def _drift(
     return Drift(moved, end.variance, end.iterations)
 
 
-class _State(NamedTuple):
+class _DriftState(NamedTuple):
     """The state of EM; `objective` is its value before the last M-step, and `change` its relative change."""
 
     coefficients: Float[Array, "rank d"]

@@ -79,7 +79,7 @@ _RIDGE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
+class _UnitSurface:
     """A shape of area 1 without unreferenced vertices. Its center is the origin."""
 
     mesh: Mesh
@@ -92,8 +92,10 @@ class _Surface:
     weights: Float64[np.ndarray, " e"]  # cotangent weights
 
     @classmethod
-    def of(cls, mesh: Mesh, descriptors: Float[np.ndarray, "n c"], number_of_eigenvectors: int) -> _Surface:
-        """Compute the `_Surface` of a mesh in which all vertices are referenced."""
+    def of(
+        cls, mesh: Mesh, descriptors: Float[np.ndarray, "n c"], number_of_eigenvectors: int
+    ) -> _UnitSurface:
+        """Compute the `_UnitSurface` of a mesh in which all vertices are referenced."""
         spectrum = compute_spectrum(mesh, number_of_eigenvectors)
         areas = np.asarray(spectrum.vertex_areas, np.float64)
         eigenvectors = np.asarray(spectrum.eigenvectors, np.float64)
@@ -272,8 +274,8 @@ def smooth_shells(
     used_x, used_y = (np.flatnonzero(mesh.referenced_vertices) for mesh in (mesh_x, mesh_y))
     count = min(number_of_eigenvectors, len(used_x) - 1, len(used_y) - 1)
     surfaces = (
-        _Surface.of(_without_unreferenced(mesh_x), descriptors_x[used_x], count),
-        _Surface.of(_without_unreferenced(mesh_y), descriptors_y[used_y], count),
+        _UnitSurface.of(_without_unreferenced(mesh_x), descriptors_x[used_x], count),
+        _UnitSurface.of(_without_unreferenced(mesh_y), descriptors_y[used_y], count),
     )
     first = min(_INITIAL, count)
     matches = _refined(surfaces, first, count, _best_matches(surfaces, first, proposals, seed))
@@ -312,7 +314,9 @@ def _mapped(x: _Shell, y: _Shell, matches: Int64[np.ndarray, " s"]) -> Float64[n
     return x.dual.T @ y.points[matches]
 
 
-def _best_matches(surfaces: tuple[_Surface, _Surface], last: int, proposals: int, seed: int) -> _Matches:
+def _best_matches(
+    surfaces: tuple[_UnitSurface, _UnitSurface], last: int, proposals: int, seed: int
+) -> _Matches:
     """Try initial poses on samples, and return the matches of all vertices from the best pose."""
     samples_x, samples_y = (
         farthest_point_samples(surface.mesh, min(number, len(surface.positions)))
@@ -384,7 +388,9 @@ def _aligned(sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndar
     return _Pose(space.energy(matches), matches)
 
 
-def _refined(surfaces: tuple[_Surface, _Surface], first: int, last: int, matches: _Matches) -> _Matches:
+def _refined(
+    surfaces: tuple[_UnitSurface, _UnitSurface], first: int, last: int, matches: _Matches
+) -> _Matches:
     """Align the shells of all vertices, level by level, and return the matches of the last level."""
     moved: list[Float64[np.ndarray, "s 3"]] | None = None
     for level in _levels(first, last, _GROWTH):
@@ -405,7 +411,7 @@ def _refined(surfaces: tuple[_Surface, _Surface], first: int, last: int, matches
 
 
 def _as_rigid_as_possible(
-    surface: _Surface,
+    surface: _UnitSurface,
     shell: _Shell,
     targets: Float64[np.ndarray, "s 3"],
     positions: Float64[np.ndarray, "s 3"],
