@@ -74,6 +74,7 @@ _MODULES = (
     "jaxsmw.transfer",
     "jaxsmw.collection",
     "jaxsmw.evaluation",
+    "jaxsmw.benchmark",
 )
 # Maps each public name to its documented path.
 _PUBLIC: dict[str, str] = {}

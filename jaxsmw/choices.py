@@ -1,7 +1,8 @@
-"""The names that settings accept, and the default settings.
+"""The types of arguments that accept names, and the default settings.
 
-The help text of the command line shows these names. This module does not import JAX, NumPy or SciPy, because
-these imports would delay the help text.
+The help text of the command line shows these names. Names of things that the library makes are the keys of
+their registries, such as `jaxsmw.benchmark.protocols.PROTOCOLS`. This module does not import JAX, NumPy or
+SciPy, because these imports would delay the help text.
 """
 
 from typing import Literal
@@ -58,37 +59,6 @@ one system to the other reverses the signs of x and y.
 
 Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 """The axis of a mesh that points up in pictures."""
-
-MethodName = Literal[
-    "initial",
-    "mwp",
-    "accurate",
-    "mwp-sampled",
-    "no-filter",
-    "icp",
-    "cpd",
-    "smooth-shells",
-    "pfm",
-    "zoomout",
-    "zoomout-sampled",
-]
-"""The names of the methods of a benchmark; see `jaxsmw.benchmark.opponents.registry.METHODS`."""
-ProtocolName = Literal[
-    "faust-r",
-    "scape-r",
-    "shrec19-r",
-    "smal-r",
-    "topkids",
-    "shrec16-cuts",
-    "shrec16-holes",
-    "tosca",
-    "dt4d-intra",
-    "dt4d-inter",
-]
-"""The names of the published protocols, which choose the pairs of a data set."""
-
-PeerName = Literal["pyfm-zoomout", "geomfum-zoomout"]
-"""The names of other libraries' methods, which a benchmark can measure if the libraries are installed."""
 
 NUMBER_OF_EIGENVECTORS = 100
 """The number of eigenvectors per shape in the MWP paper."""

@@ -44,6 +44,7 @@ from tqdm import tqdm
 
 from jaxsmw import geodesic_error, make_mesh, match, read_ground_truth, read_mesh
 from jaxsmw.benchmark.intervals import mean_interval
+from jaxsmw.benchmark.journal import Journal
 from jaxsmw.choices import DEFAULT_PRESET, EDGES_PER_SHAPE
 from jaxsmw.collection import Collection, match_collection
 from jaxsmw.collection.synchronization import vertex_map_between, vertices_as_points
@@ -51,7 +52,6 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry import nearest_surface_points
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal
 from jaxsmw.matching.presets import PRESETS
-from jaxsmw.runtime.journal import Journal
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import transfer_landmarks
 

@@ -28,11 +28,11 @@ from jaxtyping import Bool, Float64
 
 from jaxsmw import Mesh, geodesic_error, make_mesh, match, read_ground_truth, read_mesh
 from jaxsmw.benchmark.intervals import mean_interval
+from jaxsmw.benchmark.journal import Journal
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation import GroundTruth
 from jaxsmw.geometry import SurfacePoints, nearest_surface_points
 from jaxsmw.runtime.compilation import release_programs
-from jaxsmw.runtime.journal import Journal
 from jaxsmw.runtime.provenance import made_with
 
 _SHARES = 0.4, 0.9

@@ -35,6 +35,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw import Mesh, geodesic_error, match, read_ground_truth, read_mesh
+from jaxsmw.benchmark.journal import Journal
 from jaxsmw.choices import MatchInit
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import farthest_point_samples, nearest_surface_points
@@ -43,7 +44,6 @@ from jaxsmw.geometry.surface_distance import bounding_box_diagonal
 from jaxsmw.io import Landmarks, read_landmark_file
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.runtime.compilation import release_programs
-from jaxsmw.runtime.journal import Journal
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import RegisteredMesh, transfer_landmarks
 

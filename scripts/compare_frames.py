@@ -50,11 +50,11 @@ from frame_study.variants import QUICK_FRAMES, Variant, frames, twins
 from tqdm import tqdm
 
 from jaxsmw import InputError
+from jaxsmw.benchmark.journal import Journal, Row
 from jaxsmw.report.figures import check_drawable
 from jaxsmw.report.summary import provenance
 from jaxsmw.runtime.files import atomic_write, make_directory
-from jaxsmw.runtime.journal import Journal, Row, claimed_directory
-from jaxsmw.runtime.provenance import code_digest, measured_code
+from jaxsmw.runtime.provenance import claimed_directory, code_digest, measured_code
 from jaxsmw.runtime.workers import Workers, run_tasks
 
 QUICK = Settings(

@@ -21,10 +21,18 @@ from tqdm import tqdm
 from jaxsmw import InputError, Mesh, Spectrum, WaveletPreservation, geodesic_error, refine
 from jaxsmw.benchmark.datasets import DataPair, open_data_set
 from jaxsmw.benchmark.intervals import mean_interval
+from jaxsmw.benchmark.journal import Journal
 from jaxsmw.benchmark.tables import markdown
 from jaxsmw.runtime.files import atomic_write, make_directory
-from jaxsmw.runtime.journal import Journal, claimed_directory
-from jaxsmw.runtime.provenance import code_digest, commit, machine, made_with, measured_code, versions
+from jaxsmw.runtime.provenance import (
+    claimed_directory,
+    code_digest,
+    commit,
+    machine,
+    made_with,
+    measured_code,
+    versions,
+)
 
 EIGENVECTORS, ITERATIONS = 100, 3
 TRAINING_PEOPLE, POSES = 5, 10
@@ -409,7 +417,7 @@ class Run(NamedTuple):
 def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> Iterator[Run]:
     """Read the arguments, open the data, and reserve the output directory for this process.
 
-    `jaxsmw.runtime.journal.claimed_directory` writes the provenance of the results to `provenance.json` in
+    `jaxsmw.runtime.provenance.claimed_directory` writes the provenance of the results to `provenance.json` in
     the output directory. After bad input or an interruption, the process prints one sentence and ends.
 
     **Arguments:**

@@ -264,7 +264,7 @@ def programs() -> dict[str, Callable[[Path], Row]]:
     repair, last = ACCURATE.repair, ACCURATE.stages[-1]
     stages = {
         **{f"{name} {i}": s for name, preset in jaxsmw.PRESETS.items() for i, s in enumerate(preset.stages)},
-        **{f"accurate large {i}": stage for i, stage in enumerate(ACCURATE.large_stages)},
+        **{f"accurate large {i}": stage for i, stage in enumerate(ACCURATE.large.stages)},
         "accurate trimmed": last.with_levels(repair.trimmed_levels),
         **{f"accurate coarse {i}": last.with_levels(levels) for i, levels in enumerate(repair.coarse_levels)},
     }

@@ -12,6 +12,7 @@ import numpy as np
 
 import jaxsmw
 from jaxsmw import FeatureRegression, LeastSquares, Registration, Stage, WaveletPreservation
+from jaxsmw.creature import CreaturePair
 from jaxsmw.geometry import triangulate_points
 
 STAGES = (
@@ -29,7 +30,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "stage": {"preset": Stage(WaveletPreservation(bank=jaxsmw.Meyer(8)), number_of_eigenvectors=60)},
     "least-squares": {"preset": Stage(LEAST_SQUARES, number_of_eigenvectors=30, stop_when_unchanged=True)},
     "stages": {"preset": STAGES},
-    "repaired-stages": {"preset": jaxsmw.Preset(STAGES, jaxsmw.RepairSettings(stage=1))},
+    "repaired-stages": {"preset": jaxsmw.Preset(STAGES[:1], STAGES[1:], repair=jaxsmw.RepairSettings())},
     "large-stages": {"preset": replace(ACCURATE, stages=ACCURATE.large_stages)},
     "cotangent": {"laplacian": "cotangent"},
     "robust": {"laplacian": "robust", "preset": "paper"},
@@ -137,7 +138,7 @@ COMMANDS = {
 
 
 @cache
-def creatures(name: str) -> jaxsmw.geometry.CreaturePair:
+def creatures(name: str) -> CreaturePair:
     """Return two poses of a creature, whose kind, number of vertices and seed the first words state."""
     kind, vertices, seed = name.split()[:3]
     return jaxsmw.creature_pair(kind, vertices=int(vertices), seed=int(seed))

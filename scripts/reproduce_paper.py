@@ -44,9 +44,10 @@ from jaxsmw.benchmark.benchmark import Results, run_benchmark
 from jaxsmw.benchmark.datasets import DataPair, DataSet, choose_pairs, class_of, open_data_set
 from jaxsmw.benchmark.measurement import Settings
 from jaxsmw.benchmark.opponents.base import Method
-from jaxsmw.benchmark.opponents.published_maps import PublishedMaps
+from jaxsmw.benchmark.opponents.baselines import PublishedMaps
 from jaxsmw.benchmark.opponents.registry import METHODS, suited_methods
 from jaxsmw.benchmark.tables import MethodSummary, markdown, write_tables
+from jaxsmw.choices import DEFAULT_MATCH_INIT
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.io.mesh_files import read_mesh, write_mesh
 from jaxsmw.runtime.files import atomic_write, make_directory
@@ -231,7 +232,7 @@ def methods(pairs: Sequence[DataPair], options: argparse.Namespace) -> dict[str,
     return {name: every[name] for name in ("initial", "mwp", "zoomout-sampled")} if options.quick else every
 
 
-def same(options: argparse.Namespace, *, init: str = "shot", mirrored: bool = False) -> Settings:
+def same(options: argparse.Namespace, *, init: str = DEFAULT_MATCH_INIT, mirrored: bool = False) -> Settings:
     """Return the benchmark settings of a run. Only the initial map and mirroring differ between runs."""
     return Settings(init, mirrored, 200 if options.quick else None, options.seed)
 

@@ -4,8 +4,10 @@ import ast
 import graphlib
 import sys
 from pathlib import Path
+from typing import get_args
 
 import jaxsmw
+from jaxsmw.choices import PresetName
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
@@ -50,6 +52,19 @@ def test_every_module_belongs_to_a_layer_or_a_namespace():
 def test_the_package_exports_at_most_50_names():
     """Further names belong in subpackages such as `jaxsmw.banks`, `jaxsmw.io` and `jaxsmw.evaluation`."""
     assert len(jaxsmw.__all__) <= 50
+
+
+def test_only_its_command_imports_the_benchmark():
+    importers = {
+        module
+        for module, others in imported_modules().items()
+        if module.split(".")[0] != "benchmark" and any(other.split(".")[0] == "benchmark" for other in others)
+    }
+    assert importers == {"cli.benchmark"}
+
+
+def test_the_names_of_presets_are_written_once_more_only_in_their_type():
+    assert tuple(jaxsmw.PRESETS) == get_args(PresetName)
 
 
 def test_imports_have_no_cycle():

@@ -23,6 +23,7 @@ from frame_study.measurement import PairName, Settings
 from frame_study.variants import DEFAULT, UPDATES, Variant
 
 import jaxsmw
+from jaxsmw.benchmark.journal import Journal
 from jaxsmw.core.banks import CubicSpline, Gabor, Meyer, tighten
 from jaxsmw.core.functional_map import multiscale_kernel
 from jaxsmw.core.refiner import Problem
@@ -32,8 +33,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps
-from jaxsmw.runtime.journal import Journal, claimed_directory
-from jaxsmw.runtime.provenance import code_digest
+from jaxsmw.runtime.provenance import claimed_directory, code_digest
 
 pytestmark = pytest.mark.study
 

@@ -171,6 +171,7 @@ def test_match_computes_them_for_its_stages():
     )
     assert with_creases.spectrum_x.crease_eigenvectors.shape == (len(mesh.vertices), 6)
     assert without.spectrum_x.crease_eigenvectors is None
+    assert "crease eigenvectors" in with_creases.seconds and "crease eigenvectors" not in without.seconds
 
 
 def test_poses_of_one_person_have_related_crease_eigenvectors(shared):

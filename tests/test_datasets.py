@@ -2,6 +2,8 @@
 
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -163,7 +165,7 @@ def test_one_shape_in_two_formats_is_one_shape(tmp_path):
 BREAKAGES = {
     "no directory": (lambda d: None, "is not a directory"),
     "empty": (lambda d: d.mkdir(), "not laid out like a known data set"),
-    "only text": (lambda d: put(d / "readme.txt", "x"), "remeshed sets: off/NAME.off"),
+    "only text": (lambda d: put(d / "readme.txt", "x"), "remeshed set: off/NAME.off"),
     "no meshes": (lambda d: put(d / "corres" / "a.vts", "1\n"), "no folder with their meshes"),
     "no truth": (lambda d: (remeshed(d), (d / "corres" / "cat2.vts").unlink()), "cat2.vts: the ground truth of .* is missing"),
     "no mesh": (lambda d: (remeshed(d), (d / "off" / "cat2.off").unlink()), "no mesh for .*cat2.vts"),
@@ -264,3 +266,10 @@ def test_real_data_sets_are_recognised(shared, name):
     for pair in data_set.pairs[:1] + data_set.pairs[-1:]:
         truth = pair.ground_truth(read_mesh(pair.source_file), read_mesh(pair.target_file))
         assert len(truth.source_vertices) > 500
+
+
+def test_importing_data_sets_and_protocols_loads_no_heavy_module():
+    code = "import sys, jaxsmw.benchmark.datasets, jaxsmw.benchmark.protocols; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "jaxsmw.benchmark.datasets" in loaded.split()
+    assert {"jax", "numpy", "scipy", "igl"}.isdisjoint(loaded.split())

@@ -7,7 +7,8 @@ import os
 import pytest
 
 from jaxsmw import InputError
-from jaxsmw.runtime.journal import Journal, claimed_directory
+from jaxsmw.benchmark.journal import Journal
+from jaxsmw.runtime.provenance import claimed_directory
 
 COLUMNS = {"name": str, "value": float}
 

@@ -368,7 +368,7 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
     monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", False)
     with caplog.at_level(logging.INFO, "jaxsmw"):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=100))
-    steps = ["eigenbases", "mirror test", "initial map", "refinement"]
+    steps = ["eigenbases", "samples", "mirror test", "initial map", "refinement"]
     assert caplog.messages == [f"{step} ..." for step in steps]
 
 
@@ -482,9 +482,9 @@ def test_presets_match_a_copy_accurately(pair, usual):
     assert accurate.iterations == 3 + 4 + 4 + 4 and accurate.functional_map.shape == (200, 200)
     assert len(accurate.preset.stages) == 4 != len(usual.preset.stages) and accurate.distortion < 1.05
     assert paper.functional_map.shape == (100, 100) != usual.functional_map.shape
-    steps = ["eigenbases", "mirror test", "initial map", "descriptors", "refinement"]
+    steps = ["eigenbases", "samples", "crease eigenvectors", "mirror test", "initial map", "descriptors"]
     # The body differs from its mirror image, so the better of two maps was chosen.
-    assert list(accurate.seconds) == [*steps, "expected error", "final stages"]
+    assert list(accurate.seconds) == [*steps, "refinement", "expected error", "final stages"]
     assert accurate.expected_error().mean() < 0.002
     points = accurate.surface_points()
     distances = np.linalg.norm(points.positions(mesh_y) - mesh_y.vertices[truth], axis=1)

@@ -9,20 +9,12 @@ from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh, random_spectrum
 
 from jaxsmw.benchmark.opponents.base import MethodInput
-from jaxsmw.benchmark.opponents.initial_map import Unrefined
-from jaxsmw.benchmark.opponents.peers import installed_peers
-from jaxsmw.benchmark.opponents.presets import Refined
-from jaxsmw.benchmark.opponents.registry import METHODS
+from jaxsmw.benchmark.opponents.baselines import Refined, Unrefined, ZoomOut
+from jaxsmw.benchmark.opponents.registry import METHODS, PEERS, known_methods
 from jaxsmw.benchmark.opponents.smooth_shells import SmoothShells
-from jaxsmw.benchmark.opponents.zoomout import ZoomOut
-from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.matching.executor import Start
-from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import pair_up
-from jaxsmw.matching.shapes import PreparedShape
 
 pytestmark = pytest.mark.study
 
@@ -48,8 +40,7 @@ def test_zoomout_is_iterative_upsampling(pair):
         a, b = np.asarray(x.eigenvectors[:, :k]), np.asarray(y.eigenvectors[:, :k])
         c = (a * np.asarray(x.vertex_areas)[:, None]).T @ b[t]
         t = nearest(a, b @ c.T)
-    found, result = ZoomOut("", first=10, step=5, number_of_eigenvectors=25)(pair)
-    assert result == RESULTS.successful
+    found = ZoomOut("", first=10, step=5, number_of_eigenvectors=25)(pair)
     np.testing.assert_array_equal(found, t)
 
 
@@ -62,8 +53,7 @@ def test_zoomout_on_samples_searches_all_vertices_at_the_end(pair):
     for k in (10, 15, 20):
         c = np.linalg.lstsq(phi[s_x, :k], psi[s_y[t], :k])[0]
         t = nearest(phi[s_x, :k], psi[s_y, :k] @ c.T)
-    found, result = ZoomOut("", first=10, step=5, number_of_eigenvectors=20, number_of_samples=60)(pair)
-    assert result == RESULTS.successful
+    found = ZoomOut("", first=10, step=5, number_of_eigenvectors=20, number_of_samples=60)(pair)
     np.testing.assert_array_equal(found, nearest(phi[:, :20], psi[:, :20] @ c.T))
 
 
@@ -76,7 +66,7 @@ def test_spectral_icp_takes_the_nearest_rotation(pair):
         ]
         u, _, v = np.linalg.svd(c)
         t = nearest(np.asarray(x.eigenvectors), np.asarray(y.eigenvectors) @ (u @ v).T)
-    found, _ = Refined("", icp.refiner, number_of_eigenvectors=K, iterations=4)(pair)
+    found = Refined("", icp.refiner, number_of_eigenvectors=K, iterations=4)(pair)
     np.testing.assert_array_equal(found, t)
 
 
@@ -93,20 +83,14 @@ def test_all_methods_repair_a_noisy_initial_map():
     initial_map = np.where(generator.random(n) < 0.1, generator.integers(0, n, n), order)
     samples = generator.choice(n, 550, replace=False)
     on_both = jnp.asarray(np.argsort(order)[samples]), jnp.asarray(samples)
-    shapes = (
-        PreparedShape(mesh, spectrum, samples=s)
-        for mesh, spectrum, s in zip((mesh_x, mesh_y), (x, y), on_both, strict=True)
-    )
-    prepared = pair_up(Pair(mesh_x, mesh_y), *shapes)
-    pair = MethodInput.of(prepared, Start(prepared.spectra, initial_map), ("X", "Y"))
+    pair = MethodInput(x, y, jnp.asarray(initial_map), on_both, (mesh_x, mesh_y), init=initial_map)
     for name, method in METHODS.items():
         if method.partial_only or isinstance(method, SmoothShells):
             continue  # tested in files of their own
         if isinstance(method, ZoomOut):
             # JAX compiles the program anew for each size, so large steps save time.
             method = replace(method, step=50)
-        found, result = method(pair)
-        assert result == RESULTS.successful
+        found = method(pair)
         wrong = np.mean(np.asarray(found)[:n] != order)
         assert wrong > 0.08 if isinstance(method, Unrefined) else wrong < 0.02, name
 
@@ -114,7 +98,7 @@ def test_all_methods_repair_a_noisy_initial_map():
 @pytest.mark.filterwarnings("ignore::ImportWarning")
 def test_other_libraries_run_the_same_zoomout():
     """Other libraries receive no padding and no unreferenced vertices. Returned maps use our vertex numbers."""
-    peers = installed_peers()
+    peers = {name: method for name, method in known_methods().items() if name in PEERS}
     if not peers:
         pytest.skip("neither pyFM nor geomfum is installed: pip install '.[peers]'")
     generator = np.random.default_rng(0)
@@ -123,7 +107,7 @@ def test_other_libraries_run_the_same_zoomout():
     x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
     initial_map = jnp.asarray(np.where(generator.random(300) < 0.3, generator.integers(0, 300, 300), order))
     samples = (jnp.arange(200), jnp.arange(200))
-    expected, _ = METHODS["zoomout"](MethodInput(x, y, initial_map, samples))
+    expected = METHODS["zoomout"](MethodInput(x, y, initial_map, samples))
     # These spectra have an unreferenced vertex at the beginning, and padding at the end.
     x, y = (
         Spectrum(s.eigenvalues, *(jnp.roll(a, 1, axis=0) for a in (s.eigenvectors, s.vertex_areas, s.mask)))
@@ -131,8 +115,7 @@ def test_other_libraries_run_the_same_zoomout():
     )
     shifted = jnp.roll(jnp.pad(initial_map + 1, (0, 20)), 1)
     for name, peer in peers.items():
-        found, result = peer(MethodInput(x, y, shifted, samples))
-        assert result == RESULTS.successful
+        found = peer(MethodInput(x, y, shifted, samples))
         found = np.asarray(found)[1:301] - 1
         assert np.mean(found != order) < 0.02
         if name == "pyfm-zoomout":

@@ -7,6 +7,7 @@ from test_datasets import column, partial, put, shrec19, topology, tosca
 
 from jaxsmw import InputError, read_mesh
 from jaxsmw.benchmark import open_data_set, protocol_pairs
+from jaxsmw.benchmark.datasets import LAYOUTS
 from jaxsmw.benchmark.protocols import PROTOCOLS
 
 HERE = Path(__file__).parent
@@ -58,6 +59,16 @@ CASES = {
 
 def test_each_protocol_is_tested():
     assert list(CASES) == list(PROTOCOLS)
+
+
+def test_protocols_name_known_layouts():
+    assert {name for protocol in PROTOCOLS.values() for name in protocol.layouts} <= set(LAYOUTS)
+
+
+def test_an_unknown_protocol_is_refused(tmp_path):
+    topology(tmp_path)
+    with pytest.raises(InputError, match=r"'kids' is not a protocol.*topkids"):
+        protocol_pairs("kids", open_data_set(tmp_path))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -19,7 +19,6 @@ from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.shapes import Sizes
-from jaxsmw.matching.starts import make_start
 
 pytestmark = pytest.mark.study
 
@@ -27,9 +26,9 @@ TURN = Rotation.from_euler("xyz", [100, 40, -70], degrees=True).as_matrix()
 
 
 @pytest.fixture(scope="module")
-def surface() -> steps._Surface:
+def surface() -> steps._UnitSurface:
     mesh = bumpy_mesh(3)
-    return steps._Surface.of(mesh, np.zeros((len(mesh.vertices), 0)), 60)
+    return steps._UnitSurface.of(mesh, np.zeros((len(mesh.vertices), 0)), 60)
 
 
 def turned_copy(mesh: Mesh) -> tuple[Mesh, np.ndarray]:
@@ -129,10 +128,13 @@ def test_the_error_is_at_most_the_error_of_the_authors_program(shared):
     mesh_x, mesh_y = map(jaxsmw.read_mesh, pair.meshes)
     truth = pair.ground_truth(mesh_x, mesh_y)
     method = METHODS["smooth-shells"]
-    prepared = prepare(Pair(mesh_x, mesh_y), Sizes(30, number_of_samples=100))
-    prepared = prepared.describe(method.number_of_descriptors)
-    start = make_start(prepared, "shot")
-    found, _ = replace(method, last_level=200)(MethodInput.of(prepared, start, pair.names))
+    given = MethodInput.prepare(
+        Pair(mesh_x, mesh_y),
+        names=pair.names,
+        number_of_eigenvectors=30,
+        number_of_descriptors=method.number_of_descriptors,
+    )
+    found = replace(method, last_level=200)(given)
     theirs = np.loadtxt(shared / "oracle/smooth_shells/tr_reg_000__tr_reg_004.txt", dtype=int)
     mean = {
         program: jaxsmw.geodesic_error(mesh_y, pointwise_map, truth, number_of_samples=200).mean

@@ -9,9 +9,9 @@ from test_benchmark import scape  # noqa: F401 (a fixture)
 
 from jaxsmw import InputError
 from jaxsmw.benchmark.datasets import open_data_set
+from jaxsmw.benchmark.journal import Journal
 from jaxsmw.benchmark.verification import Comparison, StoredResults
 from jaxsmw.cli.run import run_command
-from jaxsmw.runtime.journal import Journal
 
 
 @pytest.mark.parametrize(

@@ -16,20 +16,19 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 from jaxsmw.benchmark.datasets import DataPair, DataSet
+from jaxsmw.benchmark.journal import Journal, Row
 from jaxsmw.benchmark.measurement import (
     RESULT_COLUMNS,
     SHAPE_COLUMNS,
     Settings,
-    Task,
     file_digest,
     measure_pair,
     measure_shape,
 )
 from jaxsmw.benchmark.opponents.base import Method
-from jaxsmw.benchmark.opponents.registry import MOST_EIGENVECTORS
+from jaxsmw.benchmark.opponents.registry import METHODS
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.journal import Journal, Row, claimed_directory
-from jaxsmw.runtime.provenance import code_digest, commit, measured_code, versions
+from jaxsmw.runtime.provenance import claimed_directory, code_digest, commit, measured_code, versions
 from jaxsmw.runtime.workers import run_tasks
 
 
@@ -128,14 +127,12 @@ def run_benchmark(
 
 
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
-    """Return the number of eigenvectors to precompute.
+    """Return the number of eigenvectors to precompute, which suffices for `methods` and for all of `METHODS`.
 
-    All results in a directory must be measured with the same number of eigenvectors, because the time of the
-    precomputation depends on this number. The returned number is at least `MOST_EIGENVECTORS`, which suffices
-    for all of `METHODS`. A later benchmark of other methods therefore usually has the same number, and can
-    add its results to the same directory.
+    The time of the precomputation depends on this number, so all results in a directory have the same number.
+    A later benchmark of other methods usually has this number as well, and can add its results.
     """
-    return max(MOST_EIGENVECTORS, *(method.number_of_eigenvectors for method in methods.values()))
+    return max(method.number_of_eigenvectors for method in (*METHODS.values(), *methods.values()))
 
 
 def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[str, Any]]:
@@ -149,11 +146,7 @@ def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[s
 
 
 class _Store:
-    """The result files of a benchmark, `results.csv` and `shapes.csv`.
-
-    **Raises:** `InputError` if the files are damaged or belong to another data set, or if a mesh file has
-    changed since it was measured.
-    """
+    """The result files of a benchmark, which must fit the data set and its present mesh files."""
 
     def __init__(self, output: Path, data_set: DataSet, pairs: Sequence[DataPair]):
         self.pairs = pairs
@@ -178,23 +171,17 @@ class _Store:
         """Return a dictionary from the name of each unmeasured shape to a tuple (name, mesh file)."""
         return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
 
-    def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, Task]:
-        """Return a dictionary from the name of each unfinished pair to its task.
-
-        The task contains the methods that have no result for this pair.
-        """
+    def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, tuple[DataPair, dict[str, Method]]]:
+        """Return the unfinished pairs by name, each with the methods that have no result."""
         tasks = {}
         for pair in self.pairs:
             missing = {name: methods[name] for name in methods if (*pair.names, name) not in self.results}
             if missing:
-                tasks[pair.name] = Task(pair, missing)
+                tasks[pair.name] = pair, missing
         return tasks
 
     def collected(self, methods: Mapping[str, Method], failed: Mapping[str, BaseException]) -> Results:
-        """Return the results of the pairs for which every method has a result.
-
-        All methods are thus compared on the same pairs.
-        """
+        """Return the results of the pairs for which every method has a result, so methods are comparable."""
         known = [pair for pair in self.pairs if all((name,) in self.shapes for name in pair.names)]
         by_pair = [[(*pair.names, name) for name in methods] for pair in known]
         finished = [keys for keys in by_pair if all(key in self.results for key in keys)]
@@ -213,10 +200,7 @@ def _measure_all(
     journal: Journal,
     quiet: bool,
 ) -> dict[str, BaseException]:
-    """Run all tasks, show a progress bar, and append the rows of each finished task to a journal.
-
-    **Returns:** A dictionary from the name of each failed task to its exception.
-    """
+    """Run all tasks, append their rows to a journal, and return the exceptions of failed tasks by name."""
     if not tasks:
         return {}
     failed: dict[str, BaseException] = {}

@@ -1,7 +1,7 @@
 """Readers for data sets in their published directory layouts: shapes, pairs and ground truth.
 
 This library contains no data set, because the licences of the data sets do not allow copies.
-`docs/datasets.md` says where to obtain each data set.
+`docs/datasets.md` says where to obtain each data set. Importing this module imports neither JAX nor NumPy.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
-
-import numpy as np
+from typing import TYPE_CHECKING, NamedTuple
 
 from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
-from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
-from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.mesh_files import MESH_SUFFIXES
+
+if TYPE_CHECKING:
+    from jaxsmw.evaluation.ground_truth import GroundTruth
+    from jaxsmw.geometry.mesh import Mesh
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,10 @@ class DataPair:
         `mirrored` is True, but `mirrored_truth` is None; or if `truth` is empty, but X and Y have different
         numbers of vertices.
         """
+        import numpy as np
+
+        from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
+
         files = self.mirrored_truth if mirrored else self.truth
         if files is None:
             raise InputError(
@@ -108,9 +112,8 @@ class DataSet:
     **Attributes:**
 
     - `directory`: the path of the directory that contains the files.
-    - `layout`: the name of the recognised layout: `"a remeshed set"`, `"SHREC'19 humans"`,
-      `"SHREC'16 partial"`, `"SHREC'16 topology"`, `"DeformingThings4D"`, `"FAUST registrations"`,
-      `"SCAPE"` or `"TOSCA"`.
+    - `layout`: the name of the recognised layout, a key of `jaxsmw.benchmark.datasets.LAYOUTS`, such as
+      `"SHREC'16 partial"`.
     - `pairs`: the pairs to match, as a tuple of `DataPair`. If the data set contains a list of pairs, the
       tuple contains the listed pairs in the order of the list.
     - `others`: a tuple of `DataPair`, with all pairs that have ground truth but are not in `pairs`. In a
@@ -140,6 +143,10 @@ class DataSet:
     def known_pairs(self) -> dict[tuple[str, str], DataPair]:
         """A dictionary from the names of each pair with ground truth to the pair."""
         return {pair.names: pair for pair in (*self.pairs, *self.others)}
+
+
+# The lists `pairs` and `others` of a `DataSet`.
+_Pairs = tuple[list[DataPair], list[DataPair]]
 
 
 def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
@@ -200,8 +207,9 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
             "the directory of one data set."
         )
     if found is None:
+        expected = "; ".join(f"{name}: {layout.files}" for name, layout in LAYOUTS.items())
         raise InputError(
-            f"{directory}: is not laid out like a known data set ({'; '.join(_EXPECTED)}): give the "
+            f"{directory}: is not laid out like a known data set ({expected}): give the "
             "directory of an unpacked data set."
         )
     layout, (pairs, others) = found
@@ -215,9 +223,9 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
 
 def _recognise(directory: Path) -> tuple[str, _Pairs] | None:
     """Return the name of the first layout that fits a directory, and its pairs; None if no layout fits."""
-    for layout, open_layout in _LAYOUTS.items():
-        if (pairs := open_layout(directory)) is not None:
-            return layout, pairs
+    for name, layout in LAYOUTS.items():
+        if (pairs := layout.open(directory)) is not None:
+            return name, pairs
     return None
 
 
@@ -228,18 +236,6 @@ def _is_a_set(directory: Path) -> bool:
         return False
 
 
-_EXPECTED = (
-    "remeshed sets: off/NAME.off with corres/NAME.vts",
-    "SHREC'19: NAME.obj with FARMgt_txt/NAME_NAME.txt",
-    "SHREC'16 partial: null/ with cuts/ or holes/",
-    "SHREC'16 topology: kid00.off with kidNN_ref.txt",
-    "DeformingThings4D: off/CLASS/NAME.off with corres/CLASS/NAME.vts",
-    "FAUST: tr_reg_NNN.ply",
-    "SCAPE: meshNNN.ply",
-    "TOSCA: cat0.mat or cat0.off",
-)
-
-
 def _natural(name: str) -> list[tuple[int, str]]:
     """Return a sort key that puts cat2 before cat10."""
     return [(int(word), "") if word.isdigit() else (-1, word) for word in re.split(r"(\d+)", name)]
@@ -247,6 +243,8 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def _meshes(directory: Path) -> dict[str, Path]:
     """Return a dictionary from the name of each mesh in a directory to its file, sorted by `_natural`."""
+    from jaxsmw.io.mesh_files import MESH_SUFFIXES
+
     if not directory.is_dir():
         return {}
     files = [file for file in directory.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file()]
@@ -257,16 +255,8 @@ def _meshes(directory: Path) -> dict[str, Path]:
     return {name: found[name] for name in sorted(found, key=_natural)}
 
 
-# The lists `pairs` and `others` of a `DataSet`.
-_Pairs = tuple[list[DataPair], list[DataPair]]
-
-
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
-    """Find the meshes whose names match a pattern, and return a dictionary from their names to their files.
-
-    Only the first folder that contains a mesh with a matching name is used. The directory itself is searched
-    before the folders below it.
-    """
+    """Return the meshes whose names match a pattern, in the first folder that contains such a mesh."""
     folders = [directory, *sorted(folder for folder in directory.rglob("*") if folder.is_dir())]
     for folder in folders:
         found = {name: file for name, file in _meshes(folder).items() if names.fullmatch(name)}
@@ -349,6 +339,8 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
     **Raises:** `InputError` if the number is not positive, if the list cannot be read, or if a listed pair
     has no ground truth.
     """
+    import numpy as np
+
     pairs = list(data_set.pairs)
     if wanted is None:
         return pairs
@@ -383,10 +375,7 @@ def _listed_first(
     listed: Iterable[tuple[str, str]] | None,
     known: Iterable[tuple[str, str]],
 ) -> _Pairs:
-    """Return two lists: the listed pairs, and the unlisted pairs with ground truth.
-
-    If `listed` is None, the first list contains all pairs with ground truth.
-    """
+    """Return the listed pairs (all pairs if there is no list), and the other pairs with ground truth."""
     wanted = dict.fromkeys(known if listed is None else listed)
     others = (names for names in known if names not in wanted)
     return [pair(*names) for names in wanted], [pair(*names) for names in others]
@@ -529,11 +518,7 @@ def _characters(directory: Path) -> _Pairs | None:
 
 
 def _identical(names: str) -> Callable[[Path], _Pairs | None]:
-    """Return a function that opens a data set if its mesh names match the pattern `names`.
-
-    These data sets have no ground-truth files, because vertex i of one shape corresponds to vertex i of every
-    other shape of its class.
-    """
+    """Return a function that opens a data set in which vertex i corresponds to vertex i of all shapes."""
     pattern = re.compile(names)
 
     def open_layout(directory: Path) -> _Pairs | None:
@@ -552,14 +537,29 @@ def _identical(names: str) -> Callable[[Path], _Pairs | None]:
     return open_layout
 
 
-# Each function returns the pairs of a directory, or None if the directory has another layout.
-_LAYOUTS: dict[str, Callable[[Path], _Pairs | None]] = {
-    "a remeshed set": _remeshed,
-    "SHREC'19 humans": _shrec19,
-    "SHREC'16 partial": _partial,
-    "SHREC'16 topology": _topology,
-    "DeformingThings4D": _characters,
-    "FAUST registrations": _identical(r"tr_reg_\d{3}"),
-    "SCAPE": _identical(r"mesh\d{3}"),
-    "TOSCA": _identical(r"(cat|centaur|david|dog|gorilla|horse|lioness|michael|seahorse|victoria|wolf)\d+"),
+class Layout(NamedTuple):
+    """A layout of data sets.
+
+    **Attributes:**
+
+    - `files`: the files by which the layout is recognised, as text for messages.
+    - `open`: a function that returns the lists `pairs` and `others` of the `DataSet` in a directory, or None
+      if the directory has another layout.
+    """
+
+    files: str
+    open: Callable[[Path], _Pairs | None]
+
+
+_TOSCA = r"(cat|centaur|david|dog|gorilla|horse|lioness|michael|seahorse|victoria|wolf)\d+"
+LAYOUTS = {
+    "a remeshed set": Layout("off/NAME.off with corres/NAME.vts", _remeshed),
+    "SHREC'19 humans": Layout("NAME.obj with FARMgt_txt/NAME_NAME.txt", _shrec19),
+    "SHREC'16 partial": Layout("null/ with cuts/ or holes/", _partial),
+    "SHREC'16 topology": Layout("kid00.off with kidNN_ref.txt", _topology),
+    "DeformingThings4D": Layout("off/CLASS/NAME.off with corres/CLASS/NAME.vts", _characters),
+    "FAUST registrations": Layout("tr_reg_NNN.ply", _identical(r"tr_reg_\d{3}")),
+    "SCAPE": Layout("meshNNN.ply", _identical(r"mesh\d{3}")),
+    "TOSCA": Layout("cat0.mat or cat0.off", _identical(_TOSCA)),
 }
+"""A dictionary from the names of the layouts to the layouts, in the order in which they are tried."""

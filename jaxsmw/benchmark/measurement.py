@@ -10,19 +10,20 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import numpy as np
 from jaxtyping import Int
 
 from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.journal import Row
 from jaxsmw.benchmark.opponents.base import Method, MethodInput
-from jaxsmw.benchmark.opponents.published_maps import PublishedMaps
-from jaxsmw.benchmark.preparation import prepare_pair
-from jaxsmw.core.results import RESULTS, sentence
+from jaxsmw.benchmark.opponents.baselines import PublishedMaps, read_published_map
+from jaxsmw.choices import DEFAULT_MATCH_INIT, MatchInit
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
@@ -30,9 +31,8 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.io.mesh_files import read_mesh
-from jaxsmw.matching.starts import INITIAL_MAPS
+from jaxsmw.matching.pair import Pair
 from jaxsmw.runtime.cache import recomputing
-from jaxsmw.runtime.journal import Row
 from jaxsmw.runtime.provenance import machine
 from jaxsmw.runtime.threads import one_blas_thread
 
@@ -85,8 +85,9 @@ RESULT_COLUMNS: dict[str, Callable[[str], Any]] = {
 """A dictionary from the name of each column of `results.csv` to the function that parses its values.
 
 The file contains one row for each pair and method. `result` is `successful`, or a sentence that explains why
-the method failed. `seconds` is the wall time from the initial map to the final map, without compilation.
-`truth` is the ground truth with which the errors were computed, `direct` or `mirrored`.
+the method failed. `seconds` is the wall time from the initial map to the final map, without compilation
+(`docs/evaluation.md`). `truth` is the ground truth with which the errors were computed, `direct` or
+`mirrored`.
 """
 
 SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
@@ -110,8 +111,8 @@ class Settings:
     **Attributes:**
 
     - `init`: the initial map from which all methods start. It is either a directory with initial maps in
-      files named `X_Y.map`, or the name of an initial map (see `jaxsmw.match`): `"shot"` (default), `"wks"`,
-      `"hks"`, `"wavelet"`, `"functional"` or `"aligned"`.
+      files named `X_Y.map`, or a name that `jaxsmw.match` accepts. With `"auto"` (default), all methods start
+      from `"shot"`; `accurate`, which calls `match`, also starts from `"aligned"` for asymmetric shapes.
     - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. If True,
       errors are computed for both ground truths, and the errors with the smaller mean are stored. Use this
       setting for methods and initial maps that do not distinguish left from right.
@@ -122,23 +123,23 @@ class Settings:
     **Raises:** `InputError` if `init` is neither the name of an initial map nor a directory.
     """
 
-    init: str = "shot"
+    init: str = DEFAULT_MATCH_INIT
     mirrored: bool = False
     evaluated_points: int | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
         # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
-        if not self.is_descriptor and not os.path.isdir(self.init):
+        if not self.is_named and not os.path.isdir(self.init):
             raise InputError(
-                f"{self.init!r} is not an initial map: choose from {', '.join(INITIAL_MAPS)}, or give a "
-                "directory with maps X_Y.map."
+                f"{self.init!r} is not an initial map: choose from {', '.join(get_args(MatchInit))}, or give "
+                "a directory with maps X_Y.map."
             )
 
     @property
-    def is_descriptor(self) -> bool:
+    def is_named(self) -> bool:
         """Whether the initial maps are computed, and not read from a directory."""
-        return self.init in INITIAL_MAPS
+        return self.init in get_args(MatchInit)
 
     def check(self, pairs: Sequence[DataPair]) -> None:
         """Check that the directory `init` contains a map for every pair.
@@ -147,22 +148,8 @@ class Settings:
 
         **Raises:** `InputError` if a file with an initial map is missing.
         """
-        if not self.is_descriptor:
+        if not self.is_named:
             PublishedMaps(Path(self.init)).check(pairs)
-
-
-@dataclass(frozen=True)
-class Task:
-    """A task of a benchmark: several methods to run on one pair.
-
-    **Attributes:**
-
-    - `pair`: the pair.
-    - `methods`: a dictionary from the names of the methods to the methods.
-    """
-
-    pair: DataPair
-    methods: dict[str, Method]
 
 
 def file_digest(file: Path) -> str:
@@ -188,71 +175,73 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[
 
     **Returns:** A list with one row, which has the keys of `SHAPE_COLUMNS`. Times are in seconds.
 
-    **Raises:** `InputError` if the file cannot be read, or if its spectrum or descriptors cannot be computed.
+    **Raises:** `InputError` if the file cannot be read, or if its spectrum cannot be computed.
     """
     name, file = shape
     with recomputing():
         seconds, mesh = {}, read_mesh(file)
-        for what, compute in (
-            ("spectrum", lambda: compute_spectrum(mesh, number_of_eigenvectors)),
-            ("descriptors", lambda: shot_descriptors(mesh)),
+        for what, compute, refusals in (
+            ("spectrum", lambda: compute_spectrum(mesh, number_of_eigenvectors), []),
+            # A mesh can be too coarse for SHOT. Methods that need no SHOT can match this mesh nevertheless.
+            ("descriptors", lambda: shot_descriptors(mesh), [InputError]),
         ):
             began = time.perf_counter()
-            compute()
+            with suppress(*refusals):
+                compute()
             seconds[f"seconds_{what}"] = f"{time.perf_counter() - began:.4f}"
     return [{"shape": name, "digest": file_digest(file), "vertices": len(mesh.vertices), **seconds}]
 
 
-def measure_pair(task: Task, settings: Settings, number_of_eigenvectors: int) -> list[Row]:
-    """Match a pair with every method of a task, and measure the errors of the maps.
+def measure_pair(
+    task: tuple[DataPair, Mapping[str, Method]], settings: Settings, number_of_eigenvectors: int
+) -> list[Row]:
+    """Match a pair with several methods, and measure the errors of the maps.
 
     **Arguments:**
 
-    - `task`: the pair and the methods.
+    - `task`: the pair, and a dictionary from the names of the methods to the methods.
     - `settings`: the settings of the benchmark.
-    - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape. This number must be at
-      least as large as the `number_of_eigenvectors` of every method in the task.
+    - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape, at least the
+      `number_of_eigenvectors` of every method.
 
     **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. The statistics
-    of a map that contains -1 are NaN. Most methods return such a map after a failure.
+    and the seconds of a method that failed are NaN.
 
     **Raises:** `InputError` if a file cannot be read, or if the pair cannot be prepared; `ArithmeticError` if
     the computation of an initial map fails numerically.
     """
-    data = task.pair
+    data, methods = task
     mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)
     truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
     if settings.mirrored:
         truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
-    methods = task.methods.values()
-    pair = prepare_pair(
-        data,
-        mesh_x,
-        mesh_y,
-        settings.init,
-        number_of_eigenvectors,
-        number_of_descriptors=max(method.number_of_descriptors for method in methods),
+    given = Path(settings.init)
+    pair = MethodInput.prepare(
+        Pair(mesh_x, mesh_y, data.partial),
+        names=data.names,
+        init=settings.init if settings.is_named else read_published_map(given, data.names, (mesh_x, mesh_y)),
+        number_of_eigenvectors=number_of_eigenvectors,
+        number_of_descriptors=max(method.number_of_descriptors for method in methods.values()),
     )
     rows = []
-    for name, method in task.methods.items():
-        pointwise_map, result, seconds = _timed(name, method, pair)
-        ending = "successful" if result == RESULTS.successful else sentence(result)
-        figures = _evaluate(mesh_y, pointwise_map[: len(mesh_x.vertices)], truths, settings)
+    for name, method in methods.items():
+        try:
+            pointwise_map, seconds = _timed(name, method, pair)
+            ending = "successful"
+            figures = _evaluate(mesh_y, pointwise_map[: len(mesh_x.vertices)], truths, settings)
+        except ArithmeticError as error:
+            seconds, ending, figures = np.nan, str(error), _NO_FIGURES
         identity = {"source": data.source, "target": data.target, "method": name, "machine": machine()}
         rows.append(identity | {"result": ending, "seconds": f"{seconds:.5f}"} | figures)
     return rows
 
 
-def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], RESULTS, float]:
-    """Run a method, and return its map, its status code (`RESULTS`) and its wall time in seconds.
-
-    The time does not include compilation. For maps that are read from files, the time is NaN.
-    """
+def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], float]:
+    """Run a method, and return its map and its seconds without compilation; see `Method.measure`."""
     for _ in range(2):
         with _CompilationClock() as compilation, one_blas_thread():
-            began = time.perf_counter()
-            pointwise_map, result = jax.block_until_ready(method(pair))
-            seconds = time.perf_counter() - began - compilation.seconds
+            pointwise_map, seconds = method.measure(pair)
+            seconds -= compilation.seconds
         warm = name in _warm and not compilation.seconds
         _warm.add(name)
         # The first run of a method takes longer than later runs, for example because of imports, so the
@@ -260,7 +249,7 @@ def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray
         # negligible in comparison.
         if warm or seconds > _LONG:
             break
-    return np.asarray(pointwise_map), result, np.nan if isinstance(method, PublishedMaps) else seconds
+    return np.asarray(pointwise_map), seconds
 
 
 # A run that takes longer than this number of seconds is not repeated.
@@ -285,20 +274,17 @@ class _CompilationClock:
             self.seconds += duration_secs
 
 
+# The statistics of a method that failed.
+_NO_FIGURES = dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}
+
+
 def _evaluate(
     mesh_y: Mesh,
     pointwise_map: Int[np.ndarray, " m"],
     truths: Mapping[str, GroundTruth],
     settings: Settings,
 ) -> Row:
-    """Evaluate a map with every ground truth, and return the statistics with the smallest mean error.
-
-    `truths` is a dictionary with the ground truth `"direct"` and, if requested, the ground truth
-    `"mirrored"`. If the map contains -1, all statistics are NaN. Most methods return such a map after a
-    failure.
-    """
-    if (pointwise_map < 0).any():
-        return dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}
+    """Return the statistics of a map for the ground truth, by name, that has the smallest mean error."""
     errors = {
         name: geodesic_error(
             mesh_y, pointwise_map, truth, number_of_samples=settings.evaluated_points, seed=settings.seed

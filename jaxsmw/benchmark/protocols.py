@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import chain, permutations
 
 from jaxsmw.benchmark.datasets import DataPair, DataSet, class_of, read_shapes
-from jaxsmw.choices import ProtocolName
 from jaxsmw.errors import InputError
 
 
@@ -17,7 +16,7 @@ class Protocol:
 
     **Attributes:**
 
-    - `layouts`: the accepted layouts of the data set; see `DataSet.layout`.
+    - `layouts`: the names of the accepted layouts of the data set; see `DataSet.layout`.
     - `choose`: a function that takes a `DataSet` and returns the pairs of the protocol.
     - `files`: the needed files, as a text.
     - `pairs`: the chosen pairs, as a text.
@@ -33,7 +32,7 @@ class Protocol:
     source: str
 
 
-def protocol_pairs(name: ProtocolName, data_set: DataSet) -> list[DataPair]:
+def protocol_pairs(name: str, data_set: DataSet) -> list[DataPair]:
     """Return the pairs of a published protocol.
 
     **Arguments:**
@@ -43,8 +42,11 @@ def protocol_pairs(name: ProtocolName, data_set: DataSet) -> list[DataPair]:
 
     **Returns:** The pairs, each a `DataPair` of the data set.
 
-    **Raises:** `InputError` if the data set has another layout, or lacks files that the protocol needs.
+    **Raises:** `InputError` if there is no such protocol, or if the data set has another layout or lacks
+    files that the protocol needs.
     """
+    if name not in PROTOCOLS:
+        raise InputError(f"{name!r} is not a protocol: choose {', '.join(PROTOCOLS)}.")
     protocol = PROTOCOLS[name]
     if data_set.layout not in protocol.layouts:
         raise InputError(
@@ -65,10 +67,7 @@ class _MissingError(Exception):
 
 
 def _between(data_set: DataSet, names: Iterable[tuple[str, str]]) -> list[DataPair]:
-    """Return the pairs with the given names.
-
-    **Raises:** `_MissingError` if the data set lacks one of the shapes or one of the ground truths.
-    """
+    """Return the pairs with the given names, or raise `_MissingError`."""
     names, shapes = list(names), data_set.shapes
     if missing := [shape for shape in dict.fromkeys(chain.from_iterable(names)) if shape not in shapes]:
         count = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
@@ -150,7 +149,7 @@ _REN = "https://github.com/llorz/SGA18_orientation_BCICP_dataset"
 _CAO = "https://github.com/dongliangcao/Unsupervised-Learning-of-Robust-Spectral-Shape-Matching"
 _TRAINED = "Donati 2020, Li 2022 (AttentiveFMaps), Cao 2023 (ULRSSM), Bastian 2024 (hybrid functional maps)"
 
-PROTOCOLS: dict[ProtocolName, Protocol] = {
+PROTOCOLS: dict[str, Protocol] = {
     "faust-r": Protocol(
         _REMESHED,
         _among(*(f"tr_reg_{number:03}" for number in range(80, 100))),

@@ -12,11 +12,12 @@ from jaxtyping import Float64
 from jaxsmw.benchmark.benchmark import Results
 from jaxsmw.benchmark.datasets import DataSet
 from jaxsmw.benchmark.intervals import CONFIDENCE, Interval, mean_interval
+from jaxsmw.benchmark.journal import Row
 from jaxsmw.benchmark.measurement import CURVE, RESULT_COLUMNS, Settings
 from jaxsmw.benchmark.opponents.base import Method
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MATCH_INIT
 from jaxsmw.report.figures import draw_quality_curves, save_figure
 from jaxsmw.runtime.files import atomic_write
-from jaxsmw.runtime.journal import Row
 
 REFERENCE = "mwp"
 """The name of the reference method, with which tables compare all other methods."""
@@ -98,10 +99,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
 
 
 def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
-    """Return a dictionary from each pair (source, target) to its mean error. Failed pairs are left out.
-
-    The errors are in the unit of `MethodSummary.mean`.
-    """
+    """Return the error of each pair (source, target) on which the method did not fail."""
     return {
         (row["source"], row["target"]): 1e3 * float(row["mean"])
         for row in rows
@@ -224,7 +222,7 @@ def _introduction(data_set: DataSet, results: Results, settings: Settings) -> st
     machines = "; ".join(sorted({row["machine"] for row in results.rows}))
     sentences = [
         f"{share} pairs of the data set ({data_set.layout}) were measured. All methods start "
-        f"from the same initial map ({Path(settings.init).name}).",
+        f"from the same initial map ({_initial_map(settings)}).",
         "Errors are mean geodesic errors in thousandths of the square root of the target's area, at "
         f"{points} of the ground truth.",
         "The mean and the median are computed over the pairs on which a method did not fail. The column "
@@ -236,6 +234,10 @@ def _introduction(data_set: DataSet, results: Results, settings: Settings) -> st
     if results.failures:
         sentences.append(f"{len(results.failures)} shapes or pairs could not be measured.")
     return " ".join(sentences)
+
+
+def _initial_map(settings: Settings) -> str:
+    return DEFAULT_INITIAL_MAP if settings.init == DEFAULT_MATCH_INIT else Path(settings.init).name
 
 
 def _write(path: Path, text: str) -> None:

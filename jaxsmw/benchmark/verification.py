@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Container, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 
 from jaxsmw.benchmark.benchmark import run_benchmark
 from jaxsmw.benchmark.datasets import DataPair, DataSet
+from jaxsmw.benchmark.journal import Journal, Row
 from jaxsmw.benchmark.measurement import RESULT_COLUMNS, Settings
 from jaxsmw.benchmark.opponents.base import Method
+from jaxsmw.choices import MatchInit
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.journal import Journal, Row
 
 # This share of the stored pairs is measured again.
 _SHARE = 0.1
@@ -62,7 +64,8 @@ class StoredResults:
     **Arguments:**
 
     - `path`: the file `results.csv` of a benchmark. The file `provenance.json` must be in the same directory.
-    - `init`: the directory with initial maps, if the results were measured from such a directory.
+    - `init`: the directory with initial maps, if the results were measured from such a directory; None
+      otherwise.
 
     **Attributes:**
 
@@ -73,7 +76,7 @@ class StoredResults:
     **Raises:** `InputError` if a file cannot be read, or the results were measured from other initial maps.
     """
 
-    def __init__(self, path: Path, init: str):
+    def __init__(self, path: Path, init: str | None = None):
         if not path.is_file():
             raise InputError(f"{path}: is not a file: give the results.csv of a benchmark.")
         self.path = path
@@ -83,7 +86,8 @@ class StoredResults:
             raise InputError(f"{path}: contains no results: give the results.csv of a benchmark.")
         self.methods = list(dict.fromkeys(row["method"] for row in self.rows))
         stored = _stored_settings(path.with_name("provenance.json"))
-        if Path(init).name != stored["init"]:
+        init = stored["init"] if init is None else init
+        if Path(init).name != stored["init"] or not (init in get_args(MatchInit) or os.path.isdir(init)):
             raise InputError(
                 f"{path}: was measured with the initial maps {stored['init']}: give them with --init."
             )
@@ -165,10 +169,7 @@ def _key(row: Row) -> tuple[str, str, str]:
 
 
 def _stored_settings(path: Path) -> dict[str, Any]:
-    """Return the settings in a file `provenance.json`.
-
-    **Raises:** `InputError` if the file cannot be read, or contains no settings of a benchmark.
-    """
+    """Return the settings in a file `provenance.json`, or raise `InputError`."""
     try:
         settings = json.loads(path.read_text("utf-8"))["settings"]
         return {name: settings[name] for name in ("init", "mirrored", "evaluated_points", "seed")}

@@ -7,7 +7,13 @@ import os
 from pathlib import Path
 from typing import get_args
 
-from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap, MethodName, PeerName, ProtocolName
+from jaxsmw.benchmark.opponents.registry import METHODS, PEERS
+from jaxsmw.benchmark.protocols import PROTOCOLS
+from jaxsmw.choices import (
+    DEFAULT_INITIAL_MAP,
+    DEFAULT_MATCH_INIT,
+    MatchInit,
+)
 from jaxsmw.cli.arguments import path, whole_number
 from jaxsmw.cli.console import report_progress, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
@@ -33,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=path,
         nargs="+",
         help="methods to measure (default: all methods that suit the pairs): "
-        f"{', '.join(get_args(MethodName))}; {', '.join(get_args(PeerName))} if these libraries are "
-        "installed. For a method of another program, give the directory of its maps, in files named X_Y.map. "
+        f"{', '.join(METHODS)}; {', '.join(PEERS)} if these libraries are installed. For a method of another "
+        "program, give the directory of its maps, in files named X_Y.map. "
         "cpd and smooth-shells take 20 to 30 seconds per pair. pfm matches partial shapes only",
     )
     pairs = parser.add_mutually_exclusive_group()
@@ -47,16 +53,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     pairs.add_argument(
         "--protocol",
         metavar="NAME",
-        choices=get_args(ProtocolName),
+        choices=list(PROTOCOLS),
         help="the pairs on which papers report errors: %(choices)s. The data set must be complete",
     )
     parser.add_argument(
         "--init",
         metavar="INITIAL_MAP",
         type=path,
-        default=DEFAULT_INITIAL_MAP,
-        help=f"initial map of all methods: {', '.join(get_args(InitialMap))}, or a directory with maps "
-        "in files named X_Y.map (default: %(default)s)",
+        help=f"initial map of all methods: {', '.join(get_args(MatchInit))}, or a directory with maps "
+        f"in files named X_Y.map (default: {DEFAULT_MATCH_INIT}). With {DEFAULT_MATCH_INIT}, all methods "
+        f"start from {DEFAULT_INITIAL_MAP}, and accurate also from aligned if the shapes are asymmetric",
     )
     parser.add_argument(
         "--mirrored",
@@ -145,7 +151,8 @@ def _measure(options: argparse.Namespace) -> None:
         pairs = choose_pairs(data_set, options.pairs, options.seed)
     else:
         pairs = protocol_pairs(options.protocol, data_set)
-    settings = Settings(options.init, options.mirrored, options.evaluation_samples, options.seed)
+    init = options.init or DEFAULT_MATCH_INIT
+    settings = Settings(init, options.mirrored, options.evaluation_samples, options.seed)
     methods = find_methods(options.methods) if options.methods else suited_methods(pairs)
     output = options.output or f"jaxsmw-benchmark-{data_set.name}"
     check_outputs([options.pairs], directories=[(output, ())])

@@ -157,7 +157,7 @@ def run(options: argparse.Namespace) -> None:
         from jaxsmw.io.landmark_files import read_landmark_file
         from jaxsmw.io.landmarks import check_frame
         from jaxsmw.runtime.files import make_directory, remove_leftovers
-        from jaxsmw.runtime.journal import claimed_directory
+        from jaxsmw.runtime.provenance import claimed_directory
     with stopwatch.step("reading"):
         _note_other_files(options)
         landmarks = read_landmark_file(options.landmarks) if options.landmarks else None

@@ -216,11 +216,7 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 
 
 def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
-    """Return a column of a table as 0-based faces of a mesh.
-
-    The face numbers in the table count all faces of the mesh file, including faces that were dropped when the
-    mesh was read. The returned numbers refer to `mesh.faces`, which contains only the faces that were kept.
-    """
+    """Return a column of face numbers, which also count dropped faces, as rows of `mesh.faces`."""
     count = len(mesh.faces) + len(mesh.dropped_faces)
     given = table.indices(column, count, f"faces of {mesh.name}", base)
     faces = np.searchsorted(mesh.face_numbers, given)

@@ -7,8 +7,8 @@ It also cannot read binary PLY files whose polygons have different numbers of co
 the JSON part of glTF files, and has no checks.
 
 The other libraries were tried on the files of `tests/corpus`, with one to three damages of
-`tests/test_fuzzing.py` each. On 1000 damaged VTK legacy files, the reader of VTK 9.7.2 ended the process with a
-segmentation fault 15 times, and returned cells with indices or offsets out of range 162 times. On 1000
+`tests/test_fuzzing.py` each. On 1000 damaged VTK legacy files, the reader of VTK 9.7.2 ended the process with
+a segmentation fault 15 times, and returned cells with indices or offsets out of range 162 times. On 1000
 damaged VTK XML files, it aborted the process twice, hung once, and returned such cells 11 times. cvista-io
 has the same readers. On 1000 damaged PCD files, pypcd4 1.5.1 hung twice, and silently returned too few points
 25 times. It needs python-lzf, which has no wheels. On 2000 damaged MATLAB files of version 7.3, pymatreader

@@ -6,8 +6,8 @@ import functools
 import itertools
 import logging
 import warnings
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 
 import jax
@@ -41,7 +41,7 @@ from jaxsmw.matching.settings import WITHOUT_REPAIR, ExpectedErrorSettings
 from jaxsmw.matching.stages import Stage
 from jaxsmw.matching.starts import check_initial_map, make_start
 from jaxsmw.runtime.memory import return_free_memory
-from jaxsmw.runtime.progress import timed
+from jaxsmw.runtime.progress import Step, no_step, timed
 from jaxsmw.runtime.threads import one_blas_thread
 
 logger = logging.getLogger("jaxsmw")
@@ -162,8 +162,9 @@ def match(
 
     seconds: dict[str, float] = {}
     step = functools.partial(timed, seconds=seconds)
-    with step("eigenbases"):
-        prepared = prepare(surfaces, chosen.sizes, given=pair, laplacian=laplacian, eigensolver=eigensolver)
+    prepared = prepare(
+        surfaces, chosen.sizes, given=pair, laplacian=laplacian, eigensolver=eigensolver, step=step
+    )
     decision = Decision(mirror == "yes")
     aligns = automatic and chosen.repair is not None  # "aligned" is used only for asymmetric shapes
     if (mirror == "auto" or aligns) and not partial:
@@ -193,10 +194,6 @@ def match(
     )
 
 
-Step = Callable[[str], AbstractContextManager[None]]
-"""A function that takes the name of a step and returns the context in which the step runs."""
-
-
 def match_prepared(
     prepared: PreparedPair,
     starts: Sequence[Start],
@@ -205,7 +202,7 @@ def match_prepared(
     outcomes: Sequence[Outcome] = (),
     alternatives: bool = True,
     history: bool = False,
-    step: Step = lambda name: nullcontext(),
+    step: Step = no_step,
 ) -> Correspondence:
     """Run all stages and the repair from each start, and return the better map.
 

@@ -25,6 +25,7 @@ from jaxsmw.matching.descriptors import (
 from jaxsmw.matching.executor import SpectralPair, common_range
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.shapes import PreparedShape, Sizes, prepare_shapes
+from jaxsmw.runtime.progress import Step, no_step
 from jaxsmw.runtime.threads import side_by_side
 
 # In a partial pair, the smaller area must be at least this share of the larger area. A part with less than a
@@ -139,6 +140,7 @@ def prepare(
     given: Pair | None = None,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
+    step: Step = no_step,
 ) -> PreparedPair:
     """Prepare both shapes of a pair, and pair them.
 
@@ -148,6 +150,7 @@ def prepare(
     - `sizes`: the numbers of eigenvectors, crease eigenvectors and samples of each shape.
     - `given`: the pair to whose vertices the result refers, if `pair` is cut; by default `pair`.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
+    - `step`: reports and measures the steps.
 
     **Returns:** A `PreparedPair` without descriptors.
 
@@ -160,7 +163,7 @@ def prepare(
             f"area {pair.mesh_y.area:.3g}, so their units of length probably differ: scale one of the "
             'meshes, or set scale="unknown" (--scale unknown).'
         )
-    x, y = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver)
+    x, y = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver, step=step)
     prepared = pair_up(pair, x, y)
     return replace(prepared, given=given or pair, laplacian=laplacian, eigensolver=eigensolver)
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,10 @@ from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpai
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples, poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
+from jaxsmw.runtime.progress import Step, no_step
 from jaxsmw.runtime.threads import side_by_side
+
+Computed = TypeVar("Computed")
 
 # A mesh with more than `_COMPARED_FROM` vertices is reduced to about `_COMPARED` samples. Descriptors
 # cannot distinguish two vertices whose distance is below a few hundredths of the square root of the area.
@@ -123,6 +126,7 @@ def prepare_shapes(
     *,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
+    step: Step = no_step,
 ) -> list[PreparedShape]:
     """Compute the spectra, crease eigenvectors and samples of shapes; two shapes side by side.
 
@@ -132,6 +136,7 @@ def prepare_shapes(
     - `sizes`: the numbers of eigenvectors, crease eigenvectors and samples of each shape.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`. All meshes get the same eigensolver, because
       their spectra are compared.
+    - `step`: reports and measures the steps.
 
     **Returns:** One `PreparedShape` per mesh, without descriptors, in units in which its area is 1.
 
@@ -139,45 +144,47 @@ def prepare_shapes(
     """
     if eigensolver == "auto":
         eigensolver = choose_eigensolver(*meshes)
+    pairwise = len(meshes) == 2 and max(len(mesh.vertices) for mesh in meshes) < _ONE_BY_ONE_FROM
 
-    def compute(mesh: Mesh) -> _Arrays:
-        pairs = eigenpairs(mesh, sizes.number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
-        creases = samples = None
-        if sizes.number_of_crease_eigenvectors:
-            creases = crease_eigenvectors(mesh, sizes.number_of_crease_eigenvectors)
-        if sizes.number_of_samples:
-            samples = farthest_point_samples(mesh, sizes.number_of_samples)
-        return _Arrays(*pairs, compared_samples(mesh), creases, samples)
+    def each(compute: Callable[[Mesh], Computed]) -> Sequence[Computed]:
+        return side_by_side(compute, *meshes) if pairwise else [compute(mesh) for mesh in meshes]
 
-    if len(meshes) == 2 and max(len(mesh.vertices) for mesh in meshes) < _ONE_BY_ONE_FROM:
-        computed: Sequence[_Arrays] = side_by_side(compute, *meshes)
-    else:
-        computed = [compute(mesh) for mesh in meshes]
-    # Spectra are made outside of the threads, because threads do not inherit `jax.enable_x64`.
-    return [_shape(mesh, arrays) for mesh, arrays in zip(meshes, computed, strict=True)]
+    number, creases, samples = sizes
+    with step("eigenbases"):
+        pairs = each(lambda mesh: eigenpairs(mesh, number, laplacian=laplacian, eigensolver=eigensolver))
+        # Spectra are made outside of the threads, because threads do not inherit `jax.enable_x64`.
+        shapes = [_shape(mesh, *of_mesh) for mesh, of_mesh in zip(meshes, pairs, strict=True)]
+    if samples:
+        with step("samples"):
+            found = each(lambda mesh: farthest_point_samples(mesh, samples))
+        shapes = [
+            replace(shape, samples=jax.device_put(chosen))
+            for shape, chosen in zip(shapes, found, strict=True)
+        ]
+    if creases:
+        with step("crease eigenvectors"):
+            vectors = each(lambda mesh: crease_eigenvectors(mesh, creases))
+        shapes = [
+            replace(shape, spectrum=shape.spectrum.with_crease_eigenvectors(jax.device_put(columns)))
+            for shape, columns in zip(shapes, vectors, strict=True)
+        ]
+    return shapes
 
 
-class _Arrays(NamedTuple):
-    eigenvalues: Float64[np.ndarray, " k"]
-    eigenvectors: Float64[np.ndarray, "n k"]
-    vertex_areas: Float64[np.ndarray, " n"]
-    compared: SurfaceSamples | None
-    creases: Float[np.ndarray, "n c"] | None
-    samples: Int64[np.ndarray, " s"] | None
-
-
-def _shape(mesh: Mesh, arrays: _Arrays) -> PreparedShape:
-    spectrum = as_spectrum(mesh, arrays.eigenvalues, arrays.eigenvectors, arrays.vertex_areas)
+def _shape(
+    mesh: Mesh,
+    eigenvalues: Float64[np.ndarray, " k"],
+    eigenvectors: Float64[np.ndarray, "n k"],
+    vertex_areas: Float64[np.ndarray, " n"],
+) -> PreparedShape:
+    spectrum = as_spectrum(mesh, eigenvalues, eigenvectors, vertex_areas)
     if np.asarray(spectrum.eigenvalues)[-1] == 0:
         raise InputError(
             f"{mesh.name}: the largest of the {len(spectrum.eigenvalues)} eigenvalues is zero, so the "
             "eigenvectors only distinguish connected components: compute more eigenvectors than the mesh has "
             "components, or join vertices at the same position (weld=True, on the command line --weld)."
         )
-    if arrays.creases is not None:
-        spectrum = spectrum.with_crease_eigenvectors(jax.device_put(arrays.creases))
-    samples = None if arrays.samples is None else jax.device_put(arrays.samples)
-    return PreparedShape(mesh, spectrum, arrays.compared, samples)
+    return PreparedShape(mesh, spectrum, compared_samples(mesh))
 
 
 def compared_samples(mesh: Mesh) -> SurfaceSamples | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 logger = logging.getLogger("jaxsmw")
 
@@ -15,6 +15,15 @@ Progress = Callable[[str, int, int], None]
 
 def no_progress(step: str, done: int, number: int) -> None:
     """Report nothing; a `Progress`."""
+
+
+Step = Callable[[str], AbstractContextManager[None]]
+"""A function that takes the name of a step, and returns the context in which the step runs."""
+
+
+def no_step(name: str) -> AbstractContextManager[None]:
+    """Return a context that reports nothing; a `Step`."""
+    return nullcontext()
 
 
 @contextmanager

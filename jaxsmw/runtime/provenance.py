@@ -1,16 +1,26 @@
-"""The provenance of a result: the versions of the software, the code and the machine."""
+"""The provenance of results: the versions of the software, the code and the machine.
+
+All results in a directory are made with the same settings and software versions; see `claimed_directory`.
+"""
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import atomic_write, can_lock
 
 _PACKAGES = (
     "jaxsmw",
@@ -90,3 +100,93 @@ def _source_digest(source: str) -> str:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
             del node.body[0]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+@contextmanager
+def claimed_directory(
+    directory: Path,
+    provenance: Mapping[str, Mapping[str, Any]],
+    noted: Mapping[str, Any] = MappingProxyType({}),
+) -> Iterator[None]:
+    """Lock a directory against other processes while results are added.
+
+    The function is a context manager, and releases the lock at the end of the `with` block. The first call
+    for a directory writes `provenance` to the file `provenance.json`. Later calls check that their argument
+    `provenance` equals the stored provenance.
+
+    **Arguments:**
+
+    - `directory`: an existing directory.
+    - `provenance`: a dictionary from the name of each group, such as `"settings"`, to a dictionary of named
+      values. These values must be the same for all results in the directory.
+    - `noted`: a dictionary of further information that the first call writes to the file. Later calls ignore
+      `noted`.
+
+    **Raises:** `InputError` if the stored provenance differs from `provenance`, or if the directory contains
+    results but no `provenance.json`. `InputError` is also raised if `provenance.json` is damaged, if the
+    directory cannot be locked, or if another process is adding results.
+    """
+    from filelock import FileLock, Timeout  # the import is slow
+
+    if not can_lock(directory):
+        # Some versions of `filelock` would report a lock of another process instead.
+        raise InputError(
+            f"{directory}: cannot be locked, because files cannot be created or locked there: give another "
+            "--output, on a file system with locks."
+        )
+    # The operating system releases the lock even if the process is killed.
+    lock = FileLock(directory / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise InputError(
+            f"{directory}: another process is adding results: wait until this process ends, or give another "
+            "--output."
+        ) from None
+    except OSError as error:
+        raise InputError(
+            f"{directory}: cannot be locked ({error.strerror}): give another --output, or remove the "
+            "directory."
+        ) from error
+    try:
+        _check_origin(directory, provenance, noted)
+        yield
+    finally:
+        lock.release()
+
+
+def _check_origin(
+    directory: Path, provenance: Mapping[str, Mapping[str, Any]], noted: Mapping[str, Any]
+) -> None:
+    path = directory / "provenance.json"
+    wanted = json.loads(json.dumps(provenance))
+    if path.exists():
+        found = _read_provenance(path)
+        found.pop("noted", None)
+        for group in {**found, **wanted}:
+            before, now = found.get(group, {}), wanted.get(group, {})
+            for name in {**before, **now}:
+                if before.get(name) != now.get(name):
+                    raise InputError(
+                        f"{directory}: contains results with {name} = {before.get(name)} ({group}), but this "
+                        f"run has {name} = {now.get(name)}: give another --output, or remove the directory."
+                    )
+    elif any(directory.glob("*.csv")):
+        raise InputError(
+            f"{directory}: contains results of unknown origin, because provenance.json is missing: give "
+            "another --output."
+        )
+    else:
+        contents = {**wanted, "noted": dict(noted)} if noted else wanted
+        with atomic_write(path) as temporary:
+            temporary.write_text(json.dumps(contents, indent=2) + "\n", "utf-8")
+
+
+def _read_provenance(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or not all(isinstance(group, dict) for group in found.values()):
+        raise InputError(f"{path}: the file is damaged: give another --output, or remove its directory.")
+    return found

@@ -12,12 +12,12 @@ from frame_study.measurement import DATA_SETS, INVARIANCE_FRAMES, PairName, Sett
 from frame_study.summary import Study
 from frame_study.variants import ABLATIONS, CONVENTIONS, UPDATES, Variant, frames
 from jaxsmw import compute_spectrum
+from jaxsmw.benchmark.journal import Row
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps, save_figure
 from jaxsmw.report.rendering import camera_axes, choose_azimuth
 from jaxsmw.report.standing import stand
 from jaxsmw.report.summary import draw_bank
-from jaxsmw.runtime.journal import Row
 
 
 def draw_figures(output: Path, data: Path, study: Study, parameters: Sequence[Row]) -> None:

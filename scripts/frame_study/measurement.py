@@ -26,6 +26,7 @@ from frame_study.variants import (
     tabulate,
 )
 from jaxsmw import read_mesh
+from jaxsmw.benchmark.journal import Row
 from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
@@ -40,7 +41,6 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import paired_spectra
 from jaxsmw.matching.starts import initial_map
-from jaxsmw.runtime.journal import Row
 
 DATA_SETS = ("faust_r", "tosca_r")
 # Shapes are padded to a multiple of this number of vertices, so that all shapes of a data set share one

@@ -12,8 +12,8 @@ from jaxtyping import Float64
 from frame_study.measurement import INVARIANCE_FRAMES, MOVE, SEARCH, PairName, Settings
 from frame_study.variants import CONVENTIONS, DEFAULT, GAINS, UPDATES, Variant
 from jaxsmw.benchmark.intervals import CONFIDENCE, RESAMPLES, Interval, mean_interval
+from jaxsmw.benchmark.journal import Row
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.runtime.journal import Row
 
 SETTLED = 0.05
 """A map settles in the first iteration that moves less than this share of the matches."""

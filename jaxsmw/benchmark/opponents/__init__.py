@@ -3,11 +3,9 @@
 The modules of this package are:
 
 - `base`: the input of a method (`MethodInput`) and the interface of a method (`Method`).
-- `initial_map`: the initial map without refinement.
-- `presets`: this library's own methods.
-- `published_maps`: methods that read the maps of other programs from files.
-- `spectral_icp`, `zoomout`, `smooth_shells`, `cpd`, `partial_functional_maps`: methods by other authors,
-  reimplemented here.
+- `baselines`: the initial map without refinement, this library's own methods, spectral ICP and ZoomOut, and
+  methods that read the maps of other programs from files.
+- `smooth_shells`, `cpd`, `partial_functional_maps`: methods by other authors, reimplemented here.
 - `peers`: methods of other libraries, if these are installed.
 - `registry`: the name of each method on the command line and in results.
 

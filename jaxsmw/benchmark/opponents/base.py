@@ -6,19 +6,26 @@ All methods receive the same prepared pair, with the same spectra, the same init
 from __future__ import annotations
 
 import abc
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from jaxtyping import Array, Int
+import jax
+import numpy as np
+from jaxtyping import Array, Int, Int64
 
 from jaxsmw.benchmark.datasets import DataPair
-from jaxsmw.core.results import RESULTS
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MATCH_INIT
+from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.matching.executor import SpectralPair, Start, padded_map
-from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.executor import SpectralPair, padded_map
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.shapes import Sizes
 from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.starts import make_start
 
 MOST_SAMPLES = 1000
 """The number of samples of each shape in a prepared pair. No method uses more samples.
@@ -26,6 +33,8 @@ MOST_SAMPLES = 1000
 If a shape has fewer referenced vertices, both shapes have the same smaller number of samples. This is the
 number of referenced vertices of the shape with the fewest.
 """
+
+PointwiseMap = Int[Array, " m"] | Int[np.ndarray, " m"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +52,7 @@ class MethodInput:
     - `names`: the names of X and Y, for methods that read maps from files.
     - `partial`: whether X and Y are a partial pair, that is, one shape is a part of the other shape. The
       spectra of a partial pair are comparable only in their common range of eigenvalues.
-    - `prepared`: the `PreparedPair` from which this input was created, for methods that run a preset.
+    - `init`: the initial map as the argument `init` of `jaxsmw.match`, for methods that call `match`.
     """
 
     spectrum_x: Spectrum
@@ -53,29 +62,42 @@ class MethodInput:
     meshes: tuple[Mesh, Mesh] | None = None
     names: tuple[str, str] = ("X", "Y")
     partial: bool = False
-    prepared: PreparedPair | None = None
+    init: str | Int64[np.ndarray, " vertices"] = DEFAULT_MATCH_INIT
 
     @classmethod
-    def of(cls, prepared: PreparedPair, start: Start, names: tuple[str, str]) -> MethodInput:
-        """Create the input of all methods from a prepared pair.
+    def prepare(
+        cls,
+        pair: Pair,
+        *,
+        names: tuple[str, str] = ("X", "Y"),
+        init: str | Int64[np.ndarray, " vertices"] = DEFAULT_MATCH_INIT,
+        number_of_eigenvectors: int,
+        number_of_descriptors: int = 0,
+    ) -> MethodInput:
+        """Compute the input that all methods share: spectra, descriptors, the initial map and samples.
 
         **Arguments:**
 
-        - `prepared`: the prepared pair, with samples.
-        - `start`: the initial map.
-        - `names`: the names of X and Y.
+        - `pair`: the source X (m vertices) and the target Y (n vertices).
+        - `names`, `init`: the attributes of the same names. With `"auto"`, the initial map is `"shot"`.
+        - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1.
+        - `number_of_descriptors`: the number of principal components of SHOT; 0 for no descriptors.
+
+        **Returns:** A `MethodInput`, padded like the arrays of `jaxsmw.match`.
+
+        **Raises:** `InputError` if a spectrum, a descriptor or the initial map cannot be computed;
+        `ArithmeticError` if the computation of the initial map fails numerically.
         """
+        automatic = isinstance(init, str) and init == DEFAULT_MATCH_INIT
+        samples = min(MOST_SAMPLES, pair.fewest_vertices())
+        prepared = prepare(pair, Sizes(number_of_eigenvectors, number_of_samples=samples))
+        start = make_start(prepared, DEFAULT_INITIAL_MAP if automatic else init)
+        if number_of_descriptors:
+            prepared = prepared.describe(number_of_descriptors)
         spectra = prepared.spectra.padded
         assert spectra.samples is not None
-        return cls(
-            *spectra.both,
-            padded_map(start.pointwise_map),
-            spectra.samples,
-            prepared.pair.meshes,
-            names,
-            prepared.pair.partial,
-            prepared,
-        )
+        first = padded_map(start.pointwise_map)
+        return cls(*spectra.both, first, spectra.samples, pair.meshes, names, pair.partial, init)
 
     def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
         """Return both spectra as a stage sees them; see `SpectralPair.seen_by`.
@@ -88,10 +110,7 @@ class MethodInput:
         return spectra.seen_by(stage).both
 
     def truncated(self, k: int) -> tuple[Spectrum, Spectrum]:
-        """Return both spectra with their first k eigenvectors.
-
-        The spectra of a partial pair are also cut to their common range of eigenvalues.
-        """
+        """Return both spectra with their first k eigenvectors; see `seen_in`."""
         return self.seen_in(Stage(number_of_eigenvectors=k))
 
     def sampled(self, count: int | None) -> tuple[Int[Array, " s_x"] | None, Int[Array, " s_y"] | None]:
@@ -122,12 +141,20 @@ class Method(abc.ABC):
     partial_only: bool = False
 
     @abc.abstractmethod
-    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Return the pointwise map X -> Y (m,), 0-based vertices of Y, and the status code (`RESULTS`).
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
+        """Return the pointwise map X -> Y (m,), 0-based vertices of Y, which may be padded.
 
-        If the status code is not `RESULTS.successful`, the map is invalid. After a failure, most methods
-        return -1 for all vertices.
+        **Raises:** `ArithmeticError` if the method fails numerically.
         """
+
+    def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
+        """Return the map of `__call__`, and the seconds from the initial map to this map.
+
+        The seconds are NaN if the map was computed elsewhere.
+        """
+        began = time.perf_counter()
+        found = jax.block_until_ready(self(pair))
+        return found, time.perf_counter() - began
 
     def check(self, pairs: Sequence[DataPair]) -> None:
         """Check that the method can match all pairs. A benchmark calls `check` before it matches any pair.
@@ -147,6 +174,13 @@ class Method(abc.ABC):
         """Return whether the method can match all pairs. Unlike `check`, `suits` does not look for files."""
         partial = [pair.partial for pair in pairs]
         return not (self.full_only and any(partial)) and not (self.partial_only and not all(partial))
+
+
+def successful(pointwise_map: Int[Array, " m"], result: RESULTS) -> Int[Array, " m"]:
+    """Return the map of a refinement. Raise `ArithmeticError` if its status code is not `successful`."""
+    if result != RESULTS.successful:
+        raise ArithmeticError(sentence(result))
+    return pointwise_map
 
 
 def check_spectrum(mesh: Mesh, spectrum: Spectrum) -> None:

@@ -55,7 +55,7 @@ import jax.scipy as jsp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.benchmark.opponents.presets import Refined
+from jaxsmw.benchmark.opponents.baselines import Refined
 from jaxsmw.core.banks import FilterBank, Identity
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.products import product
@@ -283,7 +283,7 @@ def _drift(
     factor = kernel_factor(y, centroids_mask, width=width, rank=rank)
     d, points = data.shape[1], jnp.sum(data_mask).astype(x.dtype)
 
-    def step(state: _State) -> _State:
+    def step(state: _DriftState) -> _DriftState:
         moved = y + product(factor, state.coefficients)
         expected = _expectation(x, data_mask, moved, centroids_mask, state.variance, outliers)
         objective = (
@@ -292,7 +292,7 @@ def _drift(
             - expected.log_likelihood
         )
         coefficients = _maximization(expected, y, factor, stiffness * state.variance)
-        return _State(
+        return _DriftState(
             coefficients,
             _variance(expected, x, y + product(factor, coefficients)),
             objective,
@@ -300,12 +300,12 @@ def _drift(
             iterations=state.iterations + 1,
         )
 
-    def goes_on(state: _State) -> Bool[Array, ""]:
+    def goes_on(state: _DriftState) -> Bool[Array, ""]:
         drifting = (state.change > tolerance) & (state.variance > _LEAST_VARIANCE)
         return drifting & (state.iterations < iterations)
 
     infinite = jnp.asarray(jnp.inf, x.dtype)
-    initial = _State(
+    initial = _DriftState(
         jnp.zeros((rank, d), x.dtype),
         # The initial variance is the mean squared distance between data and centroids, divided by d. This
         # value is 2 / d, because both sets have zero mean and a mean squared norm of 1.
@@ -319,12 +319,8 @@ def _drift(
     return Drift(moved, end.variance, end.iterations)
 
 
-class _State(NamedTuple):
-    """The state of EM between two iterations.
-
-    `objective` is the value of the objective before the most recent M-step. `change` is the relative change
-    of `objective` in the most recent iteration.
-    """
+class _DriftState(NamedTuple):
+    """The state of EM; `objective` is its value before the last M-step, and `change` its relative change."""
 
     coefficients: Float[Array, "rank d"]
     variance: Float[Array, ""]
@@ -334,10 +330,7 @@ class _State(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """The result of the E-step: the log-likelihood, and sums over the probabilities P (n, m).
-
-    `weighted_data` is `P X`, `per_centroid` is `P 1`, and `per_point` is `P^T 1`.
-    """
+    """The result of the E-step: `P X`, `P 1` and `P^T 1` for the probabilities P, and the log-likelihood."""
 
     weighted_data: Float[Array, "n d"]
     per_centroid: Float[Array, " n"]
@@ -348,10 +341,7 @@ class _Expected(NamedTuple):
 def _normalized(
     points: Float[Array, "n d"], mask: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n d"], Float[Array, " d"], Float[Array, ""]]:
-    """Shift and scale points to zero mean and mean squared norm 1. Masked points become zero.
-
-    **Returns:** The new points, the mean of the given points, and the scale by which they were divided.
-    """
+    """Return points of zero mean and mean squared norm 1, the mean of the given points, and their scale."""
     count = jnp.sum(mask).astype(points.dtype)
     mean = jnp.sum(jnp.where(mask[:, None], points, 0), axis=0) / count
     centered = jnp.where(mask[:, None], points - mean[None, :], 0)

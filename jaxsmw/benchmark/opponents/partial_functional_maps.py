@@ -76,7 +76,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Int32
 
-from jaxsmw.benchmark.opponents.base import Method, MethodInput, check_spectrum
+from jaxsmw.benchmark.opponents.base import (
+    Method,
+    MethodInput,
+    PointwiseMap,
+    check_spectrum,
+    successful,
+)
 from jaxsmw.core.checks import all_finite
 from jaxsmw.core.functional_map import dual_eigenvectors, encode
 from jaxsmw.core.pointwise_map import decode
@@ -242,25 +248,14 @@ def partial_functional_map(
 
 
 class _Energies(eqx.Module):
-    """The data of one pair, with methods that minimise the energy over C and over v.
-
-    **Attributes:**
-
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y. The spectrum of X contains r eigenvectors, and r is
-      at most k_Y.
-    - `gradient_y`: the gradient of functions on Y.
-    - `dual_y`: the dual eigenvectors of Y (n, k_Y), whose transpose is Phi_Y^+.
-    - `coefficients_x`: A (r, functions), the coefficients of the descriptors and of the constant function on
-      X.
-    - `functions_y`: G (n, functions), the descriptors and the constant function on Y.
-    """
+    """The data of one pair, with methods that minimise the energy over C and over v."""
 
     spectrum_x: Spectrum
     spectrum_y: Spectrum
     gradient_y: SurfaceGradient
-    dual_y: Float[Array, "n k_y"]
-    coefficients_x: Float[Array, "r functions"]
-    functions_y: Float[Array, "n functions"]
+    dual_y: Float[Array, "n k_y"]  # its transpose is Phi_Y^+
+    coefficients_x: Float[Array, "r functions"]  # A
+    functions_y: Float[Array, "n functions"]  # G
 
     @classmethod
     def of(cls, spectrum_x: Spectrum, spectrum_y: Spectrum, gradient_y: SurfaceGradient) -> _Energies:
@@ -416,11 +411,7 @@ def _smoothed_norm(vectors: Float[Array, "a b"], *, axis: int) -> Float[Array, "
 def _spectral_icp(
     functional_map: Float[Array, "k_x k_y"], spectrum_x: Spectrum, spectrum_y: Spectrum, steps: int
 ) -> Float[Array, "k_x k_y"]:
-    """Refine C by `steps` steps of spectral ICP, which is also the final refinement in the paper.
-
-    Each step searches for nearest neighbours, encodes the matches as a functional map, and replaces this map
-    by the nearest matrix with orthonormal rows.
-    """
+    """Refine C by `steps` steps of spectral ICP, which is also the final refinement in the paper."""
 
     def step(c: Float[Array, "k_x k_y"], nothing: None) -> tuple[Float[Array, "k_x k_y"], None]:
         matched = encode(decode(c, spectrum_x, spectrum_y), spectrum_x, spectrum_y)
@@ -437,10 +428,7 @@ def _minimum(
     tolerance: float,
     steps: int,
 ) -> Float[Array, " ..."]:
-    """Minimise an energy by at most `steps` steps of L-BFGS, and return the final point.
-
-    No error is raised if the minimum is not reached.
-    """
+    """Return the point after at most `steps` steps of L-BFGS, even if it is not a minimum."""
     import optimistix as optx  # optimistix is imported here because its import is slow
 
     solver: optx.LBFGS = optx.LBFGS(tolerance, tolerance)
@@ -462,8 +450,7 @@ class PartialFunctionalMaps(Method):
     iterations: int = 5
     partial_only: bool = True
 
-    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Return the map X -> Y and the status code; see `Method`."""
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
         assert pair.meshes is not None
         spectra = pair.seen_in(
             Stage(
@@ -475,7 +462,7 @@ class PartialFunctionalMaps(Method):
         found = compiled(partial_functional_map)(
             *spectra, gradient, pair.initial_map, iterations=self.iterations
         )
-        return found.pointwise_map, found.result
+        return successful(found.pointwise_map, found.result)
 
 
 PARTIAL_FUNCTIONAL_MAPS = PartialFunctionalMaps(

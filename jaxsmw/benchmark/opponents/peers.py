@@ -5,7 +5,7 @@ The methods need optional packages, and are available only if these packages are
     pip install 'jaxsmw[benchmark,peers]'
 
 `PyFM` and `Geomfum` receive the same spectra and initial maps as all other compared methods, and run on the
-same number of cores. Both methods use the settings of the ZoomOut paper (see `zoomout`): the number of
+same number of cores. Both methods use the settings of the ZoomOut paper (see `baselines`): the number of
 eigenvectors k is 20, 25, ..., 120, and every iteration uses all vertices.
 
 - `PyFM` calls the function `zoomout_refine` of Robin Magnet's pyFM (`pyfmaps` on the package index) with
@@ -17,15 +17,12 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from importlib.util import find_spec
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float64, Int, Int64
+from jaxtyping import Float64, Int64
 
-from jaxsmw.benchmark.opponents.base import Method, MethodInput
-from jaxsmw.benchmark.opponents.zoomout import FIRST_EIGENVECTORS, LAST_EIGENVECTORS, ZOOMOUT_STEP
-from jaxsmw.core.results import RESULTS
+from jaxsmw.benchmark.opponents.base import Method, MethodInput, PointwiseMap
+from jaxsmw.benchmark.opponents.baselines import ZOOMOUT
 from jaxsmw.core.spectrum import Spectrum
 
 
@@ -41,17 +38,16 @@ class Peer(Method):
     - `package`: the name under which the other library is imported.
     """
 
-    number_of_eigenvectors = LAST_EIGENVECTORS
+    number_of_eigenvectors = ZOOMOUT.number_of_eigenvectors
     full_only = True
     package: str
 
-    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Return the map X -> Y and the status code; see `Method`."""
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
         x, y = (_Shape.of(spectrum) for spectrum in (pair.spectrum_x, pair.spectrum_y))
         initial_map = np.searchsorted(y.vertices, np.asarray(pair.initial_map)[x.vertices])
         found = np.zeros(pair.initial_map.shape, np.int32)
         found[x.vertices] = y.vertices[self.refine(initial_map, x, y)]
-        return jnp.asarray(found), RESULTS.successful  # type: ignore[return-value]
+        return found
 
     @abc.abstractmethod
     def refine(self, initial_map: Int64[np.ndarray, " u"], x: _Shape, y: _Shape) -> Int64[np.ndarray, " u"]:
@@ -66,15 +62,7 @@ class Peer(Method):
 
 @dataclass(frozen=True, eq=False)
 class _Shape:
-    """The spectrum of a shape at its u referenced vertices, converted to float64 for other libraries.
-
-    **Attributes:**
-
-    - `vertices`: the indices of the referenced vertices in the mesh (u,).
-    - `eigenvalues`: the eigenvalues (k,).
-    - `eigenvectors`: the eigenvectors (u, k).
-    - `areas`: the vertex areas (u,).
-    """
+    """The spectrum of a shape at its u referenced vertices, converted to float64 for other libraries."""
 
     vertices: Int64[np.ndarray, " u"]
     eigenvalues: Float64[np.ndarray, " k"]
@@ -103,8 +91,8 @@ class PyFM(Peer):
         areas = diags_array(x.areas).tocsr()
         first = p2p_to_FM(
             initial_map,
-            y.eigenvectors[:, :FIRST_EIGENVECTORS],
-            x.eigenvectors[:, :FIRST_EIGENVECTORS],
+            y.eigenvectors[:, : ZOOMOUT.first],
+            x.eigenvectors[:, : ZOOMOUT.first],
             A2=areas,
         )
         _, found = zoomout_refine(
@@ -112,7 +100,7 @@ class PyFM(Peer):
             y.eigenvectors,
             x.eigenvectors,
             nit=_STEPS,
-            step=ZOOMOUT_STEP,
+            step=ZOOMOUT.step,
             A2=areas,
             return_p2p=True,
             n_jobs=1,
@@ -132,15 +120,11 @@ class Geomfum(Peer):
         from geomfum.refine import ZoomOut
 
         bases = [EigenBasis(shape.eigenvalues, shape.eigenvectors) for shape in (y, x)]
-        first = FmFromP2pConverter()(initial_map, *(basis.truncate(FIRST_EIGENVECTORS) for basis in bases))
-        refined = ZoomOut(nit=_STEPS, step=ZOOMOUT_STEP)(first, *bases)
+        first = FmFromP2pConverter()(initial_map, *(basis.truncate(ZOOMOUT.first) for basis in bases))
+        refined = ZoomOut(nit=_STEPS, step=ZOOMOUT.step)(first, *bases)
         return np.asarray(P2pFromFmConverter()(refined, *bases))
 
 
-_STEPS = (LAST_EIGENVECTORS - FIRST_EIGENVECTORS) // ZOOMOUT_STEP
+_STEPS = (ZOOMOUT.number_of_eigenvectors - ZOOMOUT.first) // ZOOMOUT.step
 
-
-def installed_peers() -> dict[str, Method]:
-    """Return the methods whose packages are installed, as a dictionary from name to method."""
-    peers: dict[str, Peer] = {"pyfm-zoomout": PyFM(), "geomfum-zoomout": Geomfum()}
-    return {name: peer for name, peer in peers.items() if find_spec(peer.package)}
+PYFM, GEOMFUM = PyFM(), Geomfum()

@@ -1,46 +1,70 @@
-"""The names of the compared methods on the command line and in results."""
+"""The names of the compared methods on the command line and in results.
+
+A method is imported when it is looked up, so the help text of the command line shows all names without JAX.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from jaxsmw.benchmark.datasets import DataPair
-from jaxsmw.benchmark.opponents.base import Method
-from jaxsmw.benchmark.opponents.cpd import CPD
-from jaxsmw.benchmark.opponents.initial_map import UNREFINED
-from jaxsmw.benchmark.opponents.partial_functional_maps import PARTIAL_FUNCTIONAL_MAPS
-from jaxsmw.benchmark.opponents.peers import installed_peers
-from jaxsmw.benchmark.opponents.presets import ACCURATE, MWP, MWP_SAMPLED
-from jaxsmw.benchmark.opponents.published_maps import PublishedMaps
-from jaxsmw.benchmark.opponents.smooth_shells import SMOOTH_SHELLS
-from jaxsmw.benchmark.opponents.spectral_icp import NO_FILTER, SPECTRAL_ICP
-from jaxsmw.benchmark.opponents.zoomout import ZOOMOUT, ZOOMOUT_SAMPLED
 from jaxsmw.errors import InputError
 
-METHODS: dict[str, Method] = {
-    "initial": UNREFINED,
-    "mwp": MWP,
-    "accurate": ACCURATE,
-    "mwp-sampled": MWP_SAMPLED,
-    "no-filter": NO_FILTER,
-    "icp": SPECTRAL_ICP,
-    "cpd": CPD,
-    "smooth-shells": SMOOTH_SHELLS,
-    "pfm": PARTIAL_FUNCTIONAL_MAPS,
-    "zoomout": ZOOMOUT,
-    "zoomout-sampled": ZOOMOUT_SAMPLED,
-}
-"""A dictionary from names to the methods that need no other library, in the order of the rows of tables."""
+if TYPE_CHECKING:
+    from jaxsmw.benchmark.opponents.base import Method
+    from jaxsmw.benchmark.opponents.peers import Peer
 
-MOST_EIGENVECTORS = max(method.number_of_eigenvectors for method in METHODS.values())
-"""The largest number of eigenvectors that any of `METHODS` uses."""
+MethodT = TypeVar("MethodT")
+
+
+class Methods(Mapping[str, MethodT], Generic[MethodT]):
+    """A mapping from names to methods, made from a dictionary of the places where the methods are defined."""
+
+    def __init__(self, places: Mapping[str, str]) -> None:
+        self._places = places
+
+    def __getitem__(self, name: str) -> MethodT:
+        return resolve_name(f"{__package__}.{self._places[name]}")
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._places
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+
+METHODS: Methods[Method] = Methods(
+    {
+        "initial": "baselines:UNREFINED",
+        "mwp": "baselines:MWP",
+        "accurate": "baselines:ACCURATE",
+        "mwp-sampled": "baselines:MWP_SAMPLED",
+        "no-filter": "baselines:NO_FILTER",
+        "icp": "baselines:SPECTRAL_ICP",
+        "cpd": "cpd:CPD",
+        "smooth-shells": "smooth_shells:SMOOTH_SHELLS",
+        "pfm": "partial_functional_maps:PARTIAL_FUNCTIONAL_MAPS",
+        "zoomout": "baselines:ZOOMOUT",
+        "zoomout-sampled": "baselines:ZOOMOUT_SAMPLED",
+    }
+)
+"""The methods that need no other library, in the order of the rows of tables."""
+
+PEERS: Methods[Peer] = Methods({"pyfm-zoomout": "peers:PYFM", "geomfum-zoomout": "peers:GEOMFUM"})
+"""The methods of other libraries, which a benchmark can measure if the libraries are installed."""
 
 
 def known_methods() -> dict[str, Method]:
     """Return `METHODS` and the methods of other installed libraries, as a dictionary from name to method."""
-    return METHODS | installed_peers()
+    return {**METHODS, **{name: peer for name, peer in PEERS.items() if find_spec(peer.package)}}
 
 
 def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
@@ -62,6 +86,8 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
     **Raises:** `InputError` if a name is neither a known method nor a directory, or if two methods would have
     the same name.
     """
+    from jaxsmw.benchmark.opponents.baselines import PublishedMaps
+
     known, found = known_methods(), {}
     for name in dict.fromkeys(names):
         if name in known:

@@ -45,11 +45,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Float64, Int, Int64
+from jaxtyping import Float, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from jaxsmw.benchmark.opponents.base import Method, MethodInput
-from jaxsmw.core.results import RESULTS
+from jaxsmw.benchmark.opponents.base import Method, MethodInput, PointwiseMap
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
@@ -80,41 +79,29 @@ _RIDGE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
-    """A shape of area 1 without unreferenced vertices. Its center is the origin.
-
-    **Attributes:**
-
-    - `mesh`: the mesh, with n vertices and f faces.
-    - `positions`: the positions of the vertices (n, 3).
-    - `eigenvalues`, `eigenvectors`: the eigenvalues (k,) and the eigenvectors (n, k).
-    - `dual`: the eigenvectors multiplied by the vertex areas (n, k). `dual.T` computes coefficients.
-    - `descriptors`: the descriptors (n, c), each with mean square 1.
-    - `differences`: a sparse matrix (e, n). Row e is the difference between the ends of edge e.
-    - `weights`: the cotangent weight of each edge (e,), which is positive.
-    """
+class _UnitSurface:
+    """A shape of area 1 without unreferenced vertices. Its center is the origin."""
 
     mesh: Mesh
     positions: Float64[np.ndarray, "n 3"]
     eigenvalues: Float64[np.ndarray, " k"]
     eigenvectors: Float64[np.ndarray, "n k"]
-    dual: Float64[np.ndarray, "n k"]
-    descriptors: Float64[np.ndarray, "n c"]
-    differences: sp.csr_array
-    weights: Float64[np.ndarray, " e"]
+    dual: Float64[np.ndarray, "n k"]  # `dual.T` computes coefficients
+    descriptors: Float64[np.ndarray, "n c"]  # with mean square 1
+    differences: sp.csr_array  # row e (e, n) is the difference between the ends of edge e
+    weights: Float64[np.ndarray, " e"]  # cotangent weights
 
     @classmethod
-    def of(cls, mesh: Mesh, descriptors: Float[np.ndarray, "n c"], number_of_eigenvectors: int) -> _Surface:
-        """Compute the `_Surface` of a mesh in which all vertices are referenced.
-
-        Edges with negative weights are left out (our choice), because the energy would otherwise have no
-        minimum.
-        """
+    def of(
+        cls, mesh: Mesh, descriptors: Float[np.ndarray, "n c"], number_of_eigenvectors: int
+    ) -> _UnitSurface:
+        """Compute the `_UnitSurface` of a mesh in which all vertices are referenced."""
         spectrum = compute_spectrum(mesh, number_of_eigenvectors)
         areas = np.asarray(spectrum.vertex_areas, np.float64)
         eigenvectors = np.asarray(spectrum.eigenvectors, np.float64)
         positions = mesh.vertices / np.sqrt(mesh.area)
         above = sp.coo_array(sp.triu(assemble_laplacian(mesh)[0], 1))
+        # Edges with negative weights are left out (our choice). With them, the energy would have no minimum.
         kept = above.data < 0
         ends = np.stack([above.row[kept], above.col[kept]], axis=1)
         rows = np.repeat(np.arange(len(ends)), 2)
@@ -169,15 +156,7 @@ class _Surface:
 
 
 class _Shell(NamedTuple):
-    """The smooth shell of level K at s vertices, which are all vertices or samples.
-
-    **Attributes:**
-
-    - `eigenvalues`, `eigenvectors`: the first K eigenvalues (K,), and the eigenvectors (s, K).
-    - `dual`: a matrix (s, K). `dual.T` computes the coefficients of functions.
-    - `positions`, `normals`, `descriptors`: the smooth positions (s, 3), their normals (s, 3), and the
-      descriptors (s, c).
-    """
+    """The smooth shell of level K at s vertices, which are all vertices or samples."""
 
     eigenvalues: Float64[np.ndarray, " K"]
     eigenvectors: Float64[np.ndarray, "s K"]
@@ -213,12 +192,9 @@ class _Shell(NamedTuple):
     def coefficients_after(
         self, targets: Float64[np.ndarray, "s 3"], rigid: Float64[np.ndarray, "K 3"]
     ) -> Float64[np.ndarray, "K 3"]:
-        """Return the coefficients of positions near `targets`, whose Laplacian is near another one.
-
-        The positions p minimise `|p - targets|^2` plus `_RIGIDITY` times a Dirichlet energy. `rigid` contains
-        the coefficients of the Laplacian at which the Dirichlet energy alone has its minimum. In the
-        eigenvectors, the linear system is diagonal.
-        """
+        """Return the coefficients of positions that are near `targets` and as rigid as possible."""
+        # The positions p minimise `|p - targets|^2` plus `_RIGIDITY` times a Dirichlet energy, at whose
+        # minimum the Laplacian has the coefficients `rigid`. In the eigenvectors, the system is diagonal.
         fitted = self.dual.T @ targets
         return (fitted + _RIGIDITY * rigid) / (1 + _RIGIDITY * self.eigenvalues[:, None])
 
@@ -298,8 +274,8 @@ def smooth_shells(
     used_x, used_y = (np.flatnonzero(mesh.referenced_vertices) for mesh in (mesh_x, mesh_y))
     count = min(number_of_eigenvectors, len(used_x) - 1, len(used_y) - 1)
     surfaces = (
-        _Surface.of(_without_unreferenced(mesh_x), descriptors_x[used_x], count),
-        _Surface.of(_without_unreferenced(mesh_y), descriptors_y[used_y], count),
+        _UnitSurface.of(_without_unreferenced(mesh_x), descriptors_x[used_x], count),
+        _UnitSurface.of(_without_unreferenced(mesh_y), descriptors_y[used_y], count),
     )
     first = min(_INITIAL, count)
     matches = _refined(surfaces, first, count, _best_matches(surfaces, first, proposals, seed))
@@ -326,10 +302,8 @@ def _levels(first: int, last: int, growth: float) -> Iterator[int]:
 
 
 def _nearest(queries: Float64[np.ndarray, "s d"], database: Float64[np.ndarray, "r d"]) -> np.ndarray:
-    """Return, for each query, the index of the nearest row of the database.
-
-    JAX compiles one program for each size. The columns are therefore padded to a power of two.
-    """
+    """Return, for each query, the index of the nearest row of the database."""
+    # JAX compiles one program for each size.
     columns = 2 ** (queries.shape[1] - 1).bit_length()
     padded = (jnp.asarray(pad_rows(points.T, columns).T, jnp.float32) for points in (queries, database))
     return np.asarray(compiled(nearest_neighbor)(*padded)).astype(np.int64)
@@ -340,7 +314,9 @@ def _mapped(x: _Shell, y: _Shell, matches: Int64[np.ndarray, " s"]) -> Float64[n
     return x.dual.T @ y.points[matches]
 
 
-def _best_matches(surfaces: tuple[_Surface, _Surface], last: int, proposals: int, seed: int) -> _Matches:
+def _best_matches(
+    surfaces: tuple[_UnitSurface, _UnitSurface], last: int, proposals: int, seed: int
+) -> _Matches:
     """Try initial poses on samples, and return the matches of all vertices from the best pose."""
     samples_x, samples_y = (
         farthest_point_samples(surface.mesh, min(number, len(surface.positions)))
@@ -363,14 +339,7 @@ def _best_matches(surfaces: tuple[_Surface, _Surface], last: int, proposals: int
 def _extended(
     x: _Shell, y: _Shell, few_x: _Shell, few_y: _Shell, matches: Int64[np.ndarray, " s"]
 ) -> Int64[np.ndarray, " m"]:
-    """Extend matches of samples to all vertices. The coefficients of the matches give a smooth map.
-
-    **Arguments:**
-
-    - `x`, `y`: the shells of X and Y at all vertices.
-    - `few_x`, `few_y`: the same shells at samples.
-    - `matches`: for each sample of X (s,), a sample of Y.
-    """
+    """Extend matches of samples to all vertices. The coefficients of the matches give a smooth map."""
     mapped = x.eigenvectors @ _mapped(few_x, few_y, matches)
     return _nearest(
         np.hstack([mapped, x.weighted_descriptors]), np.hstack([y.points, y.weighted_descriptors])
@@ -385,12 +354,10 @@ class _Pose(NamedTuple):
 
 
 def _aligned(sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndarray, "3 3"]) -> _Pose:
-    """Align the shells of the samples, level by level, after a rotation of X.
+    """Align the shells of the samples, level by level, after a rotation of X."""
 
-    The rotation of X is known, so the deformation need not estimate rotations (our choice). The deformation
-    is near to the rotated shell in the same Dirichlet energy as in `_refined`.
-    """
-
+    # The rotation of X is known, so the deformation need not estimate rotations (our choice). The deformation
+    # is near to the rotated shell in the same Dirichlet energy as in `_refined`.
     def turned(shell: _Shell, turn: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "s d"]:
         return shell._replace(positions=shell.positions @ turn.T, normals=shell.normals @ turn.T).points
 
@@ -421,7 +388,9 @@ def _aligned(sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndar
     return _Pose(space.energy(matches), matches)
 
 
-def _refined(surfaces: tuple[_Surface, _Surface], first: int, last: int, matches: _Matches) -> _Matches:
+def _refined(
+    surfaces: tuple[_UnitSurface, _UnitSurface], first: int, last: int, matches: _Matches
+) -> _Matches:
     """Align the shells of all vertices, level by level, and return the matches of the last level."""
     moved: list[Float64[np.ndarray, "s 3"]] | None = None
     for level in _levels(first, last, _GROWTH):
@@ -442,21 +411,12 @@ def _refined(surfaces: tuple[_Surface, _Surface], first: int, last: int, matches
 
 
 def _as_rigid_as_possible(
-    surface: _Surface,
+    surface: _UnitSurface,
     shell: _Shell,
     targets: Float64[np.ndarray, "s 3"],
     positions: Float64[np.ndarray, "s 3"],
 ) -> Float64[np.ndarray, "s 3"]:
-    """Move a shell near to target positions, as rigidly as possible (Sorkine, Alexa 2007).
-
-    Two steps alternate: the best rotation of each vertex, and the best positions in the shell's eigenvectors.
-
-    **Arguments:**
-
-    - `surface`, `shell`: the surface and its shell, at all vertices.
-    - `targets`: the positions of the matches.
-    - `positions`: the moved positions of the previous level, from which the first rotations follow.
-    """
+    """Move a shell near to target positions, as rigidly as possible (Sorkine, Alexa 2007)."""
     for _ in range(_ROUNDS):
         rotations = surface.rotations_to(shell.positions, positions)
         rigid = shell.eigenvectors.T @ surface.turned_laplacian(shell.positions, rotations)
@@ -480,8 +440,7 @@ class SmoothShells(Method):
     full_only: bool = True
     last_level: int = 500
 
-    def __call__(self, pair: MethodInput) -> tuple[Int[Array, " m"], RESULTS]:
-        """Return the map X -> Y and the status code; see `Method`."""
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
         assert pair.meshes is not None
         descriptors = []
         for mesh, spectrum in zip(pair.meshes, (pair.spectrum_x, pair.spectrum_y), strict=True):
@@ -490,9 +449,7 @@ class SmoothShells(Method):
                 np.asarray(spectrum.descriptors)[: len(mesh.vertices), : self.number_of_descriptors]
             )
         with recomputing():
-            found = smooth_shells(*pair.meshes, *descriptors, number_of_eigenvectors=self.last_level)
-        padded = pad_rows(found, pair.initial_map.shape[0])
-        return jnp.asarray(padded, jnp.int32), RESULTS.successful  # type: ignore[return-value]
+            return smooth_shells(*pair.meshes, *descriptors, number_of_eigenvectors=self.last_level)
 
 
 SMOOTH_SHELLS = SmoothShells(

@@ -1,0 +1,261 @@
+"""Methods that run on what this library already has, and methods that read the maps of other programs.
+
+- `UNREFINED`: the initial map, from which all other methods start.
+- `MWP`: Algorithm 1 of Hu, Li, Liu, Liu, *Efficient deformable shape correspondence via multiscale spectral
+  manifold wavelets preservation*, CVPR 2021, with the settings of the paper: 100 eigenvectors, a Meyer frame
+  of 6 filters, and 3 iterations. `MWP_SAMPLED` iterates on 500 samples of each shape, similarly to the fast
+  variant of the authors. `NO_FILTER` has the 3 iterations of MWP, without filters.
+- `ACCURATE`: `jaxsmw.match` with the preset `accurate`.
+- `SPECTRAL_ICP`: the iterative refinement of Ovsjanikov, Ben-Chen, Solomon, Butscher, Guibas, *Functional
+  maps: a flexible representation of maps between shapes*, ACM Transactions on Graphics 31(4), 2012. Each of
+  10 iterations encodes the pointwise map as a functional map of size 100, replaces the functional map by the
+  nearest orthogonal matrix, and then searches for nearest neighbours.
+- `ZOOMOUT`: Melzi, Ren, Rodolà, Sharma, Wonka, Ovsjanikov, *ZoomOut: spectral upsampling for efficient shape
+  correspondence*, ACM Transactions on Graphics 38(6), 2019. The iterations have the sizes k = 20, 25, ...,
+  120. `ZOOMOUT_SAMPLED` iterates on 1000 samples of each shape (section 4.3 of the paper).
+- `PublishedMaps`: maps from files `X_Y.map`.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Array, Int, Int64
+
+from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.opponents.base import MOST_SAMPLES, Method, MethodInput, PointwiseMap, successful
+from jaxsmw.core.banks import Identity
+from jaxsmw.core.functional_map import encode
+from jaxsmw.core.pointwise_map import decode
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiner import Refiner
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.solutions import Filtering, NearestOrthogonal
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.io.map_files import read_pointwise_map
+from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.match import match
+from jaxsmw.matching.presets import PRESETS, PresetName
+from jaxsmw.matching.stages import Stage
+from jaxsmw.runtime.cache import recomputing
+from jaxsmw.runtime.compilation import compiled
+
+
+@dataclass(frozen=True)
+class Unrefined(Method):
+    """A method that returns the initial map unchanged."""
+
+    reference: str = "the initial map of all other methods, from nearest neighbours in descriptor space"
+    number_of_eigenvectors: int = 1
+
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
+        return pair.initial_map
+
+
+@dataclass(frozen=True)
+class PublishedMaps(Method):
+    """A method that reads the map of each pair from a directory; see `read_published_map`.
+
+    **Attributes:**
+
+    - `directory`: the directory that contains the files `X_Y.map`.
+    - `number_of_eigenvectors`: 1, the smallest number that a benchmark can compute. The method itself uses
+      no eigenvectors.
+    """
+
+    directory: Path
+    number_of_eigenvectors: int = 1
+
+    @property
+    def reference(self) -> str:  # type: ignore[override]
+        """The text that is printed with the results. It contains the name of the directory."""
+        return f"maps in {self.directory.name}, computed elsewhere"
+
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
+        assert pair.meshes is not None
+        return read_published_map(self.directory, pair.names, pair.meshes)
+
+    def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
+        return self(pair), np.nan
+
+    def check(self, pairs: Sequence[DataPair]) -> None:
+        """Check that the directory has a map for each pair.
+
+        **Raises:** `InputError` if a map is missing.
+        """
+        missing = [pair for pair in pairs if not _published_file(self.directory, pair.names).is_file()]
+        if missing:
+            raise InputError(
+                f"{_published_file(self.directory, missing[0].names)}: is missing ({len(missing)} of "
+                f"{len(pairs)} maps are missing): add the maps, or use --pairs FILE with a list of the pairs "
+                "that have maps."
+            )
+
+
+def read_published_map(
+    directory: Path, names: tuple[str, str], meshes: tuple[Mesh, Mesh]
+) -> Int64[np.ndarray, " m"]:
+    """Read the map X -> Y from `X_Y.map`, which contains one vertex of Y per line, counted from 1.
+
+    **Arguments:**
+
+    - `directory`: the directory that contains the file.
+    - `names`: the names of X and Y, which form the file name.
+    - `meshes`: the meshes of X, with m vertices, and of Y.
+
+    **Returns:** The map (m,), 0-based vertices of Y.
+
+    **Raises:** `InputError` if the file is missing or does not fit the meshes.
+    """
+    return read_pointwise_map(_published_file(directory, names), *meshes, index_base=1)
+
+
+def _published_file(directory: Path, names: tuple[str, str]) -> Path:
+    return directory / f"{'_'.join(names)}.map"
+
+
+@dataclass(frozen=True)
+class Refined(Method):
+    """A method that refines the initial map with one refiner and a fixed number of eigenvectors.
+
+    **Attributes:** those of `Method`, and the attributes of `Stage` with the same names.
+    """
+
+    reference: str
+    refiner: Refiner = field(default_factory=WaveletPreservation)
+    number_of_eigenvectors: int = 100
+    iterations: int = 3
+    number_of_samples: int | None = None
+
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
+        stage = Stage(
+            self.refiner,
+            number_of_eigenvectors=self.number_of_eigenvectors,
+            iterations=self.iterations,
+            number_of_samples=self.number_of_samples,
+        )
+        samples = None
+        if (number := self.number_of_samples) is not None:
+            samples = pair.samples[0][:number], pair.samples[1][:number]
+        found = compiled(refine)(
+            *pair.seen_in(stage), pair.initial_map, samples=samples, partial=pair.partial, **stage.settings
+        )
+        return successful(found.pointwise_map, found.result)
+
+
+@dataclass(frozen=True)
+class Matched(Method):
+    """A method that calls `jaxsmw.match` with a preset, on the meshes and the argument `init` of the pair.
+
+    `match` prepares the pair itself. The seconds leave out the steps whose results all methods share:
+    eigenbases, the initial map, descriptors and samples. All other steps count, such as the mirror test,
+    crease eigenvectors, and the spectra of trimmed shapes. Nothing is read from the cache, so all steps take
+    as long as for shapes that were never matched before.
+
+    **Attributes:**
+
+    - `reference`: the publication and the settings, as text; see `Method`.
+    - `preset`: the name of the preset.
+    """
+
+    reference: str
+    preset: PresetName
+
+    @property
+    def number_of_eigenvectors(self) -> int:  # type: ignore[override]
+        """The largest number of eigenvectors that a stage of the preset uses."""
+        return PRESETS[self.preset].sizes.number_of_eigenvectors
+
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
+        return self._match(pair).pointwise_map
+
+    def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
+        with recomputing():
+            found = self._match(pair)
+        return found.pointwise_map, sum(t for step, t in found.seconds.items() if step not in _SHARED_STEPS)
+
+    def _match(self, pair: MethodInput) -> Correspondence:
+        assert pair.meshes is not None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the errors are measured, so suspicions need no message
+            return match(*pair.meshes, preset=self.preset, init=pair.init, partial=pair.partial)
+
+
+# The steps in `Correspondence.seconds` whose results are in `MethodInput`.
+_SHARED_STEPS = {"eigenbases", "initial map", "descriptors", "samples"}
+
+_UNFILTERED = WaveletPreservation(Identity())
+_UNFILTERED_ON_SAMPLES = WaveletPreservation(Identity(), Filtering(pseudo_inverse="least_squares"))
+
+
+@dataclass(frozen=True)
+class ZoomOut(Method):
+    """The method ZoomOut (Melzi et al. 2019), which refines a map with more eigenvectors in each iteration.
+
+    With samples (section 4.3 of the paper), each iteration computes the functional map and the pointwise map
+    from the samples only. After the last iteration, one search finds the matches of all vertices.
+
+    **Attributes:**
+
+    - `reference`: the publication and the settings, as text; see `Method`.
+    - `first`: the size k of the functional map in the first iteration.
+    - `step`: the increase of k after each iteration.
+    - `number_of_eigenvectors`: the largest size k.
+    - `number_of_samples`: the number of samples of each shape; None for all vertices.
+    """
+
+    reference: str
+    first: int = 20
+    step: int = 5
+    number_of_eigenvectors: int = 120
+    number_of_samples: int | None = None
+
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
+        pointwise_map, refiner = pair.initial_map, _UNFILTERED
+        samples_x, samples_y = pair.sampled(self.number_of_samples)
+        if samples_x is not None:
+            refiner, first = _UNFILTERED_ON_SAMPLES, pair.truncated(self.first)
+            functional_map = compiled(encode)(pair.initial_map, *first)
+            pointwise_map = compiled(decode)(functional_map, *_at(first, samples_x, samples_y))
+        for k in range(self.first, self.number_of_eigenvectors + 1, self.step):
+            spectra = _at(pair.truncated(k), samples_x, samples_y)
+            refined = compiled(refine)(*spectra, pointwise_map, refiner=refiner, iterations=1)
+            pointwise_map = refined.pointwise_map
+        if samples_x is not None:
+            pointwise_map = compiled(decode)(refined.functional_map, *pair.truncated(k))
+        return successful(pointwise_map, refined.result)
+
+
+def _at(
+    spectra: tuple[Spectrum, Spectrum],
+    samples_x: Int[Array, " s_x"] | None,
+    samples_y: Int[Array, " s_y"] | None,
+) -> tuple[Spectrum, Spectrum]:
+    """Restrict both spectra to the samples. Without samples, return both spectra unchanged."""
+    if samples_x is None or samples_y is None:
+        return spectra
+    return spectra[0].sample(samples_x), spectra[1].sample(samples_y)
+
+
+UNREFINED = Unrefined()
+MWP = Refined("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations")
+MWP_SAMPLED = Refined("Hu, Li, Liu, Liu 2021: the method mwp, but on 500 samples", number_of_samples=500)
+NO_FILTER = Refined("MWP without filters: k = 100, 3 iterations", WaveletPreservation(Identity()))
+ACCURATE = Matched(
+    "jaxsmw.match with its preset accurate, which continues from the result of mwp", "accurate"
+)
+SPECTRAL_ICP = Refined(
+    "Ovsjanikov et al. 2012, spectral ICP: k = 100, 10 iterations",
+    WaveletPreservation(Identity(), NearestOrthogonal(Filtering())),
+    iterations=10,
+)
+ZOOMOUT = ZoomOut("Melzi et al. 2019: k = 20, 25, ..., 120")
+ZOOMOUT_SAMPLED = ZoomOut(
+    "Melzi et al. 2019: k = 20, 25, ..., 120 on 1000 samples", number_of_samples=MOST_SAMPLES
+)
