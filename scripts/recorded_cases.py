@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "least-squares": {"preset": Stage(LEAST_SQUARES, number_of_eigenvectors=30, stop_when_unchanged=True)},
     "stages": {"preset": STAGES},
     "repaired-stages": {"preset": jaxsmw.Preset(STAGES[:1], STAGES[1:], repair=jaxsmw.RepairSettings())},
-    "large-stages": {"preset": replace(ACCURATE, stages=ACCURATE.large_stages)},
+    "large-stages": {"preset": ACCURATE.large},
     "cotangent": {"laplacian": "cotangent"},
     "robust": {"laplacian": "robust", "preset": "paper"},
     "approximate": {"eigensolver": "approximate"},

@@ -8,8 +8,14 @@ from synthetic import bumpy_mesh
 import jaxsmw
 from jaxsmw import Mesh, Pair, creature_pair, make_mesh, match, paired_spectra
 from jaxsmw.geometry.shot import mirrored_descriptors, shot_descriptors
-from jaxsmw.matching.search.chirality import Hands, decide
-from jaxsmw.matching.settings import ChiralitySettings
+from jaxsmw.matching.search.chirality import (
+    ASYMMETRIC_FROM,
+    ASYMMETRY_DOUBT,
+    DOUBT,
+    MIRRORED_FROM,
+    Hands,
+    decide,
+)
 
 
 @pytest.fixture(scope="module")
@@ -129,13 +135,12 @@ def test_the_hands_of_a_partial_pair_are_not_compared(lump):
 
 
 def test_decisions():
-    settings = ChiralitySettings()
-    clear, near = settings.mirrored_from + 1, settings.mirrored_from + settings.doubt / 2
+    clear, near = MIRRORED_FROM + 1, MIRRORED_FROM + DOUBT / 2
     assert decide(clear, 1.0) == (True, clear, False, True)
     assert decide(-clear, 1.0) == (False, -clear, False, True)
     assert decide(near, 1.0) == (True, near, True, True)
-    assert decide(near - settings.doubt, 1.0) == (False, near - settings.doubt, True, True)
-    nearly_symmetric = settings.asymmetric_from - settings.asymmetry_doubt / 2
+    assert decide(near - DOUBT, 1.0) == (False, near - DOUBT, True, True)
+    nearly_symmetric = ASYMMETRIC_FROM - ASYMMETRY_DOUBT / 2
     assert decide(clear, nearly_symmetric) == (False, clear, True, False)
     assert decide(-clear, nearly_symmetric) == (False, -clear, False, False)
 

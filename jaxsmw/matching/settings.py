@@ -87,22 +87,6 @@ class WrongProbabilitySettings:
 
 
 @dataclass(frozen=True)
-class ExtremitySettings:
-    """The settings of `jaxsmw.matching.search.extremities`. Lengths are in units of the square root of the
-    area.
-
-    **Attributes:**
-
-    - `distance`: the smallest allowed distance between two extremities.
-    - `most`: the largest number of extremities. The number of pairings grows very fast with the number of
-      extremities.
-    """
-
-    distance: float = 0.35
-    most: int = 6
-
-
-@dataclass(frozen=True)
 class AlternativeSettings:
     """The settings of `jaxsmw.matching.search.alternatives`. Lengths are in units of the square root of the
     area.
@@ -114,7 +98,6 @@ class AlternativeSettings:
     - `samples`: the number of samples of each shape.
     - `radii`: a tuple with one entry for each initial map from SHOT alone. Each entry is a tuple of radii,
       which are positive integers in units of 0.06.
-    - `extremities`: the settings of the search for extremities, an `ExtremitySettings`.
     - `compared_pairings`: the largest number of pairings of extremities in the comparison of features. The
       most plausible pairings are compared; see `jaxsmw.matching.search.extremities.plausible_pairings`.
     - `pairings` (Tables R27 and R40): the number of initial maps from pairings of extremities.
@@ -148,7 +131,6 @@ class AlternativeSettings:
 
     samples: int = 1000
     radii: tuple[tuple[int, ...], ...] = ((1,), (1, 2, 4), (2, 4))
-    extremities: ExtremitySettings = ExtremitySettings()
     compared_pairings: int = 64
     pairings: int = 12
     distance_weight: float = 2.25
@@ -305,46 +287,3 @@ class RepairSettings:
 
 WITHOUT_REPAIR = RepairSettings(suspicious=1.25, suspicious_area=1.0, doubtful=1.25)
 """The settings by which `match` judges the map of a preset that has no repair. (Entry R25)"""
-
-
-@dataclass(frozen=True)
-class ChiralitySettings:
-    """The settings of `jaxsmw.matching.search.chirality`, which decides whether X or its mirror image matches
-    Y.
-
-    The evidence is the logarithm of a ratio of distance errors; see `jaxsmw.matching.search.chirality.Hands`.
-    Entries R20 and R21 are in `docs/research_log.md`.
-
-    **Attributes:**
-
-    - `samples`: the approximate number of evenly spread samples of each shape.
-    - `fewest_samples`: if a shape has fewer samples, X itself is matched without a comparison. Fewer samples
-      would not suffice for a regression with 50 features.
-    - `radii` (entry R20): the sets of radii of SHOT, in units of 0.06 times the square root of the area. For
-      each set, coarse maps are computed both from X and from its mirror image. With the usual radius alone,
-      descriptors hardly distinguish a tooth from its mirror image.
-    - `descriptors`, `levels`: the number of descriptors and the levels of the feature regression
-      that refines coarse maps.
-    - `asymmetry_radii` (entry R23): the radii of SHOT when the asymmetry is computed, in the unit of
-      `radii`.
-    - `asymmetric_from` (entry R23): shapes are asymmetric if the mean asymmetry of X and Y is at least this
-      value. If the mean asymmetry is smaller, X itself is matched.
-    - `asymmetry_doubt` (entry R23): evidence is computed if the mean asymmetry is at least
-      `asymmetric_from - asymmetry_doubt`. For shapes that are not asymmetric, the decision is doubtful if the
-      evidence supports the mirror image.
-    - `mirrored_from` (entry R21): for asymmetric shapes, the mirror image of X is matched if the evidence is
-      at least this value.
-    - `doubt` (entry R21): for asymmetric shapes, the decision is doubtful if the difference between the
-      evidence and `mirrored_from` is below this value.
-    """
-
-    samples: int = 1000
-    fewest_samples: int = 100
-    radii: tuple[tuple[int, ...], ...] = ((2, 4, 8), (4, 8))
-    descriptors: int = 30
-    levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20)
-    asymmetry_radii: tuple[int, ...] = (3, 6)
-    asymmetric_from: float = 0.61
-    asymmetry_doubt: float = 0.04
-    mirrored_from: float = 0.05
-    doubt: float = 0.05

@@ -205,7 +205,7 @@ class Alternatives:
         - `shot`: the squared differences of SHOT (s, t) between the s samples of X and the t samples of Y.
         """
         settings = self.settings.alternatives
-        ends = extremities(self.x, settings.extremities), extremities(self.y, settings.extremities)
+        ends = extremities(self.x), extremities(self.y)
         # Limbs of different animals differ in length, so distances are divided by their mean.
         to_ends = [
             proxy.distances[:, of_side.samples] / (proxy.areas @ proxy.distances[:, of_side.samples])

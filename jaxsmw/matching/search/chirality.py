@@ -19,9 +19,27 @@ from jaxsmw.matching.descriptors import principal_components
 from jaxsmw.matching.executor import SpectralPair, Start, reverse_map, run
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.search.proxies import Proxy, distance_error
-from jaxsmw.matching.settings import ChiralitySettings
 from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime.threads import side_by_side
+
+# The approximate number of evenly spread samples of each shape. If a shape has fewer than `_FEWEST` samples,
+# X itself is matched without a comparison, because fewer samples do not suffice for a regression with 50
+# features.
+_SAMPLES, _FEWEST = 1000, 100
+# The sets of radii of SHOT, in units of 0.06 times the square root of the area. For each set, coarse maps are
+# computed both from X and from its mirror image. With the usual radius alone, descriptors hardly distinguish
+# a tooth from its mirror image. (Entry R20 of docs/research_log.md)
+_RADII = ((2, 4, 8), (4, 8))
+# The stage that refines coarse maps.
+_STAGE = Stage(FeatureRegression(levels=(8, 8, 11, 11, 15, 15, 20, 20)), number_of_descriptors=30)
+# The radii of SHOT when the asymmetry is computed. (Entry R23)
+_ASYMMETRY_RADII = (3, 6)
+# Shapes are asymmetric if the mean asymmetry of X and Y is at least `ASYMMETRIC_FROM`. If it is smaller by up
+# to `ASYMMETRY_DOUBT`, the decision is doubtful where the evidence supports the mirror image. (Entry R23)
+ASYMMETRIC_FROM, ASYMMETRY_DOUBT = 0.61, 0.04
+# For asymmetric shapes, the mirror image of X is matched if the evidence is at least `MIRRORED_FROM`. The
+# decision is doubtful if the evidence differs from this value by less than `DOUBT`. (Entry R21)
+MIRRORED_FROM, DOUBT = 0.05, 0.05
 
 
 class Hands:
@@ -46,34 +64,20 @@ class Hands:
 
     - `pair`: two full shapes, the source X (m vertices) and the target Y (n vertices).
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, from `paired_spectra`.
-    - `settings`: the settings of the comparison.
     """
 
-    def __init__(
-        self,
-        pair: Pair,
-        spectrum_x: Spectrum,
-        spectrum_y: Spectrum,
-        settings: ChiralitySettings = ChiralitySettings(),  # noqa: B008 (immutable)
-    ) -> None:
-        self.settings = settings
-        self.stage = Stage(
-            FeatureRegression(levels=settings.levels), number_of_descriptors=settings.descriptors
-        )
-        self.x, self.y = side_by_side(self._proxy, (pair.mesh_x, spectrum_x), (pair.mesh_y, spectrum_y))
+    def __init__(self, pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
+        self.x, self.y = side_by_side(_proxy, (pair.mesh_x, spectrum_x), (pair.mesh_y, spectrum_y))
 
     def decide(self, mirror: Mirror = "auto") -> Decision:
         """Decide whether X or its mirror image is matched.
 
         With `mirror="auto"`, the mirror image is matched if the mean asymmetry of X and Y is large enough,
         and if the evidence supports the mirror image. With `"yes"` and `"no"`, only the asymmetry is
-        computed.
-
-        **Returns:** The decision. With `"auto"`, X itself is matched if a shape has too few samples.
+        computed. With `"auto"`, X itself is matched if a shape has too few samples.
         """
-        settings = self.settings
         given = Decision(mirror == "yes")
-        if min(len(shape.areas) for shape in (self.x, self.y)) < settings.fewest_samples:
+        if min(len(shape.areas) for shape in (self.x, self.y)) < _FEWEST:
             return given
         try:
             with warnings.catch_warnings():
@@ -81,10 +85,10 @@ class Hands:
                 warnings.simplefilter("ignore")
                 asymmetry = self.asymmetry()
                 if mirror != "auto":
-                    return given._replace(asymmetric=asymmetry >= settings.asymmetric_from)
-                if asymmetry < settings.asymmetric_from - settings.asymmetry_doubt:
+                    return given._replace(asymmetric=asymmetry >= ASYMMETRIC_FROM)
+                if asymmetry < ASYMMETRIC_FROM - ASYMMETRY_DOUBT:
                     return given
-                return decide(self.evidence(), asymmetry, settings)
+                return decide(self.evidence(), asymmetry)
         except InputError:  # the samples are too sparse for SHOT
             return given
 
@@ -101,7 +105,7 @@ class Hands:
         return float(np.mean(side_by_side(self._asymmetry, self.x, self.y)))
 
     def _asymmetry(self, shape: Proxy) -> float:
-        shot = self._shot(shape, self.settings.asymmetry_radii)
+        shot = _shot(shape, _ASYMMETRY_RADII)
         # All descriptors have the same norm, so the nearest descriptor has the largest inner product.
         mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
         found = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
@@ -113,7 +117,7 @@ class Hands:
 
         The samples are spread evenly over each shape. The initial maps take each sample to the sample with
         the nearest SHOT descriptor. The SHOT descriptors have large radii. A feature regression with few
-        eigenvectors refines these maps. The comparison is repeated for each set of radii in the settings. If
+        eigenvectors refines these maps. The comparison is repeated for several sets of radii. If
         both maps are wrong, one map can be much better than the other map by chance. Therefore the method
         returns the smallest evidence. The method stops as soon as the evidence is clearly too small to
         support the mirror image.
@@ -123,17 +127,17 @@ class Hands:
         **Raises:** `InputError` if the samples are too sparse for SHOT.
         """
         least = np.inf
-        for radii in self.settings.radii:
+        for radii in _RADII:
             x, mirrored_x, y, _ = self._describe(radii)
             own, mirrored = (self._error(hand, y, *self._map(hand, y)) for hand in (x, mirrored_x))
             least = min(least, _log_ratio(own, mirrored))
-            if least < self.settings.mirrored_from - self.settings.doubt:
+            if least < MIRRORED_FROM - DOUBT:
                 break
         return float(least)
 
     def _describe(self, radii: tuple[int, ...]) -> list[_Hand]:
         """Compute descriptors of four shapes: X, the mirror image of X, Y, and the mirror image of Y."""
-        shot_x, shot_y = side_by_side(lambda shape: self._shot(shape, radii), self.x, self.y)
+        shot_x, shot_y = side_by_side(lambda shape: _shot(shape, radii), self.x, self.y)
         shapes = [self.x, self.x, self.y, self.y]
         shot = [
             np.hstack(descriptors)
@@ -143,7 +147,7 @@ class Hands:
         components = principal_components(
             np.concatenate(shot),
             np.concatenate([shape.areas for shape in shapes]) / len(shapes),
-            self.stage.number_of_descriptors,
+            _STAGE.number_of_descriptors,
         )
         of_hands = np.split(components, np.cumsum([len(rows) for rows in shot])[:-1])
         return [_Hand(*hand) for hand in zip(shapes, shot, of_hands, strict=True)]
@@ -155,26 +159,27 @@ class Hands:
         """Return the sum of the distance errors of a map and of its reverse map."""
         return distance_error(x.shape, y.shape, forward) + distance_error(y.shape, x.shape, backward)
 
-    def _proxy(self, argument: tuple[Mesh, Spectrum]) -> Proxy:
-        mesh, spectrum = argument
-        samples = poisson_disk_samples(mesh, self.settings.samples)
-        return Proxy(mesh, spectrum, samples, mesh.area**0.5)
-
-    def _shot(self, shape: Proxy, radii: tuple[int, ...]) -> list[Float[np.ndarray, "s 352"]]:
-        return [
-            shot_descriptors(shape.mesh, radius=multiple * SHOT_RADIUS, samples=shape.samples)
-            for multiple in radii
-        ]
-
     def _map(self, x: _Hand, y: _Hand) -> tuple[Int64[np.ndarray, " s"], Int64[np.ndarray, " t"]]:
         """Map each sample to the sample with the nearest descriptor, and refine this map.
 
         **Returns:** The refined map (s,) and its reverse map (t,).
         """
         spectra = SpectralPair(x.shape.sampled_spectrum(x.components), y.shape.sampled_spectrum(y.components))
-        (found,) = run([self.stage], [Start(spectra, _nearest(x.shot, y.shot))])
-        seen = spectra.seen_by(self.stage)
-        return found.pointwise_map, reverse_map(self.stage.refiner, seen, found.last.state)
+        (found,) = run([_STAGE], [Start(spectra, _nearest(x.shot, y.shot))])
+        seen = spectra.seen_by(_STAGE)
+        return found.pointwise_map, reverse_map(_STAGE.refiner, seen, found.last.state)
+
+
+def _proxy(argument: tuple[Mesh, Spectrum]) -> Proxy:
+    mesh, spectrum = argument
+    return Proxy(mesh, spectrum, poisson_disk_samples(mesh, _SAMPLES), mesh.area**0.5)
+
+
+def _shot(shape: Proxy, radii: tuple[int, ...]) -> list[Float[np.ndarray, "s 352"]]:
+    return [
+        shot_descriptors(shape.mesh, radius=multiple * SHOT_RADIUS, samples=shape.samples)
+        for multiple in radii
+    ]
 
 
 class _Hand(NamedTuple):
@@ -206,9 +211,9 @@ class Decision(NamedTuple):
       distance errors; see `Hands`. None if no evidence was computed, for example because the shapes are their
       own mirror images.
     - `doubtful`: whether the decision is uncertain. For asymmetric shapes, the decision is uncertain if the
-      evidence is near `mirrored_from`. If the asymmetry is slightly below `asymmetric_from`, the decision is
-      uncertain if the evidence is at least `mirrored_from`. `ChiralitySettings` contains the thresholds.
-    - `asymmetric`: whether the mean asymmetry of X and Y is at least `asymmetric_from`.
+      evidence is near `MIRRORED_FROM`. If the asymmetry is slightly below `ASYMMETRIC_FROM`, the decision is
+      uncertain if the evidence is at least `MIRRORED_FROM`.
+    - `asymmetric`: whether the mean asymmetry of X and Y is at least `ASYMMETRIC_FROM`.
     """
 
     mirrored: bool
@@ -217,20 +222,8 @@ class Decision(NamedTuple):
     asymmetric: bool = False
 
 
-def decide(
-    evidence: float,
-    asymmetry: float,
-    settings: ChiralitySettings = ChiralitySettings(),  # noqa: B008
-) -> Decision:
-    """Decide whether X or its mirror image is matched, from the evidence and the asymmetry.
-
-    **Arguments:**
-
-    - `evidence`: the evidence for the mirror image; see `Hands`.
-    - `asymmetry`: the mean asymmetry of both shapes, from 0 to about 1; see `Hands.asymmetry`.
-    - `settings`: the thresholds.
-    """
-    supported = evidence >= settings.mirrored_from
-    asymmetric = asymmetry >= settings.asymmetric_from
-    near = abs(evidence - settings.mirrored_from) < settings.doubt
+def decide(evidence: float, asymmetry: float) -> Decision:
+    """Decide whether X or its mirror image is matched, from the evidence and the mean asymmetry."""
+    supported, asymmetric = evidence >= MIRRORED_FROM, asymmetry >= ASYMMETRIC_FROM
+    near = abs(evidence - MIRRORED_FROM) < DOUBT
     return Decision(supported and asymmetric, evidence, near if asymmetric else supported, asymmetric)

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from jaxsmw.matching.search.proxies import Proxy
-from jaxsmw.matching.settings import ExtremitySettings
 
 
 class Extremities(NamedTuple):
@@ -30,27 +29,23 @@ class Extremities(NamedTuple):
     remoteness: Float[np.ndarray, " e"]
 
 
-def extremities(
-    proxy: Proxy,
-    settings: ExtremitySettings = ExtremitySettings(),  # noqa: B008 (immutable)
-) -> Extremities:
-    """Find the extremities of a body, such as the ends of its limbs.
+# The smallest distance between two extremities, in units of the square root of the area.
+_DISTANCE = 0.35
+# The largest number of extremities. The number of pairings grows very fast with it.
+_MOST = 6
+
+
+def extremities(proxy: Proxy) -> Extremities:
+    """Find the extremities of a body, such as the ends of its limbs, at most six.
 
     Extremities are the local maxima of the mean squared distance to the whole surface (Hilaga et al. 2001,
     "Topology matching for fully automatic similarity estimation of 3D shapes").
-
-    **Arguments:**
-
-    - `proxy`: the body.
-    - `settings`: the smallest distance between extremities, and the largest number of extremities.
-
-    **Returns:** The `Extremities`, at most `settings.most` of them.
     """
     distances = proxy.distances
     remoteness = np.sqrt(proxy.areas @ distances**2)
-    around = np.where(distances < settings.distance, remoteness, 0).max(axis=1)
+    around = np.where(distances < _DISTANCE, remoteness, 0).max(axis=1)
     ends = np.flatnonzero(remoteness >= around)
-    ends = ends[np.argsort(-remoteness[ends], kind="stable")][: settings.most]
+    ends = ends[np.argsort(-remoteness[ends], kind="stable")][:_MOST]
     unit = max(remoteness[ends].mean(), np.finfo(np.float64).tiny)
     return Extremities(ends, distances[np.ix_(ends, ends)] / unit, remoteness[ends] / unit)
 
