@@ -40,7 +40,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Int
 
 from jaxsmw.collection.pairs import match_pairs, prepare_task
-from jaxsmw.collection.shapes import prepare_described_shapes
+from jaxsmw.collection.shapes import prepare_collection
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import CREATURES, creature
@@ -304,7 +304,7 @@ def errors_of(data: Path, shapes: Shapes, maps: Sequence[np.ndarray]) -> list[fl
 
 def prepared_starts(shapes: Shapes, preset: PresetName) -> list[Start]:
     """Return the starts of all pairs, with initial maps from SHOT."""
-    found, _ = prepare_described_shapes(shapes.meshes, PRESETS[preset])
+    found, _ = prepare_collection(shapes.meshes, PRESETS[preset])
     return [prepare_task(found[i], found[j])[1][0] for i, j in shapes.pairs]
 
 

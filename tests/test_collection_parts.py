@@ -22,7 +22,7 @@ from jaxsmw.collection import (
 )
 from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, find_outliers, triangles
 from jaxsmw.collection.pairs import prepare_task
-from jaxsmw.collection.shapes import prepare_described_shapes, prepare_shape, preset_key
+from jaxsmw.collection.shapes import prepare_collection, prepare_shape, preset_key
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
 from jaxsmw.core.banks import LowPass
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -51,7 +51,7 @@ def test_a_coarse_mesh_is_named_once_with_advice_that_fits():
     bodies = [replace(creature("biped", vertices=500, seed=seed), name=f"body {seed}") for seed in range(2)]
     with warnings.catch_warnings(record=True) as issued:
         warnings.simplefilter("always")
-        shapes, _ = prepare_described_shapes(bodies, PRESETS["fast"])
+        shapes, _ = prepare_collection(bodies, PRESETS["fast"])
         prepare_task(*shapes)
     texts = [str(warning.message) for warning in issued]
     assert [text.split(":")[0] for text in texts] == ["body 0", "body 1"]

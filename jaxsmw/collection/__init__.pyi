@@ -5,7 +5,7 @@ from .matching import match_collection
 from .pairs import match_pairs
 from .result import Collection, MatchedEdge
 from .shape_models import ProcrustesAlignment, ShapeModel, align, shape_model
-from .shapes import PreparedShape, prepare_shapes
+from .shapes import PreparedShape, prepare_collection
 from .synchronization import Network, synchronize
 
 __all__ = [
@@ -21,7 +21,7 @@ __all__ = [
     "edge_errors",
     "match_collection",
     "match_pairs",
-    "prepare_shapes",
+    "prepare_collection",
     "shape_distances",
     "shape_model",
     "synchronize",

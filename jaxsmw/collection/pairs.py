@@ -12,7 +12,7 @@ from jaxtyping import Int64
 
 from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection.consistency import check_pairs
-from jaxsmw.collection.shapes import fitted_preset, prepare_described_shapes, warned_already
+from jaxsmw.collection.shapes import fitted_preset, prepare_collection, warned_already
 from jaxsmw.errors import check_whole_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.matching.correspondence import Correspondence
@@ -68,7 +68,7 @@ def match_pairs(
     if batch_size is not None:
         check_whole_number("batch_size", batch_size, 1)
     chosen = choose_preset(preset)
-    shapes, _ = prepare_described_shapes(given, chosen)
+    shapes, _ = prepare_collection(given, chosen)
 
     def results() -> Iterator[tuple[int, Correspondence]]:
         tasks = (prepare_task(shapes[i], shapes[j], given=Pair(given[i], given[j])) for i, j in checked)

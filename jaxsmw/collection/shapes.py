@@ -138,7 +138,7 @@ def describe_shapes(
         return [axes.describe(shape) for shape in shapes], axes
 
 
-def prepare_described_shapes(
+def prepare_collection(
     meshes: Sequence[Mesh], preset: Preset
 ) -> tuple[list[PreparedShape], DescriptorAxes | None]:
     """Prepare several shapes, and compute comparable descriptors; see `prepare_shape` and `describe_shapes`.
