@@ -1,4 +1,4 @@
-/* Built from the viewer's sources with SHA-256 55dc4db14a5f360af58b85a24166887f2f74aa835386750ea707578115f3d0d6.
+/* Built from the viewer's sources with SHA-256 4cfb98b87b20dc9ba218e4a7a3e0207a3bcd99234d5a39ee809025a5b83bd9ef.
 Contains three.js:
 
 The MIT License
