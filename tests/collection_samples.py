@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxsmw.collection.result import MatchedEdge
 from jaxsmw.collection.shape_models import shape_model
 from jaxsmw.creature import creature
-from jaxsmw.report.collection_page import PageEdge
 
 HOSTILE = '</script></title><img src=x onerror="window.hacked=1"><b>\'&{{script}}'
 _POSES = ("rest", "stand", "walk", "sit")
@@ -18,6 +18,12 @@ NAMES = [*_POSES, "blend"]
 @cache
 def _meshes() -> tuple[Any, ...]:
     return tuple(creature("quadruped", vertices=600, pose=pose) for pose in _POSES)
+
+
+def edge(source: int, target: int, thousandths: float, *, doubtful: bool = False) -> MatchedEdge:
+    """A matched pair with an expected error in thousandths."""
+    error = thousandths / 1000
+    return MatchedEdge(source, target, error, 1.1, error, 0.01, "kept", doubtful)
 
 
 def collection() -> dict[str, Any]:
@@ -36,10 +42,10 @@ def collection() -> dict[str, Any]:
         "registered": registered,
         "template": 0,
         "edges": [
-            PageEdge(0, 1, 4.25, False, ""),
-            PageEdge(1, 2, 30.5, True, "Left and right may be exchanged."),
-            PageEdge(0, 3, float("nan"), False, ""),
-            PageEdge(1, 4, 2.0, False, ""),
+            edge(0, 1, 4.25),
+            edge(1, 2, 30.5, doubtful=True),
+            edge(0, 3, float("inf")),
+            edge(1, 4, 2.0),
         ],
         "model": shape_model(registered, weights=meshes[0].vertex_areas),
         "title": "Five foxes",

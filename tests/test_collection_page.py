@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from collection_samples import HOSTILE, collection
+from collection_samples import HOSTILE, collection, edge
 from report_helpers import decode, embedded
 from scipy.spatial.distance import pdist
 
@@ -17,7 +17,7 @@ from jaxsmw.creature import creature
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.report import collection_page
-from jaxsmw.report.collection_page import PageEdge, layout, simplify, write_collection_page
+from jaxsmw.report.collection_page import layout, simplify, write_collection_page
 from jaxsmw.report.colors import position_colors
 from jaxsmw.report.page_data import encode_positions
 from jaxsmw.report.standing import placement, stand
@@ -59,14 +59,11 @@ def test_page_holds_the_aligned_shapes_and_the_model(tmp_path: Path) -> None:
     for shown, scores in zip(data["shapes"], of_model["scores"], strict=True):
         rebuilt = positions(of_model["mean"]) + np.tensordot(scores, modes, axes=1)
         np.testing.assert_allclose(rebuilt, positions(shown), atol=2e-2)
-    edges = [
-        (edge["source"], edge["target"], edge["error"], edge["doubtful"], edge["note"])
-        for edge in data["edges"]
-    ]
-    assert edges == [
-        tuple(edge) if np.isfinite(edge[2]) else (*edge[:2], None, *edge[3:]) for edge in arguments["edges"]
-    ]
-    assert any(error is None for _, _, error, _, _ in edges)
+    for shown, one in zip(data["edges"], arguments["edges"], strict=True):
+        assert (shown["source"], shown["target"], shown["doubtful"]) == (one.source, one.target, one.doubtful)
+        assert shown["error"] == (1e3 * one.expected_error if np.isfinite(one.expected_error) else None)
+        assert shown["note"] == one.sentence(arguments["names"])
+    assert any(shown["error"] is None for shown in data["edges"])
 
 
 @pytest.mark.parametrize("up", ["y", None])
@@ -83,7 +80,7 @@ def test_a_shape_on_which_the_template_collapses_is_shown(tmp_path: Path, up: An
 
 def test_page_loads_nothing_and_escapes_texts(tmp_path: Path) -> None:
     names = [HOSTILE, *collection()["names"][1:]]
-    edges = [PageEdge(0, 1, 3.0, True, HOSTILE)]
+    edges = [edge(0, 1, 3.0, doubtful=True)]
     page, data, _ = written(
         tmp_path / "page.html",
         names=names,
@@ -92,7 +89,7 @@ def test_page_loads_nothing_and_escapes_texts(tmp_path: Path) -> None:
         notes=[HOSTILE],
         left_out={HOSTILE: HOSTILE},
     )
-    assert data["names"][0] == data["edges"][0]["note"] == HOSTILE
+    assert data["names"][0] == HOSTILE and HOSTILE in data["edges"][0]["note"]
     assert "<img src=x" not in page
     before = page.split('<script type="application/json"')[0]
     assert "{{" not in before.replace("{{script}}", "")
@@ -107,13 +104,9 @@ def test_names_with_undecodable_bytes_are_shown(tmp_path: Path) -> None:
 
 
 def test_the_list_of_pairs_starts_with_doubtful_pairs_and_large_errors(tmp_path: Path) -> None:
-    edges = [
-        PageEdge(0, 1, 9.0, False, ""),
-        PageEdge(1, 2, 20.0, False, ""),
-        PageEdge(2, 3, 1.0, True, "why"),
-    ]
+    edges = [edge(0, 1, 9.0), edge(1, 2, 20.0), edge(2, 3, 1.0, doubtful=True), edge(3, 0, np.inf)]
     page, _, _ = written(tmp_path / "page.html", edges=edges)
-    assert re.findall(r'data-edge="(\d)"', page) == ["2", "1", "0"]
+    assert re.findall(r'data-edge="(\d)"', page) == ["2", "3", "1", "0"]
     assert "<dt>Doubtful pairs</dt><dd>1</dd>" in page
 
 
@@ -144,7 +137,7 @@ def test_one_shape_is_shown_without_modes(tmp_path: Path) -> None:
 def test_a_hundred_shapes_fit_in_8_megabytes(tmp_path: Path) -> None:
     mesh = creature("biped", vertices=5000)
     shapes = mesh.vertices + 0.002 * np.random.default_rng(0).normal(size=(100, 5000, 3))
-    edges = [PageEdge(i, i + 1, 1.0, False, "A sentence of usual length about a pair.") for i in range(99)]
+    edges = [edge(i, i + 1, 1.0) for i in range(99)]
     written(
         tmp_path / "page.html",
         names=[f"shape {i}" for i in range(100)],
@@ -216,7 +209,7 @@ def test_positions_are_rounded_to_16_bits() -> None:
         ({"template": 5}, "the template is shape 5, but the shapes are 0 to 4"),
         ({"faces": np.array([[0, 1, 9999]])}, "the faces do not fit the 600 vertices"),
         ({"faces": np.zeros((0, 3), dtype=int)}, "the faces do not fit"),
-        ({"edges": [PageEdge(0, 5, 1.0, False, "")]}, "an edge joins the shapes 0 and 5"),
+        ({"edges": [edge(0, 5, 1.0)]}, "an edge joins the shapes 0 and 5"),
         ({"model": slice(3)}, "the model has 3 shapes with 600 vertices"),
         ({"registered": np.eye(3)}, "blend: there are 3 positions, but the template has 600"),
         ({"registered": np.full((600, 3), np.nan)}, "blend: some coordinates are not finite"),

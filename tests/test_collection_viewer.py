@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from browser_pages import OpenPage, differ
-from collection_samples import HOSTILE, NAMES, collection
+from collection_samples import HOSTILE, NAMES, collection, edge
 from report_helpers import embedded
 
 from jaxsmw.collection.shape_models import shape_model
-from jaxsmw.report.collection_page import PageEdge, write_collection_page
+from jaxsmw.report.collection_page import write_collection_page
 
 pytestmark = pytest.mark.browser
 
@@ -242,7 +242,7 @@ def test_graph_marks_doubtful_pairs_and_opens_pairs(page: CollectionPage) -> Non
     page.point_at(*page.on_edge(len(edges) - 1), click=False)
     assert page.tip.split("\n") == [
         "stand → walk",
-        "Expected error 30.5 ‰ of √area. Doubtful. Left and right may be exchanged.",
+        f"Expected error 30.5 ‰ of √area. Doubtful. {edges[1].sentence(NAMES)}",
     ]
     page.point_at(*page.on_edge(len(edges) - 1), click=True)
     assert page.shown == (1, 2)
@@ -275,7 +275,7 @@ def test_names_and_nodes_of_a_large_graph_do_not_overlap(browser: Any, tmp_path:
     arguments = collection()
     shapes = [arguments["registered"][i % 5] * generator.normal(1, 0.05, 3) for i in range(25)]
     names = [f"a rather long name {i}" if i % 2 else f"{i}" for i in range(25)]
-    edges = [PageEdge(i, j, 5.0, i % 3 == 0, "") for i in range(25) for j in (i - 1, i - 7) if j >= 0]
+    edges = [edge(i, j, 5.0, doubtful=i % 3 == 0) for i in range(25) for j in (i - 1, i - 7) if j >= 0]
     model = shape_model(shapes)
     changes = {"names": names, "registered": shapes, "edges": edges, "model": model, "warning": "Look."}
     write_collection_page(tmp_path / "page.html", **(arguments | changes), up="y")
@@ -431,7 +431,7 @@ def test_page_is_useful_without_webgl(browser: Any, page_file: Path) -> None:
 def test_hostile_texts_are_shown_as_plain_text(browser: Any, tmp_path: Path) -> None:
     arguments = collection()
     arguments["names"] = [HOSTILE, *NAMES[1:]]
-    arguments["edges"] = [PageEdge(0, 1, 1.0, True, HOSTILE)]
+    arguments["edges"] = [edge(0, 1, 1.0, doubtful=True)]
     arguments |= {"title": HOSTILE, "notes": [HOSTILE], "warning": HOSTILE, "left_out": {HOSTILE: HOSTILE}}
     write_collection_page(tmp_path / "page.html", **arguments)
     browser.get_log("browser")

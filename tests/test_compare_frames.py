@@ -19,6 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import compare_frames
 from frame_study import measurement, summary, variants
+from frame_study.drawing import draw_forest, draw_heat_maps
 from frame_study.measurement import PairName, Settings
 from frame_study.variants import DEFAULT, UPDATES, Variant
 
@@ -32,7 +33,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.metrics import geodesic_error
-from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps
+from jaxsmw.report.figures import draw_functions
 from jaxsmw.runtime.provenance import claimed_directory, code_digest
 
 pytestmark = pytest.mark.study

@@ -483,7 +483,7 @@ def _write(
         write_registered,
         write_summary,
     )
-    from jaxsmw.report.collection_page import PageEdge, write_collection_page
+    from jaxsmw.report.collection_page import write_collection_page
     from jaxsmw.runtime.provenance import machine
 
     names = dict(zip(data, _names(data), strict=True))
@@ -517,16 +517,7 @@ def _write(
         faces=template.faces,
         registered=[one.vertices for one in collection.registered],
         template=collection.template,
-        edges=[
-            PageEdge(
-                edge.source,
-                edge.target,
-                1e3 * edge.expected_error,
-                edge.doubtful,
-                edge.sentence(collection.names),
-            )
-            for edge in collection.edges
-        ],
+        edges=collection.edges,
         model=model,
         title=f"Collection {Path(options.directory).resolve().name}",
         notes=collection.decisions(),

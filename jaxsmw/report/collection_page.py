@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import html
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from html import escape
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import igl
 import numpy as np
@@ -16,15 +16,15 @@ from jaxtyping import Float64, Int, Int64, Real
 from scipy.spatial.distance import pdist, squareform
 
 from jaxsmw.choices import Axis
+from jaxsmw.collection.result import MatchedEdge
 from jaxsmw.collection.shape_models import ShapeModel, shape_model
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.report.colors import PLAIN, position_colors
-from jaxsmw.report.page_data import COLOR_SCALES, encode, encode_colors, encode_positions
-from jaxsmw.report.rendering import ELEVATION, choose_azimuth
+from jaxsmw.report.colors import position_colors
+from jaxsmw.report.page_data import encode, encode_colors, encode_positions
+from jaxsmw.report.rendering import choose_azimuth
 from jaxsmw.report.standing import guess_up, placement, stand
-from jaxsmw.report.template import fill_template
-from jaxsmw.runtime.files import atomic_write
+from jaxsmw.report.template import facts, table, write_html
 
 MOST_VERTICES = 20_000
 """The largest number of vertices of each shape on a page. Larger manifold triangulations are simplified."""
@@ -39,25 +39,6 @@ _SHAPES_IN_VIEW = 8
 _ROUNDS_OF_LAYOUT = 200
 
 
-class PageEdge(NamedTuple):
-    """A matched pair of shapes on a page.
-
-    **Attributes:**
-
-    - `source`, `target`: the indices of the two shapes.
-    - `expected_error`: the expected error of the match, in thousandths of sqrt(area) of the target. NaN and
-      infinity count as unknown.
-    - `doubtful`: whether the match seems to be wrong.
-    - `note`: a sentence about the match; empty if there is nothing to say.
-    """
-
-    source: int
-    target: int
-    expected_error: float
-    doubtful: bool
-    note: str
-
-
 def write_collection_page(
     path: str | os.PathLike[str],
     *,
@@ -65,7 +46,7 @@ def write_collection_page(
     faces: Int[np.ndarray, "f 3"],
     registered: Sequence[Real[np.ndarray, "_ 3"]],
     template: int,
-    edges: Sequence[PageEdge],
+    edges: Sequence[MatchedEdge],
     model: ShapeModel | None,
     title: str,
     notes: Sequence[str] = (),
@@ -128,40 +109,41 @@ def write_collection_page(
     shapes = [(shape[chosen] - offset) @ to_page for shape in shown_model.aligned]
     in_view = [replace(standing, vertices=shapes[i], faces=chosen_faces) for i in some]
     data: dict[str, Any] = {
-        "names": [_plain(name) for name in names],
+        "names": list(names),
         "template": int(template),
         "faces": encode(chosen_faces, "<u4"),
         "vertices": None if len(chosen) == len(first.vertices) else encode(chosen, "<u4"),
         "colors": encode_colors(position_colors(standing)[chosen]),
-        "plain": np.round(255 * PLAIN).astype(int).tolist(),
-        "scale": encode_colors(COLOR_SCALES["error"]),
         "shapes": [encode_positions(shape) for shape in shapes],
         "azimuth": choose_azimuth(in_view),
-        "elevation": ELEVATION,
         "edges": [
             {
-                "source": int(edge.source),
-                "target": int(edge.target),
-                "error": float(edge.expected_error) if np.isfinite(edge.expected_error) else None,
-                "doubtful": bool(edge.doubtful),
-                "note": _plain(edge.note),
+                "source": edge.source,
+                "target": edge.target,
+                "error": 1e3 * edge.expected_error if np.isfinite(edge.expected_error) else None,
+                "doubtful": edge.doubtful,
+                "note": edge.sentence(names),
             }
             for edge in edges
         ],
         "layout": layout(shown_model.aligned, shown_model.weights).tolist(),
         "model": None if model is None else _encode_model(model, chosen, offset, to_page),
     }
+    lead = (
+        f"Every shape has the {len(first.vertices)} vertices of the template, {names[template]}. Equal "
+        "colours mark the same point of the body on every shape."
+    )
+    if len(chosen) < len(first.vertices):
+        lead += f" This page shows {len(chosen)} of the vertices."
     fragments = {
-        "title": html.escape(title),
-        "lead": html.escape(_lead(names, template, len(first.vertices), len(chosen))),
-        "warning": f'<p class="fault">{html.escape(_plain(warning))}</p>' if warning else "",
+        "title": escape(title),
+        "lead": escape(lead),
+        "warning": f'<p class="fault">{escape(warning)}</p>' if warning else "",
         "statistics": _statistics(names, edges, left_out, model),
         "notes": _notes(notes, left_out),
-        "edges": _edge_table(names, edges),
+        "edges": _edge_table(names, edges) if edges else "",
     }
-    page = fill_template("collection.html", "collection.js", data, fragments)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(page.encode("utf-8", "replace"))
+    write_html(path, "collection.html", data, fragments)
 
 
 def simplify(mesh: Mesh, most: int) -> tuple[Int64[np.ndarray, " q"], Int64[np.ndarray, "g 3"]]:
@@ -237,7 +219,7 @@ def _check(
     faces: Int[np.ndarray, "f 3"],
     registered: Sequence[Real[np.ndarray, "_ 3"]],
     template: int,
-    edges: Sequence[PageEdge],
+    edges: Sequence[MatchedEdge],
     model: ShapeModel | None,
 ) -> None:
     """Check that the arguments of `write_collection_page` fit each other."""
@@ -284,10 +266,7 @@ def _encode_model(
     offset: Float64[np.ndarray, " 3"],
     to_page: Float64[np.ndarray, "3 3"],
 ) -> dict[str, Any]:
-    """Encode the mean shape, the modes and the scores of a model.
-
-    The modes are displacements by one standard deviation. The scores are in units of the standard deviation.
-    """
+    """Encode the mean shape, the modes (displacements by one standard deviation) and the scores."""
     shares = model.variances[:_MODES] / (model.total_variance or 1.0)
     count = max(np.count_nonzero(shares >= _SMALLEST_SHARE), min(len(shares), 2))
     deviations = np.sqrt(model.variances[:count])
@@ -302,23 +281,9 @@ def _encode_model(
     }
 
 
-def _plain(text: str) -> str:
-    """Replace bytes that are not valid UTF-8 by question marks. Some file names contain such bytes."""
-    return text.encode("utf-8", "replace").decode()
-
-
-def _lead(names: Sequence[str], template: int, n: int, shown: int) -> str:
-    """Return the sentences below the heading."""
-    text = (
-        f"Every shape has the {n} vertices of the template, {_plain(names[template])}. Equal colours mark "
-        f"the same point of the body on every shape."
-    )
-    return text if shown == n else f"{text} This page shows {shown} of the vertices."
-
-
 def _statistics(
     names: Sequence[str],
-    edges: Sequence[PageEdge],
+    edges: Sequence[MatchedEdge],
     left_out: Mapping[str, str],
     model: ShapeModel | None,
 ) -> str:
@@ -333,45 +298,33 @@ def _statistics(
         enough = np.flatnonzero(model.compactness() >= 0.9)
         if len(enough):
             values["Modes for 90 % of variance"] = str(enough[0] + 1)
-    rows = "".join(f"<div><dt>{label}</dt><dd>{value}</dd></div>" for label, value in values.items())
-    return f"<dl>{rows}</dl>"
+    return facts(values)
 
 
 def _notes(notes: Sequence[str], left_out: Mapping[str, str]) -> str:
-    """Return the HTML of the sentences about decisions, and of the list of shapes that were left out."""
-    parts = []
-    if notes:
-        items = "".join(f"<li>{html.escape(_plain(note))}</li>" for note in notes)
-        parts.append(f'<section><h2>Decisions</h2><ul class="notes">{items}</ul></section>')
-    if left_out:
-        items = "".join(
-            f"<li><b>{html.escape(_plain(name))}</b> {html.escape(_plain(reason))}</li>"
-            for name, reason in left_out.items()
-        )
-        parts.append(f'<section><h2>Shapes left out</h2><ul class="notes">{items}</ul></section>')
-    return f'<div class="columns">{"".join(parts)}</div>' if parts else ""
+    """Return the HTML of the decisions and of the shapes that were left out."""
+    lists = {
+        "Decisions": [escape(note) for note in notes],
+        "Shapes left out": [f"<b>{escape(name)}</b> {escape(reason)}" for name, reason in left_out.items()],
+    }
+    sections = ""
+    for heading, items in lists.items():
+        if items:
+            listed = "".join(f"<li>{item}</li>" for item in items)
+            sections += f'<section><h2>{heading}</h2><ul class="notes">{listed}</ul></section>'
+    return f'<div class="columns">{sections}</div>' if sections else ""
 
 
-def _edge_table(names: Sequence[str], edges: Sequence[PageEdge]) -> str:
+def _edge_table(names: Sequence[str], edges: Sequence[MatchedEdge]) -> str:
     """Return the HTML table of the matched pairs. Doubtful pairs and large errors come first."""
-    if not edges:
-        return ""
-    order = sorted(
-        range(len(edges)), key=lambda i: (not edges[i].doubtful, -np.nan_to_num(edges[i].expected_error))
-    )
+    order = sorted(range(len(edges)), key=lambda i: (not edges[i].doubtful, -edges[i].expected_error))
     rows = []
     for i in order:
         edge = edges[i]
-        source, target = (html.escape(_plain(names[index])) for index in (edge.source, edge.target))
-        error = f"{edge.expected_error:.1f}" if np.isfinite(edge.expected_error) else ""
+        pair = escape(f"{names[edge.source]} → {names[edge.target]}")
+        error = f"{1e3 * edge.expected_error:.1f}" if np.isfinite(edge.expected_error) else ""
         doubt = '<span class="doubt">doubtful</span> ' if edge.doubtful else ""
-        rows.append(
-            f'<tr><th scope="row"><button type="button" class="pair" data-edge="{i}">{source} → {target}'
-            f"</button></th><td>{error}</td><td>{doubt}{html.escape(_plain(edge.note))}</td></tr>"
-        )
-    return (
-        "<details><summary>List of all matched pairs</summary>"
-        '<div class="table" role="region" aria-label="Matched pairs" tabindex="0"><table><thead><tr>'
-        '<th scope="col">pair</th><th scope="col">expected error (‰ of √area)</th><th scope="col">note</th>'
-        f"</tr></thead><tbody>{''.join(rows)}</tbody></table></div></details>"
-    )
+        button = f'<button type="button" class="pair" data-edge="{i}">{pair}</button>'
+        rows.append((button, error, doubt + escape(edge.sentence(names))))
+    listed = table("Matched pairs", ("pair", "expected error (‰ of √area)", "note"), rows)
+    return f"<details><summary>List of all matched pairs</summary>{listed}</details>"

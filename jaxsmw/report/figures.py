@@ -39,12 +39,15 @@ _LONGEST_NAME = 36
 # `_LEGEND_LINE` is the height of one line of a legend, in inches. `_SCALE_WIDTH` is the width of the margin
 # for the error scale, in pixels.
 _LEGEND_LINE, _SCALE_WIDTH = 0.24, 190
-_INK, _FAINT = "#1d2430", "#79818c"
-# Okabe and Ito's colours, which colour-blind readers can tell apart. The lines also differ in style, because
-# colours are lost in black-and-white prints.
-_LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+INK, FAINT = "#1d2430", "#79818c"
+"""The colours of text and of lines."""
+
+LINE_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's colours, which colour-blind readers can tell apart."""
+
+# The lines also differ in style, because colours are lost in black-and-white prints.
 _LINE_STYLES = ("solid", (0, (6, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (10, 2, 3, 2)))
-_MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 
 
 def draw_correspondence(
@@ -145,7 +148,7 @@ def draw_functional_map(
     **Raises:** `InputError` if C is not a matrix of finite numbers, or if matplotlib is missing.
     """
     matrix = check_functional_map(functional_map)
-    figure = _new_figure(5.0, 4.3, plot=True)
+    figure = new_figure(5.0, 4.3, plot=True)
     axes = figure.add_subplot()
     limit = np.abs(matrix).max() or 1.0
     image = axes.imshow(matrix, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
@@ -158,8 +161,8 @@ def draw_functional_map(
     axes.xaxis.tick_top()
     scale = figure.colorbar(image, ax=axes, shrink=0.9)
     scale.outline.set_visible(False)
-    _style(axes)
-    _style(scale.ax)
+    style_axes(axes)
+    style_axes(scale.ax)
     return figure
 
 
@@ -187,7 +190,7 @@ def draw_filters(
             f"filter responses have shape {curves.shape}, but must have shape (filters, p) for a grid of p "
             f"values; the grid has shape {grid.shape}."
         )
-    figure = _new_figure(6.4, 3.4, plot=True)
+    figure = new_figure(6.4, 3.4, plot=True)
     import matplotlib
 
     axes = figure.add_subplot()
@@ -198,7 +201,7 @@ def draw_filters(
     axes.plot(
         grid,
         np.sum(curves**2, axis=0),
-        color=_INK,
+        color=INK,
         linewidth=1.2,
         linestyle=(0, (5, 2)),
         label=r"$G=\sum g_l^2$",
@@ -210,7 +213,7 @@ def draw_filters(
         marker=2,  # a vertical tick below the point
         markersize=4,
         markeredgewidth=0.5,
-        color=_FAINT,
+        color=FAINT,
         clip_on=False,
         label="eigenvalues",
     )
@@ -218,8 +221,8 @@ def draw_filters(
     axes.set_ylim(bottom=min(0.0, curves.min()))
     axes.set_xlabel("eigenvalue λ")
     axes.set_ylabel("response")
-    figure.legend(loc="outside right center", frameon=False, fontsize=8, labelcolor=_INK)
-    _style(axes, grid=True)
+    figure.legend(loc="outside right center", frameon=False, fontsize=8, labelcolor=INK)
+    style_axes(axes, grid=True)
     return figure
 
 
@@ -252,7 +255,7 @@ def draw_quality_curves(
             f"there are mean errors but no quality curves for {', '.join(sorted(unknown))}; give these "
             "curves, or leave out their mean errors."
         )
-    figure = _new_figure(6.8, max(3.8, 0.6 + _LEGEND_LINE * len(curves)), plot=True)
+    figure = new_figure(6.8, max(3.8, 0.6 + _LEGEND_LINE * len(curves)), plot=True)
     axes = figure.add_subplot()
     lines, labels = [], []
     for index, (name, (thresholds, shares)) in enumerate(curves.items()):
@@ -264,7 +267,7 @@ def draw_quality_curves(
         lines += axes.plot(
             thresholds,
             100 * np.asarray(shares),
-            color=_LINE_COLORS[index % len(_LINE_COLORS)],
+            color=LINE_COLORS[index % len(LINE_COLORS)],
             linestyle=_LINE_STYLES[index % len(_LINE_STYLES)],
             linewidth=2,
         )
@@ -281,13 +284,13 @@ def draw_quality_curves(
         loc="outside right center",
         frameon=False,
         fontsize=8,
-        labelcolor=_INK,
+        labelcolor=INK,
         labelspacing=0.8,
         handlelength=3.5,
     )
     for text in legend.get_texts():
         text.set_parse_math(False)
-    _style(axes, grid=True)
+    style_axes(axes, grid=True)
     return figure
 
 
@@ -334,14 +337,14 @@ def draw_functions(
     gap, header = 24, 60
     width = len(titles) * (cell_width + gap) + gap
     height = header + sum(heights) + gap * len(meshes)
-    figure = _new_figure(width / _DPI, height / _DPI)
+    figure = new_figure(width / _DPI, height / _DPI)
     import matplotlib
 
     colormap = matplotlib.colormaps["RdBu_r"]
     for column, title in enumerate(titles):
         left = gap + column * (cell_width + gap)
         center = (left + cell_width / 2) / width
-        figure.text(center, 1 - gap / height, title, ha="center", va="top", fontsize=8, color=_INK)
+        figure.text(center, 1 - gap / height, title, ha="center", va="top", fontsize=8, color=INK)
         columns = [np.asarray(of_mesh[column], dtype=float) for of_mesh in functions]
         limit = np.quantile(np.abs(np.concatenate(columns)), 0.995) or 1.0
         top = header
@@ -353,155 +356,10 @@ def draw_functions(
             drawing.imshow(picture, aspect="auto", interpolation="nearest")
             right, upwards = scale * axes @ mesh.vertices[vertex]
             x, y = cell_width / 2 + right, body_height / 2 - upwards
-            for edge, linewidth in ((_INK, 1.6), ("white", 0.8)):
+            for edge, linewidth in ((INK, 1.6), ("white", 0.8)):
                 drawing.plot(x, y, "o", mfc="none", mec=edge, mew=linewidth, ms=3.5, clip_on=False)
             drawing.set_axis_off()
             top += body_height + gap
-    return figure
-
-
-def draw_forest(
-    panels: Mapping[str, Mapping[str, Float[np.ndarray, "rows 3"]]],
-    *,
-    rows: Sequence[str],
-    xlabel: str,
-    linear_up_to: float = 1.0,
-) -> Figure:
-    """Draw a forest plot with one or several panels.
-
-    Each panel shows estimates with their intervals, and a vertical line at zero. The scale is linear near
-    zero and logarithmic elsewhere, so small and large estimates are both visible.
-
-    **Arguments:**
-
-    - `panels`: a nested dictionary. `panels[title][name]` is an array (rows, 3) that contains one series of
-      one panel. Each row of an array contains an estimate and the lower and upper end of its interval, or NaN
-      for a missing estimate. All panels have the same series.
-    - `rows`: the names of the rows, from top to bottom.
-    - `xlabel`: the name of the estimated quantity.
-    - `linear_up_to`: the absolute value up to which the scale is linear. Above this value, the scale is
-      logarithmic.
-
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if a series does not have three numbers per row, or if matplotlib is missing.
-    """
-    for title, series in panels.items():
-        for name, intervals in series.items():
-            if np.shape(intervals) != (len(rows), 3):
-                raise InputError(
-                    f"{title}, {name}: the array has shape {np.shape(intervals)}, but {len(rows)} rows need "
-                    f"shape {(len(rows), 3)}."
-                )
-    names = list(dict.fromkeys(name for series in panels.values() for name in series))
-    pitch = 0.075 * len(names) + 0.1
-    figure = _new_figure(2.6 + 3.3 * len(panels), 1.2 + pitch * len(rows), plot=True)
-    from matplotlib.ticker import NullLocator, SymmetricalLogLocator
-
-    grid = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
-    heights = np.arange(len(rows), dtype=float)
-    for axes, (title, series) in zip(grid, panels.items(), strict=True):
-        axes.set_xscale("symlog", linthresh=linear_up_to, linscale=1.0)
-        for band in range(0, len(rows), 2):
-            axes.axhspan(band - 0.5, band + 0.5, color="#f4f5f7", linewidth=0, zorder=0)
-        axes.axvline(0, color=_FAINT, linewidth=0.8, zorder=1)
-        for index, name in enumerate(names):
-            estimate, low, high = np.asarray(series[name], dtype=float).T
-            color = _LINE_COLORS[index % len(_LINE_COLORS)]
-            offset = 0.7 * ((index + 0.5) / len(names) - 0.5)
-            axes.hlines(heights + offset, low, high, color=color, linewidth=1.1, zorder=2)
-            axes.plot(
-                estimate,
-                heights + offset,
-                linestyle="none",
-                marker=_MARKERS[index % len(_MARKERS)],
-                markersize=3.4,
-                color=color,
-                label=name,
-                zorder=3,
-            )
-        axes.set_title(title, fontsize=9, color=_INK)
-        axes.set_xlabel(xlabel)
-        axes.xaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=linear_up_to))
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:+g}".replace("-", "−") if value else "0")
-        _style(axes)
-        axes.grid(axis="x", color="#e6e8ec", linewidth=0.6)
-        axes.tick_params(axis="y", length=0)
-    grid[0].set_yticks(heights, rows)
-    grid[0].set_ylim(len(rows) - 0.5, -0.5)
-    handles, labels = grid[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside upper center",
-        ncols=min(len(names), 4),
-        frameon=False,
-        fontsize=8,
-        labelcolor=_INK,
-    )
-    return figure
-
-
-def draw_heat_maps(
-    panels: Mapping[str, Float[np.ndarray, "rows columns"]],
-    *,
-    rows: tuple[str, Sequence[object]],
-    columns: tuple[str, Sequence[object]],
-    label: str,
-) -> Figure:
-    """Draw tables of positive numbers as heat maps. The colour of each cell represents its number.
-
-    Each cell also contains its number as text. All tables have the same logarithmic colour scale.
-
-    **Arguments:**
-
-    - `panels`: a dictionary from the title of each table to its numbers (rows, columns).
-    - `rows`: the name of the parameter that varies from row to row, and its value in each row.
-    - `columns`: the name of the parameter that varies from column to column, and its value in each column.
-    - `label`: the label of the colour scale, such as the name of the quantity in the tables.
-
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if a table does not fit the rows and columns, if a table has an entry that is not
-    positive, or if matplotlib is missing.
-    """
-    shape = len(rows[1]), len(columns[1])
-    for title, table in panels.items():
-        if np.shape(table) != shape or not (np.isfinite(table).all() and np.min(table) > 0):
-            raise InputError(
-                f"{title}: the table must have shape {shape} and positive entries, but its shape is "
-                f"{np.shape(table)} and its smallest entry is {np.min(table)}."
-            )
-    size = 1.2 + (0.6 + 0.42 * shape[1]) * len(panels), max(2.6, 1.1 + 0.3 * shape[0])
-    figure = _new_figure(*size, plot=True)
-    from matplotlib.colors import LogNorm
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
-    everything = np.concatenate([np.ravel(table) for table in panels.values()])
-    norm = LogNorm(everything.min(), max(everything.max(), 1.01 * everything.min()))
-    grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, (title, table) in zip(grid, panels.items(), strict=True):
-        image = axes.imshow(table, cmap="cividis", norm=norm, aspect="auto", interpolation="nearest")
-        for (row, column), value in np.ndenumerate(np.asarray(table)):
-            text = f"{value:.1f}" if value < 100 else f"{value:.0f}"
-            color = _INK if norm(value) > 0.55 else "white"
-            axes.text(column, row, text, ha="center", va="center", fontsize=7, color=color)
-        axes.set_title(title, fontsize=9, color=_INK)
-        axes.set_xlabel(columns[0])
-        axes.set_xticks(range(shape[1]), [str(value) for value in columns[1]])
-        _style(axes)
-        axes.spines[:].set_visible(False)
-        axes.tick_params(length=0)
-    grid[0].set_ylabel(rows[0])
-    grid[0].set_yticks(range(shape[0]), [str(value) for value in rows[1]])
-    scale = figure.colorbar(image, ax=list(grid), pad=0.02)
-    scale.set_label(label, fontsize=8, color=_INK)
-    scale.ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    scale.ax.yaxis.set_minor_locator(NullLocator())
-    scale.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    scale.outline.set_visible(False)
-    _style(scale.ax)
     return figure
 
 
@@ -567,10 +425,7 @@ class _Panel(NamedTuple):
 
 
 def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
-    """Draw the bodies next to each other at the same scale. The text above each body is its role and name.
-
-    The figure shows the pictures of `render` without rescaling. `right_margin` is in pixels.
-    """
+    """Draw the bodies next to each other at the same scale, with an empty margin in pixels at the right."""
     angle = choose_azimuth([panel.mesh for panel in panels]) if azimuth is None else np.radians(azimuth)
     axes = camera_axes(angle)[:2]
     reach = [
@@ -583,7 +438,7 @@ def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margi
     body_height = int(np.ceil(2 * scale * max(y for _, y in reach)))
     height, width = body_height + 2 * gap + header, sum(widths) + right_margin
 
-    figure = _new_figure(width / _DPI, height / _DPI)
+    figure = new_figure(width / _DPI, height / _DPI)
     left, names = 0, _fitting_names([panel.mesh.name for panel in panels])
     for panel, panel_width, name in zip(panels, widths, names, strict=True):
         picture = render(
@@ -595,7 +450,7 @@ def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margi
         drawing.set_axis_off()
         if captioned:
             center, top = (left + panel_width / 2) / width, 1 - gap / height
-            figure.text(center, top, panel.role, ha="center", va="top", fontsize=11, color=_INK)
+            figure.text(center, top, panel.role, ha="center", va="top", fontsize=11, color=INK)
             figure.text(
                 center,
                 top - 50 / height,
@@ -603,7 +458,7 @@ def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margi
                 ha="center",
                 va="top",
                 fontsize=7.5,
-                color=_FAINT,
+                color=FAINT,
                 parse_math=False,
             )
         left += panel_width
@@ -611,7 +466,7 @@ def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margi
 
 
 def _fitting_names(paths: Sequence[str]) -> list[str]:
-    """Return short names of files that fit above a panel. Different files keep different names."""
+    """Return short names of files that fit above a panel and that differ for different files."""
     names, half = [printable(name) for name in short_names(paths)], _LONGEST_NAME // 2
     # If the ends of long names are equal, the names are shown from shortly before their first difference.
     first_difference = next((i for i, letters in enumerate(zip_longest(*names)) if len(set(letters)) > 1), 0)
@@ -624,10 +479,7 @@ def _fitting_names(paths: Sequence[str]) -> list[str]:
 
 
 def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
-    """Draw the colour bar of errors at the right edge.
-
-    With `has_unknown`, a patch below the bar shows the colour of unknown errors.
-    """
+    """Draw the colour bar of errors at the right edge, and the colour of unknown errors if there are some."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
     from matplotlib.patches import Patch
@@ -638,19 +490,21 @@ def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
     ticks = np.linspace(0, limit, 6)
     scale = figure.colorbar(ScalarMappable(Normalize(0, limit), colors), cax=axes, extend="max", ticks=ticks)
     scale.ax.set_yticklabels([*(f"{tick:g}" for tick in ticks[:-1]), f"{limit:g} and\nabove"])
-    scale.set_label("error (fraction of √area)", fontsize=7.5, color=_FAINT)
+    scale.set_label("error (fraction of √area)", fontsize=7.5, color=FAINT)
     scale.outline.set_visible(False)
-    _style(axes)
+    style_axes(axes)
     if has_unknown:
         unknown = Patch(facecolor=PLAIN.tolist(), label="unknown")
         place = (1 - (_SCALE_WIDTH + 10) / width, 0.16)
         figure.legend(handles=[unknown], loc="upper left", bbox_to_anchor=place, frameon=False, fontsize=8)
 
 
-def _new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
+def new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
     """Return an empty white figure that opens no window. The width and the height are in inches.
 
     With `plot`, matplotlib chooses the positions of axes and labels automatically.
+
+    **Raises:** `InputError` if matplotlib is missing.
     """
     check_drawable()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -663,12 +517,13 @@ def _new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
     return figure
 
 
-def _style(axes: Axes, *, grid: bool = False) -> None:
-    axes.tick_params(labelsize=8, colors=_FAINT, labelcolor=_INK, width=0.6, length=3)
-    axes.xaxis.label.set(size=9, color=_INK)
-    axes.yaxis.label.set(size=9, color=_INK)
+def style_axes(axes: Axes, *, grid: bool = False) -> None:
+    """Give axes the fonts, colours and lines of all figures, and a grid if requested."""
+    axes.tick_params(labelsize=8, colors=FAINT, labelcolor=INK, width=0.6, length=3)
+    axes.xaxis.label.set(size=9, color=INK)
+    axes.yaxis.label.set(size=9, color=INK)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.spines[["left", "bottom"]].set(color=_FAINT, linewidth=0.6)
+    axes.spines[["left", "bottom"]].set(color=FAINT, linewidth=0.6)
     if grid:
         axes.grid(color="#e6e8ec", linewidth=0.6)
         axes.set_axisbelow(True)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import html
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from types import MappingProxyType
 from typing import Any
 
@@ -19,10 +19,9 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.landmarks import Landmarks
-from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, position_colors
+from jaxsmw.report.colors import ERROR_LIMIT, position_colors
 from jaxsmw.report.inputs import check_error_limit, check_errors, check_map
 from jaxsmw.report.page_data import (
-    COLOR_SCALES,
     encode,
     encode_basis,
     encode_bytes,
@@ -32,10 +31,9 @@ from jaxsmw.report.page_data import (
     encode_shape,
     spectra_on_page,
 )
-from jaxsmw.report.rendering import ELEVATION, choose_azimuth
+from jaxsmw.report.rendering import choose_azimuth
 from jaxsmw.report.standing import stand_pair
-from jaxsmw.report.template import fill_template
-from jaxsmw.runtime.files import atomic_write
+from jaxsmw.report.template import facts, table, write_html
 from jaxsmw.wording import short_names
 
 # If the bodies are wider than this multiple of their height, narrow screens show one body above the other.
@@ -111,20 +109,16 @@ def write_page(
 ) -> None:
     """Write a web page that shows both bodies in 3D and colours them by one map at a time.
 
-    On the page, a user can place landmarks, and load and save landmark files in the coordinates of the mesh
-    files. If the errors of a map include expected errors (the key `EXPECTED_ERROR`), the page suggests places
-    for landmarks.
-
-    The page also shows the match of the point under the pointer. If spectra are given, the page can show the
-    wavelets of a refiner's filter bank. The wavelet of scale l around a vertex y is the function
+    On the page, a user can see the match of the point under the pointer, place landmarks, and load and save
+    landmark files in the coordinates of the mesh files. If spectra are given, the page can show the wavelets
+    of a refiner's filter bank. The wavelet of scale l around a vertex y is the function
 
         psi_{l,y}(x) = sum_i g_l(lambda_i) phi_i(y) phi_i(x),
 
     where g_l is the filter of scale l, and lambda_i and phi_i are the eigenvalues and eigenvectors of the
-    shape. The page shows the wavelet on X around the vertex under the pointer, and the wavelet on Y around
-    the match of this vertex. If the map preserves wavelets, the two wavelets look similar. The page also
-    prints the similarity of the two wavelets. The map first transfers the wavelet on Y to X. The similarity
-    is the cosine of the angle between the transferred wavelet and the wavelet on X.
+    shape. The page shows the wavelet on X around the vertex under the pointer, the wavelet on Y around the
+    match of this vertex, and their similarity: the cosine of the angle between the two wavelets, after the
+    map has transferred the wavelet on Y to X. If the map preserves wavelets, they look similar.
 
     **Arguments:**
 
@@ -135,29 +129,24 @@ def write_page(
     - `maps`: a dictionary from the name of each map to a `ShownMap`. The page opens with the first map.
     - `title`: the heading of the page.
     - `spectra`: a pair with the `Spectrum` of X and of Y; None (the default) for a page without wavelets.
-      `jaxsmw.report.page_data.eigenvectors_on_page` limits the number of eigenvectors on the page. Each entry
-      of an eigenvector is rounded to one byte (`jaxsmw.report.page_data.encode_rounded`).
+      `jaxsmw.report.page_data.eigenvectors_on_page` limits the number of eigenvectors on the page.
     - `refiner`: a `WaveletPreservation` refiner, whose filter bank defines the wavelets.
     - `statistics`: a dictionary from labels to values as text, which the page shows below the bodies.
     - `error_meanings`: a dictionary from each name in `ShownMap.errors` to a sentence that explains this kind
       of error on the page.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two pages are comparable if their limits are equal.
-    - `figures`: the figures at the end of the page. Each figure is a pair: a caption, and the bytes of a PNG
-      file.
+    - `figures`: the figures at the end of the page, each a pair of a caption and the bytes of a PNG file.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
       `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
-    - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file; None (the
-      default) for a page without these positions. The page can draw X at these positions, on top of Y. A
-      slider on the page deforms X from its own shape to these positions. The positions take 16 bytes per
-      vertex.
+    - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file. With them, the
+      page can draw X on top of Y, and a slider deforms X from its own shape to these positions.
     - `landmarks`: a pair of `Landmarks`, on X and on Y, with which the page opens, in the coordinates of the
-      mesh files. Landmarks of the same name correspond. With None (the default), the page opens without
-      landmarks.
+      mesh files. Landmarks of the same name correspond.
 
-    **Raises:** `InputError` if there is no map, or if the maps, errors or spectra do not fit the meshes.
-    `InputError` is also raised if a functional map is not a matrix of finite numbers, the limit is not
-    positive, `up` is not an axis, the registered positions do not fit X, or the file cannot be written.
+    **Raises:** `InputError` if there is no map, or if the maps, errors, spectra or registered positions do
+    not fit the meshes. `InputError` is also raised if a functional map is not a matrix of finite numbers, the
+    limit is not positive, `up` is not an axis, or the file cannot be written.
     """
     if not maps:
         raise InputError("there is no map to show; give at least one map.")
@@ -167,12 +156,16 @@ def write_page(
     first = check_map(mesh_x, mesh_y, next(iter(maps.values())).pointwise_map)
     shown_x, shown_y = stand_pair(mesh_x, mesh_y, up, first)
     name_x, name_y = short_names([mesh_x.name, mesh_y.name])
-    data = _encode_view(shown_x, shown_y) | {
+    reach = np.max(
+        [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
+    )
+    data = {
         "x": encode_shape(name_x, mesh_x, shown_x),
         "y": encode_shape(name_y, mesh_y, shown_y),
         "maps": encoded,
-        "plain": np.round(255 * PLAIN).astype(int).tolist(),
-        "scales": {name: encode_colors(colors) for name, colors in COLOR_SCALES.items()},
+        "colors": encode_colors(position_colors(shown_y)),
+        "azimuth": choose_azimuth([shown_x, shown_y]),
+        "wide": bool(max(reach[0], reach[2]) > _WIDE * reach[1]),
         "limit": error_limit,
         "error_names": error_names,
         "expected": EXPECTED_ERROR,
@@ -184,9 +177,9 @@ def write_page(
     filters = _add_wavelets(data, mesh_x, mesh_y, spectra, refiner)
     modes = _modes(maps, error_names, has_spectra=filters > 0)
     fragments = {
-        "title": html.escape(title),
-        "source": html.escape(f"{name_x} · {len(mesh_x.vertices)} vertices"),
-        "target": html.escape(f"{name_y} · {len(mesh_y.vertices)} vertices"),
+        "title": escape(title),
+        "source": escape(f"{name_x} · {len(mesh_x.vertices)} vertices"),
+        "target": escape(f"{name_y} · {len(mesh_y.vertices)} vertices"),
         "last_vertex": str(len(mesh_x.vertices) - 1),
         "last_filter": str(max(filters - 1, 0)),
         "map_choices": _choices("map", "Map", dict(enumerate(maps))) if len(maps) > 1 else "",
@@ -194,25 +187,10 @@ def write_page(
         "explanations": _explanations(modes, error_meanings),
         "error_end": f"{error_limit:g} and above",
         "comparison": _comparison(maps),
-        "statistics": _statistics(statistics),
+        "statistics": f"<h2>Result</h2>{facts(statistics)}" if statistics else "",
         "figures": _figures(figures),
     }
-    page = fill_template("page.html", "viewer.js", data, fragments)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(page.encode("utf-8", "replace"))
-
-
-def _encode_view(shown_x: Mesh, shown_y: Mesh) -> dict[str, Any]:
-    """Return the colours of Y, and the settings of the camera that shows both upright meshes."""
-    reach = np.max(
-        [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
-    )
-    return {
-        "colors": encode_colors(position_colors(shown_y)),
-        "azimuth": choose_azimuth([shown_x, shown_y]),
-        "elevation": ELEVATION,
-        "wide": bool(max(reach[0], reach[2]) > _WIDE * reach[1]),
-    }
+    write_html(path, "page.html", data, fragments)
 
 
 def _encode_landmarks(landmarks: Landmarks) -> dict[str, Any]:
@@ -241,10 +219,7 @@ def _add_wavelets(
     spectra: tuple[Spectrum, Spectrum] | None,
     refiner: WaveletPreservation,
 ) -> int:
-    """Add eigenvectors and filters to the data of both shapes, and return the number of filters.
-
-    The number is 0 if the page shows no wavelets.
-    """
+    """Add eigenvectors and filters to the data of both shapes. Return the number of filters."""
     cut = None if spectra is None else spectra_on_page(mesh_x, mesh_y, *spectra)
     if cut is None:
         return 0
@@ -265,13 +240,10 @@ def _modes(maps: Mapping[str, ShownMap], error_names: Sequence[str], *, has_spec
 
 
 def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
-    """Return the HTML of radio buttons. The first button is selected.
-
-    `choices` is a dictionary from the value of each button to its label.
-    """
+    """Return the HTML of radio buttons from the values and labels in `choices`. The first is selected."""
     inputs = "".join(
         f'<label><input type="radio" name="{name}" autocomplete="off" value="{value}"'
-        f"{'' if position else ' checked'}><span>{html.escape(text)}</span></label>"
+        f"{'' if position else ' checked'}><span>{escape(text)}</span></label>"
         for position, (value, text) in enumerate(choices.items())
     )
     return (
@@ -287,7 +259,7 @@ def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str]) -
         text = _EXPLANATIONS.get(mode)
         if text is None:
             text = f"{error_meanings.get(label, f'{label} of every match.')} {_DISTANCES}"
-        paragraphs.append(f'<p data-for="{mode}">{html.escape(text)}</p>')
+        paragraphs.append(f'<p data-for="{mode}">{escape(text)}</p>')
     return "".join(paragraphs)
 
 
@@ -296,28 +268,11 @@ def _comparison(maps: Mapping[str, ShownMap]) -> str:
     labels = dict.fromkeys(label for shown in maps.values() for label in shown.statistics)
     if not labels:
         return ""
-    heads = "".join(f'<th scope="col">{html.escape(label)}</th>' for label in labels)
-    rows = "".join(
-        f'<tr><th scope="row">{html.escape(name)}</th>'
-        + "".join(f"<td>{html.escape(shown.statistics.get(label, ''))}</td>" for label in labels)
-        + "</tr>"
+    rows = [
+        [escape(name), *(escape(shown.statistics.get(label, "")) for label in labels)]
         for name, shown in maps.items()
-    )
-    return (
-        '<h2>Maps</h2><div class="table" role="region" aria-label="Maps" tabindex="0"><table>'
-        f'<thead><tr><th scope="col">map</th>{heads}</tr></thead><tbody>{rows}</tbody></table></div>'
-    )
-
-
-def _statistics(statistics: Mapping[str, str]) -> str:
-    """Return the HTML of the statistics, with one card per label."""
-    if not statistics:
-        return ""
-    rows = "".join(
-        f"<div><dt>{html.escape(label)}</dt><dd>{html.escape(value)}</dd></div>"
-        for label, value in statistics.items()
-    )
-    return f"<h2>Result</h2><dl>{rows}</dl>"
+    ]
+    return f"<h2>Maps</h2>{table('Maps', ('map', *labels), rows)}"
 
 
 def _figures(figures: Sequence[tuple[str, bytes]]) -> str:
@@ -325,8 +280,8 @@ def _figures(figures: Sequence[tuple[str, bytes]]) -> str:
     if not figures:
         return ""
     shown = "".join(
-        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{encode_bytes(png)}">'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{encode_bytes(png)}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
         for caption, png in figures
     )
     return f'<h2>Figures</h2><div class="figures">{shown}</div>'

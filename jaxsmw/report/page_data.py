@@ -13,7 +13,6 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.executor import common_range
-from jaxsmw.report.colors import error_colors, signed_colors
 from jaxsmw.report.inputs import check_functional_map
 from jaxsmw.report.standing import placement
 
@@ -21,16 +20,6 @@ from jaxsmw.report.standing import placement
 # eigenvectors of both shapes together have at most `_VALUES` entries. Before the encoding in base64, each
 # entry takes one byte.
 _EIGENVECTORS, _FEWEST, _VALUES = 100, 20, 6_000_000
-
-COLOR_SCALES = {
-    "error": error_colors(np.linspace(0, 1, 256), 1.0),
-    "signed": signed_colors(np.linspace(-1, 1, 255), 1.0),
-    "signed_dark": signed_colors(np.linspace(-1, 1, 255), 1.0, on_dark=True),
-}
-"""A dictionary from the name of each colour scale to its sRGB colours (n, 3) in [0, 1], evenly spaced.
-
-In both signed scales, the middle colour belongs to the value zero.
-"""
 
 
 def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
@@ -49,15 +38,8 @@ def spectra_on_page(
 ) -> tuple[Spectrum, Spectrum] | None:
     """Return the spectra of both shapes, truncated to the eigenvectors that a page contains.
 
-    If the two spectra have different numbers of eigenvectors, both are also truncated to their common range
-    of eigenvalues (`jaxsmw.matching.executor.common_range`). This is the case for a partial pair.
-
-    **Arguments:**
-
-    - `mesh_x`, `mesh_y`: X (m vertices) and Y (n vertices).
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, without padding.
-
-    **Returns:** Both spectra; None if the meshes are so large that a page contains no eigenvectors.
+    The spectra of a partial pair are also truncated to their common range of eigenvalues. The result is None
+    if the meshes are so large that a page contains no eigenvectors.
 
     **Raises:** `InputError` if a spectrum does not have one row per vertex of its mesh.
     """
@@ -84,29 +66,18 @@ def encode(array: Shaped[np.ndarray, " *shape"], dtype: str) -> str:
     return encode_bytes(array.astype(dtype).tobytes())
 
 
-def encode_mesh(mesh: Mesh) -> dict[str, Any]:
-    """Encode the vertices of a mesh as float32 and the faces as uint32, both in base64."""
-    return {"vertices": encode(mesh.vertices, "<f4"), "faces": encode(mesh.faces, "<u4")}
-
-
 def encode_shape(name: str, mesh: Mesh, standing: Mesh) -> dict[str, Any]:
-    """Encode a shape: its upright mesh, its name, and the transformation from the page to its file.
+    """Encode a shape: its name, its upright mesh, and the transformation from the page to its file.
 
-    The page stores the positions of vertices in float32, but computes in float64. To convert a point on a
-    triangle to the coordinates of the file, the page interpolates the stored positions of the triangle's
-    corners. The page then applies a similarity transformation (`jaxsmw.report.standing.placement`). The error
-    of a point is at most 1e-7 times the diagonal of the bounding box, plus the float64 rounding of the file's
-    own coordinates.
-
-    **Arguments:**
-
-    - `name`: the name of the shape on the page.
-    - `mesh`: the mesh in the coordinates of its file.
-    - `standing`: the mesh in the coordinates of the page; a result of `jaxsmw.report.standing.stand_pair`.
+    The page stores the vertices of `standing` in float32, but computes in float64. A point on the page,
+    transformed to the coordinates of `mesh`, has an error of at most 1e-7 times the diagonal of the bounding
+    box, plus the float64 rounding of the file's own coordinates.
     """
     matrix, offset = placement(mesh, standing)
-    return encode_mesh(standing) | {
+    return {
         "name": name,
+        "vertices": encode(standing.vertices, "<f4"),
+        "faces": encode(standing.faces, "<u4"),
         "placement": {"matrix": matrix.tolist(), "offset": offset.tolist()},
     }
 
@@ -114,15 +85,7 @@ def encode_shape(name: str, mesh: Mesh, standing: Mesh) -> dict[str, Any]:
 def encode_registered(
     registered: Float[np.ndarray, "m 3"], mesh_x: Mesh, mesh_y: Mesh, standing_y: Mesh
 ) -> str:
-    """Convert registered positions to the coordinates of the page, and encode them.
-
-    **Arguments:**
-
-    - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file.
-    - `mesh_x`, `mesh_y`: X (m vertices) and Y, in the coordinates of their files.
-    - `standing_y`: Y as the page shows it.
-
-    **Returns:** The positions on the page as float32 in base64.
+    """Convert positions of X's vertices on Y from the file of Y to the page, and encode them as float32.
 
     **Raises:** `InputError` if the positions are not three finite numbers for every vertex of X.
     """
@@ -145,14 +108,8 @@ def encode_colors(colors: Float64[np.ndarray, "n 3"]) -> str:
 def encode_positions(positions: Float64[np.ndarray, "n 3"]) -> dict[str, Any]:
     """Round positions or displacements to 16 bits per coordinate, and encode them in base64.
 
-    Coordinate j of vertex i is `low[j] + step[j] * code`, where `code` is the code with the index 3 i + j.
-    The rounding error is at most 1 / 131070 of the extent in each direction.
-
-    **Arguments:**
-
-    - `positions`: positions (n, 3), in any unit.
-
-    **Returns:** The numbers `low` and `step` of each direction, and the codes (uint16) in base64.
+    Coordinate j of vertex i is `low[j] + step[j] * codes[3 * i + j]`. The rounding error is at most
+    1 / 131070 of the extent in each direction.
     """
     low, high = positions.min(axis=0), positions.max(axis=0)
     step = np.where(high > low, (high - low) / 65535, 1.0)
@@ -171,17 +128,10 @@ def encode_basis(spectrum: Spectrum, responses: Float[np.ndarray | Array, "filte
 def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
     """Round the numbers of a matrix to one byte each, and encode them in base64.
 
-    Each row has its own unit. A byte c encodes the number sign(c) c² times the unit of its row. Small numbers
-    therefore have smaller rounding errors than large numbers. For example, an eigenvector can be large on one
-    limb and small on the rest of the body. If the encoded numbers were evenly spaced, the wavelets on the
-    rest of the body would have visible errors. On people and animals, the root-mean-square error of wavelets
-    is 0.005 times the length of the colour scale.
-
-    **Arguments:**
-
-    - `rows`: the matrix (k, n), such as k eigenvectors with n entries each.
-
-    **Returns:** The codes (int8) and the units (float32) in base64.
+    A byte c encodes the number sign(c) c² times the unit of its row, so small numbers have smaller rounding
+    errors than large numbers. An eigenvector can be large on one limb and small on the rest of the body; with
+    evenly spaced numbers, the wavelets there would have visible errors. On people and animals, the
+    root-mean-square error of wavelets is 0.005 times the length of the colour scale.
     """
     units = np.maximum(np.abs(rows).max(axis=1), np.finfo(np.float32).tiny) / 127**2
     codes = np.sign(rows) * np.round(np.sqrt(np.abs(rows) / units[:, None]))

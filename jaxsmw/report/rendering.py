@@ -141,11 +141,8 @@ def _rasterize(
     columns: int,
     rows: int,
 ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-    """Return the frontmost face of each sample, the barycentric weights in this face, and the depth.
-
-    The face is -1 if there is no face at the sample. Each face is tested against all samples in its bounding
-    box. One chunk of faces is processed at a time.
-    """
+    """Return the frontmost face of each sample (-1 for none), the barycentric weights, and the depth."""
+    # Each face is tested against all samples in its bounding box. One chunk of faces is processed at a time.
     front = np.full(rows * columns, -1)
     weights = np.zeros((rows * columns, 3))
     nearest = np.full(rows * columns, -np.inf)
@@ -186,11 +183,7 @@ def _rasterize(
 
 
 def _occlusion(depth: np.ndarray, scale: float) -> np.ndarray:
-    """Return the share of the light that reaches each sample, between 0 and 1.
-
-    Samples just behind the outline of a nearer part of the body receive less light. The share is computed by
-    unsharp masking of the depth (Luft et al. 2006).
-    """
+    """Return the share of light at each sample, by unsharp masking of the depth (Luft et al. 2006)."""
     # One sample per pixel is enough, because the depth is blurred.
     image = depth[::_SUPERSAMPLING, ::_SUPERSAMPLING]
     share = np.isfinite(image).astype(float)

@@ -184,8 +184,8 @@ def guess_up(mesh: Mesh) -> Axis:
     """Guess which axis of the file points up, from the limbs on which the body stands.
 
     The score of an axis is the sum of two terms. The first term measures the limbs that hang down along the
-    axis (`_hanging_limbs`). Legs and arms usually hang down, and only the head points up. The second term
-    measures how stably the body would stand (`_stability`). The usual axis is y for a body that is slender
+    axis. Legs and arms usually hang down, and only the head points up. The second term measures how stably
+    the body would stand. The usual axis is y for a body that is slender
     along y, such as a person, and for an open surface that faces along z, such as a mask. For other bodies,
     the usual axis is z. The usual axis is returned unless the score of another axis is clearly higher.
 
@@ -233,11 +233,7 @@ def _suits_opening(mesh: Mesh, up: Axis) -> float:
 
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:
-    """Return the points and the edges of a coarse graph of the mesh.
-
-    Each point is the mean of the vertices in one grid cell. An edge joins two points if an edge of the mesh
-    joins their two cells.
-    """
+    """Return the mean of the vertices in each grid cell, and the pairs of cells that edges join."""
     used = mesh.vertices[mesh.referenced_vertices]
     # The number of cells along a thin mesh may exceed the range of integers, so the keys remain floats.
     keys = np.floor((used - used.min(axis=0)) / cell)
@@ -251,14 +247,11 @@ def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"]
 
 
 def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, "e 2"]) -> float:
-    """Return the sum of the squared lengths of the limbs that hang down.
-
-    A limb extends upwards from its lowest point. The limb ends at the height at which it joins a part of the
-    body that reaches lower. The length of a limb is the persistence of its component in the sublevel sets of
-    the height (Edelsbrunner, Letscher and Zomorodian, "Topological persistence and simplification", 2002).
-    The limb that contains the lowest point of the body is left out. For a standing quadruped, the sum
-    therefore contains three of the four legs. For a quadruped that lies on its back, the sum contains no leg.
-    """
+    """Return the sum of the squared lengths of the limbs that hang down."""
+    # A limb extends upwards from its lowest point to the height at which it joins a part of the body that
+    # reaches lower. Its length is the persistence of its component in the sublevel sets of the height
+    # (Edelsbrunner, Letscher and Zomorodian, "Topological persistence and simplification", 2002). The limb
+    # with the lowest point is left out, so a standing quadruped has three legs, and one on its back has none.
     parent, lowest = list(range(len(heights))), heights.tolist()
 
     def root(point: int) -> int:
@@ -279,13 +272,8 @@ def _hanging_limbs(heights: Float64[np.ndarray, " c"], edges: Int64[np.ndarray, 
 
 
 def _stability(heights: Float64[np.ndarray, " c"], ground: Float64[np.ndarray, "c 2"]) -> float:
-    """Return the distance of the body's centre from the boundary of its support.
-
-    The distance is clipped to `_STABILITY_RANGE`.
-
-    The distance is negative if the centre is outside of the support. The support is the convex hull of the
-    lowest points, projected to the ground. The body's centre is at the origin.
-    """
+    """Return the clipped distance from the centre, the origin, to the boundary of the support."""
+    # The support is the convex hull of the lowest points. Outside of it, the distance is negative.
     low = ground[heights <= heights.min() + _CONTACT * np.ptp(heights)]
     angles = np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS
     reach = (low @ np.stack([np.cos(angles), np.sin(angles)])).max(axis=0)

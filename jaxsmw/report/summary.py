@@ -161,7 +161,7 @@ def write_report(
 
 
 def _shown_maps(correspondence: Correspondence, errors: Mapping[str, GeodesicError]) -> dict[str, ShownMap]:
-    """Return the refined map and the initial map, with the errors and functional maps that the page shows."""
+    """Return the refined map and the initial map, as the page shows them."""
     m = len(correspondence.pointwise_map)
     spectra = correspondence.spectrum_x, correspondence.spectrum_y
     convention = correspondence.preset.stages[-1].refiner.convention
@@ -190,10 +190,7 @@ def _save_figures(
     errors: Mapping[str, GeodesicError],
     up: Axis | None,
 ) -> tuple[list[Path], dict[Path, str]]:
-    """Write all figures. Return their files, and a dictionary from files to captions.
-
-    The dictionary contains only figures that are also on the page.
-    """
+    """Write all figures. Return their files, and the captions of the files that are also on the page."""
     mesh_x, mesh_y = correspondence.mesh_x, correspondence.mesh_y
     convention = correspondence.preset.stages[-1].refiner.convention
     figures = {
@@ -217,10 +214,7 @@ def _save_figures(
 
 
 def _last_wavelets(correspondence: Correspondence) -> tuple[WaveletPreservation, int] | None:
-    """Return the refiner and the number of eigenvectors of the last stage that preserves wavelets.
-
-    The refiner of such a stage is a `WaveletPreservation`. The result is None if there is no such stage.
-    """
+    """Return the refiner and the number of eigenvectors of the last stage that preserves wavelets, if any."""
     for stage in reversed(correspondence.preset.stages):
         if isinstance(stage.refiner, WaveletPreservation):
             return stage.refiner, stage.number_of_eigenvectors
@@ -291,10 +285,7 @@ def write_comparison(
 
 
 def _spectra_on_page(mesh_x: Mesh, mesh_y: Mesh, partial: bool) -> tuple[Spectrum, Spectrum] | None:
-    """Return the spectra for a page of two meshes, or None if the meshes have too many vertices.
-
-    If the spectra cannot be computed, the result is also None, and a warning gives the reason.
-    """
+    """Return the spectra for a page, or None if the meshes are too large or, with a warning, unsuitable."""
     pair, room = Pair(mesh_x, mesh_y, partial), eigenvectors_on_page(mesh_x, mesh_y)
     if not room:
         return None
@@ -325,10 +316,7 @@ def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
 
 
 def _error_statistics(error: GeodesicError | None) -> dict[str, str]:
-    """Return a dictionary from the label of each error statistic to its value as text.
-
-    If there are no errors, the dictionary is empty.
-    """
+    """Return the statistics of errors as text, by label."""
     if error is None:
         return {}
     shares = {f"error at most {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
@@ -424,15 +412,9 @@ def provenance() -> dict[str, str]:
 
 
 def _named_errors(error: GeodesicError | None, m: int) -> dict[str, Float64[np.ndarray, " m"]]:
-    """Return a dictionary from the label `Error` to the errors of the m source vertices.
-
-    If there are no errors, the dictionary is empty.
-    """
-    return {} if error is None else {"Error": _per_vertex(error, m)}
-
-
-def _per_vertex(error: GeodesicError, m: int) -> Float64[np.ndarray, " m"]:
-    """Return the mean error of each of the m source vertices; NaN for a vertex without errors."""
+    """Return the mean error of each source vertex, NaN if unknown, by the label on the page."""
+    if error is None:
+        return {}
     total = np.bincount(error.source_vertices, error.errors, minlength=m)
     count = np.bincount(error.source_vertices, minlength=m)
-    return np.divide(total, count, out=np.full(m, np.nan), where=count > 0)
+    return {"Error": np.divide(total, count, out=np.full(m, np.nan), where=count > 0)}

@@ -1,48 +1,89 @@
-"""Fills the HTML templates of the interactive pages."""
+"""Writes interactive pages: fills their HTML templates, and formats tables and lists of facts."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from jaxsmw.report.colors import PLAIN
-from jaxsmw.report.page_data import COLOR_SCALES, encode_bytes
+from jaxsmw.report.colors import PLAIN, error_colors, signed_colors
+from jaxsmw.report.page_data import encode_bytes, encode_colors
+from jaxsmw.report.rendering import ELEVATION
+from jaxsmw.runtime.files import atomic_write
+
+# The colours of each scale (n, 3), evenly spaced. The middle colour of a signed scale belongs to zero.
+_COLOR_SCALES = {
+    "error": error_colors(np.linspace(0, 1, 256), 1.0),
+    "signed": signed_colors(np.linspace(-1, 1, 255), 1.0),
+    "signed_dark": signed_colors(np.linspace(-1, 1, 255), 1.0, on_dark=True),
+}
 
 
-def fill_template(template: str, script: str, data: Mapping[str, Any], fragments: Mapping[str, str]) -> str:
-    """Return the HTML of a page: a template, filled with the data, the fragments and a script.
+def write_html(
+    path: str | os.PathLike[str], template: str, data: Mapping[str, Any], fragments: Mapping[str, str]
+) -> None:
+    """Write a page: a template, filled with the viewer, its data and HTML fragments.
+
+    Question marks replace bytes of file names that are not valid UTF-8.
 
     **Arguments:**
 
-    - `template`, `script`: names of files in `report/assets`.
-    - `data`: the data of the script. JSON must be able to represent the data.
-    - `fragments`: a dictionary from each placeholder of the template to its HTML. Texts in the HTML must be
-      escaped.
+    - `template`: the name of a file in `report/assets`.
+    - `data`: the data of the viewer, which JSON must be able to represent. The colour scales and the
+      elevation of the camera are added.
+    - `fragments`: a dictionary from each placeholder of the template to its HTML.
     """
     assets = files("jaxsmw.report") / "assets"
-    code = (assets / script).read_text("utf-8")
+    viewer = (assets / "viewer.js").read_text("utf-8")
+    shared = {
+        "plain": np.round(255 * PLAIN).astype(int).tolist(),
+        "scales": {name: encode_colors(colors) for name, colors in _COLOR_SCALES.items()},
+        "elevation": ELEVATION,
+    }
     parts = {
         **fragments,
-        **{f"{name}_gradient": _gradient(colors) for name, colors in COLOR_SCALES.items()},
+        **{f"{name}_gradient": _gradient(colors) for name, colors in _COLOR_SCALES.items()},
         "plain_color": _gradient(PLAIN[None]),
         "style": (assets / "style.css").read_text("utf-8").rstrip(),
         # An unescaped "<" could end the script element or open a comment in it.
-        "data": json.dumps(data).replace("<", "\\u003c"),
-        "script": code,
-        "script_hash": f"sha256-{encode_bytes(hashlib.sha256(code.encode()).digest())}",
+        "data": json.dumps({**data, **shared}, ensure_ascii=False).replace("<", "\\u003c"),
+        "script": viewer,
+        "script_hash": f"sha256-{encode_bytes(hashlib.sha256(viewer.encode()).digest())}",
     }
     # All placeholders are replaced in one pass, because inserted text must not be searched for placeholders.
-    return re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], (assets / template).read_text("utf-8"))
+    page = re.sub(r"{{(\w+)}}", lambda match: parts[match[1]], (assets / template).read_text("utf-8"))
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(page.encode("utf-8", "replace"))
 
 
 def _gradient(colors: Float64[np.ndarray, "n 3"]) -> str:
     """Return up to nine colours of a colour scale, as text for a CSS gradient."""
     chosen = np.unique(np.linspace(0, len(colors) - 1, 9).round().astype(int))
     return ", ".join(f"rgb({r} {g} {b})" for r, g, b in np.round(255 * colors[chosen]).astype(int))
+
+
+def facts(values: Mapping[str, str]) -> str:
+    """Return an HTML list of labels and values, both given as text."""
+    rows = (f"<div><dt>{escape(label)}</dt><dd>{escape(value)}</dd></div>" for label, value in values.items())
+    return f"<dl>{''.join(rows)}</dl>"
+
+
+def table(label: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return an HTML table with a label for screen readers. Heads are text; the cells of rows are HTML."""
+    head = "".join(f'<th scope="col">{escape(text)}</th>' for text in heads)
+    body = "".join(
+        f'<tr><th scope="row">{first}</th>{"".join(f"<td>{cell}</td>" for cell in rest)}</tr>'
+        for first, *rest in rows
+    )
+    return (
+        f'<div class="table" role="region" aria-label="{label}" tabindex="0"><table>'
+        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+    )

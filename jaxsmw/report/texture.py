@@ -53,10 +53,7 @@ def write_textured_pair(
 
 
 def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
-    """Return the texture coordinates (n, 2) of all vertices along the mesh's two longest principal axes.
-
-    The texture coordinates of referenced vertices are in [0, 1].
-    """
+    """Return coordinates (n, 2) along the two longest principal axes, in [0, 1] for referenced vertices."""
     used = mesh.vertices[mesh.referenced_vertices]
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
     # The sign of a singular vector is arbitrary. Here, the component with the largest absolute value is

@@ -1,4 +1,4 @@
-// Bundles viewer.js and collection.js and the modules that they import, with the parts of three.js that they use, into
+// Bundles viewer.js and the modules that it imports, with the parts of three.js that they use, into
 // the package's assets. Run `npm ci && npm run build` in this directory.
 
 import { createHash } from "node:crypto";
@@ -12,7 +12,7 @@ const digest = hash.digest("hex");
 const license = readFileSync(new URL("node_modules/three/LICENSE", import.meta.url), "utf8");
 
 await build({
-  entryPoints: ["viewer.js", "collection.js"],
+  entryPoints: ["viewer.js"],
   outdir: assets.pathname,
   bundle: true,
   minify: true,

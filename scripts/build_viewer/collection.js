@@ -1,6 +1,5 @@
 // The page of a collection: all shapes as small pictures, two shapes to compare, the mean shape with its modes, the
-// matched pairs and the scores. build.mjs bundles this module with three.js into jaxsmw/report/assets/collection.js,
-// which collection.html embeds.
+// matched pairs and the scores.
 
 import { Vector3 } from "three";
 import { Body, decode } from "./body.js";
@@ -8,7 +7,7 @@ import { Cameras } from "./cameras.js";
 import { startDeformation } from "./collection_modes.js";
 import { startPlots } from "./collection_plots.js";
 import { drawThumbnails, makeGallery } from "./collection_gallery.js";
-import { watchPointer } from "./pointer.js";
+import { watchPointer } from "./input.js";
 
 const WITHIN_SCALE = 0.98; // the share of distances inside the colour scale; the rest is clipped
 const WIDE = 0.9; // narrow screens show bodies one above the other if they are wider than this multiple of their height
@@ -17,7 +16,7 @@ const byId = (id) => document.getElementById(id);
 const data = JSON.parse(byId("data").textContent);
 const faces = decode(data.faces, Uint32Array);
 const colors = decode(data.colors, Uint8Array);
-const scale = decode(data.scale, Uint8Array);
+const scale = decode(data.scales.error, Uint8Array);
 const plain = Uint8Array.from(colors, (_, i) => data.plain[i % 3]);
 const numbers = data.vertices && decode(data.vertices, Uint32Array);
 

@@ -1,7 +1,7 @@
 // The small pictures of all shapes, drawn by one renderer that is removed afterwards.
 
 import { Body } from "./body.js";
-import { rove } from "./rove.js";
+import { rove } from "./input.js";
 
 const SIZE = 132; // pixels
 const MANY = 24; // narrow screens show more pictures than this in two rows

@@ -1,6 +1,6 @@
 // Two plots of all shapes, in SVG: the matched pairs as a graph, and the scores of two modes.
 
-import { rove } from "./rove.js";
+import { rove } from "./input.js";
 
 const CROWDED = 0.5; // if nodes and names need more than this share of the graph, the names are left out
 const NAMED_SCORES = 12; // the most shapes whose names are written next to their scores

@@ -1,5 +1,6 @@
 // Reads and writes landmark files: 3D Slicer Markups (.mrk.json), .fcsv, .csv, .txt and MeshLab's .pp.
-// Every fault is an Error whose message is one sentence.
+// A page is a file without Python behind it, so it parses the files that a user drops on it. Landmarks that jaxsmw has
+// read are in the data of the page. Every fault is an Error whose message is one sentence.
 
 const LARGEST_FILE = 20e6; // bytes
 const MOST_LANDMARKS = 1000;

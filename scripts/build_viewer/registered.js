@@ -1,13 +1,14 @@
 // The source, blended between its own shape and its registered shape, drawn over the target.
 
 import { BufferAttribute, BufferGeometry, DoubleSide, Mesh, MeshStandardMaterial } from "three";
+import { decode } from "./body.js";
 
 const TARGET_OPACITY = 0.3;
 
 export function startRegistered({ bodies: { x, y }, data, draw }) {
   const byId = (id) => document.getElementById(id);
   if (!data.registered) return;
-  const registered = new Float32Array(Uint8Array.from(atob(data.registered), (c) => c.charCodeAt(0)).buffer);
+  const registered = decode(data.registered, Float32Array);
   const overlay = makeOverlay(x);
   y.scene.add(overlay);
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from frame_study.measurement import DATA_SETS, INVARIANCE_FRAMES, PairName, Settings, read_pair, wavelets
 from frame_study.summary import Study
@@ -14,10 +15,16 @@ from frame_study.variants import ABLATIONS, CONVENTIONS, UPDATES, Variant, frame
 from jaxsmw import compute_spectrum
 from jaxsmw.benchmark.journal import Row
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.report.figures import draw_forest, draw_functions, draw_heat_maps, save_figure
+from jaxsmw.errors import InputError
+from jaxsmw.report.figures import FAINT, INK, LINE_COLORS, draw_functions, new_figure, save_figure, style_axes
 from jaxsmw.report.rendering import camera_axes, choose_azimuth
 from jaxsmw.report.standing import stand
 from jaxsmw.report.summary import draw_bank
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 
 
 def draw_figures(output: Path, data: Path, study: Study, parameters: Sequence[Row]) -> None:
@@ -100,3 +107,128 @@ def _draw_parameters(output: Path, parameters: Sequence[Row], settings: Settings
             label="mean error (x 10⁻³ √area)",
         )
         save_figure(output / f"parameters_{name}.png", figure)
+
+
+def draw_forest(
+    panels: Mapping[str, Mapping[str, Float[np.ndarray, "rows 3"]]],
+    *,
+    rows: Sequence[str],
+    xlabel: str,
+    linear_up_to: float = 1.0,
+) -> Figure:
+    """Draw estimates with their intervals, and a vertical line at zero, in one or several panels.
+
+    `panels[title][name]` is one series of a panel, (rows, 3): an estimate, and the lower and upper end of its
+    interval, or NaN. All panels have the same series. The scale is linear up to `linear_up_to` and
+    logarithmic elsewhere, so small and large estimates are both visible.
+
+    **Raises:** `InputError` if a series does not have three numbers per row.
+    """
+    for title, series in panels.items():
+        for name, intervals in series.items():
+            if np.shape(intervals) != (len(rows), 3):
+                raise InputError(
+                    f"{title}, {name}: the array has shape {np.shape(intervals)}, but {len(rows)} rows need "
+                    f"shape {(len(rows), 3)}."
+                )
+    names = list(dict.fromkeys(name for series in panels.values() for name in series))
+    pitch = 0.075 * len(names) + 0.1
+    figure = new_figure(2.6 + 3.3 * len(panels), 1.2 + pitch * len(rows), plot=True)
+    from matplotlib.ticker import NullLocator, SymmetricalLogLocator
+
+    grid = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    heights = np.arange(len(rows), dtype=float)
+    for axes, (title, series) in zip(grid, panels.items(), strict=True):
+        axes.set_xscale("symlog", linthresh=linear_up_to, linscale=1.0)
+        for band in range(0, len(rows), 2):
+            axes.axhspan(band - 0.5, band + 0.5, color="#f4f5f7", linewidth=0, zorder=0)
+        axes.axvline(0, color=FAINT, linewidth=0.8, zorder=1)
+        for index, name in enumerate(names):
+            estimate, low, high = np.asarray(series[name], dtype=float).T
+            color = LINE_COLORS[index % len(LINE_COLORS)]
+            offset = 0.7 * ((index + 0.5) / len(names) - 0.5)
+            axes.hlines(heights + offset, low, high, color=color, linewidth=1.1, zorder=2)
+            axes.plot(
+                estimate,
+                heights + offset,
+                linestyle="none",
+                marker=MARKERS[index % len(MARKERS)],
+                markersize=3.4,
+                color=color,
+                label=name,
+                zorder=3,
+            )
+        axes.set_title(title, fontsize=9, color=INK)
+        axes.set_xlabel(xlabel)
+        axes.xaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=linear_up_to))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:+g}".replace("-", "−") if value else "0")
+        style_axes(axes)
+        axes.grid(axis="x", color="#e6e8ec", linewidth=0.6)
+        axes.tick_params(axis="y", length=0)
+    grid[0].set_yticks(heights, rows)
+    grid[0].set_ylim(len(rows) - 0.5, -0.5)
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside upper center",
+        ncols=min(len(names), 4),
+        frameon=False,
+        fontsize=8,
+        labelcolor=INK,
+    )
+    return figure
+
+
+def draw_heat_maps(
+    panels: Mapping[str, Float[np.ndarray, "rows columns"]],
+    *,
+    rows: tuple[str, Sequence[object]],
+    columns: tuple[str, Sequence[object]],
+    label: str,
+) -> Figure:
+    """Draw tables of positive numbers as heat maps with one logarithmic colour scale.
+
+    `panels` maps the title of each table to its numbers. `rows` and `columns` contain the name of a
+    parameter and its values. `label` is the label of the colour scale.
+
+    **Raises:** `InputError` if a table does not fit the rows and columns, or if an entry is not positive.
+    """
+    shape = len(rows[1]), len(columns[1])
+    for title, table in panels.items():
+        if np.shape(table) != shape or not (np.isfinite(table).all() and np.min(table) > 0):
+            raise InputError(
+                f"{title}: the table must have shape {shape} and positive entries, but its shape is "
+                f"{np.shape(table)} and its smallest entry is {np.min(table)}."
+            )
+    size = 1.2 + (0.6 + 0.42 * shape[1]) * len(panels), max(2.6, 1.1 + 0.3 * shape[0])
+    figure = new_figure(*size, plot=True)
+    from matplotlib.colors import LogNorm
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    everything = np.concatenate([np.ravel(table) for table in panels.values()])
+    norm = LogNorm(everything.min(), max(everything.max(), 1.01 * everything.min()))
+    grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (title, table) in zip(grid, panels.items(), strict=True):
+        image = axes.imshow(table, cmap="cividis", norm=norm, aspect="auto", interpolation="nearest")
+        for (row, column), value in np.ndenumerate(np.asarray(table)):
+            text = f"{value:.1f}" if value < 100 else f"{value:.0f}"
+            color = INK if norm(value) > 0.55 else "white"
+            axes.text(column, row, text, ha="center", va="center", fontsize=7, color=color)
+        axes.set_title(title, fontsize=9, color=INK)
+        axes.set_xlabel(columns[0])
+        axes.set_xticks(range(shape[1]), [str(value) for value in columns[1]])
+        style_axes(axes)
+        axes.spines[:].set_visible(False)
+        axes.tick_params(length=0)
+    grid[0].set_ylabel(rows[0])
+    grid[0].set_yticks(range(shape[0]), [str(value) for value in rows[1]])
+    scale = figure.colorbar(image, ax=list(grid), pad=0.02)
+    scale.set_label(label, fontsize=8, color=INK)
+    scale.ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    scale.ax.yaxis.set_minor_locator(NullLocator())
+    scale.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    scale.outline.set_visible(False)
+    style_axes(scale.ax)
+    return figure
