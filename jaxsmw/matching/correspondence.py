@@ -21,7 +21,7 @@ from jaxsmw.core.triangles import nearest_point_on_candidates
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices
-from jaxsmw.geometry.mesh import Mesh, extend_from
+from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import program_size
 from jaxsmw.matching.presets import Preset
@@ -76,6 +76,8 @@ class Correspondence:
       to two pairs of coarse maps and keeps the smaller evidence (`jaxsmw.matching.search.chirality.Hands`).
       If X and Y differ enough from their own mirror images, a value of at least 0.05 leads to
       `mirrored=True`. Most correct decisions with `mirrored=True` have values above 0.3.
+    - `left_out`: the share of X's area in small components that have no counterpart on Y and only move with
+      their surroundings; see `jaxsmw.transfer.match_small_components`.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. If meshes of a certain
       size are refined for the first time, the time includes compilation.
     """
@@ -93,6 +95,7 @@ class Correspondence:
     suspicious: bool = False
     mirrored: bool = False
     mirror_evidence: float | None = None
+    left_out: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __repr__(self) -> str:
@@ -160,7 +163,8 @@ class Correspondence:
         with self._precision():
             padded = np.asarray(compiled(reverse_map)(*self._last_stage()))
         found = padded[: len(self.mesh_y.vertices)].astype(np.int64)
-        return extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, found)
+        found = extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, found)
+        return self.pair.reversed().with_small_components(found)[0]
 
     def _points_near(
         self,
@@ -171,6 +175,8 @@ class Correspondence:
     ) -> SurfacePoints:
         """Return, for each embedded source vertex, the nearest point on the triangles around its match."""
         mesh_x, mesh_y = pair.meshes
+        # A vertex of a small component of Y is in no face, so the nearest vertex with faces stands for it.
+        matches = extend_to_unreferenced(mesh_y, np.arange(len(mesh_y.vertices)))[matches]
         with self._precision():
             rows, candidates = mesh_y.faces_around(matches)
             # Padding lets pairs of similar sizes share compiled programs.
@@ -225,7 +231,8 @@ class Correspondence:
         queries, database = self._embeddings()
         used = self.mesh_x.referenced_vertices
         found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.referenced_vertices)
-        return extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, found)
+        found = extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, found)
+        return self.pair.with_small_components(found)[0]
 
     def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
         """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.

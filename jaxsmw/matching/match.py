@@ -30,6 +30,7 @@ from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.errors import check_choice
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike
+from jaxsmw.geometry.scans import SMALL_CLOSED
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.judge import Outcome
 from jaxsmw.matching.pair import Pair, paired_spectra
@@ -68,7 +69,8 @@ def match(
     hand with a hip; see `jaxsmw.geometry.cut_shortcuts`. The result refers to the given meshes.
 
     The function issues a `UserWarning` if the final map looks wrong, if X and its mirror image match Y about
-    equally well, or if a mesh is too coarse for the descriptors of the preset.
+    equally well, or if a mesh is too coarse for the descriptors of the preset. It also issues one if small
+    components without a counterpart have more than 5 % of X's area.
 
     **Arguments:**
 
@@ -140,8 +142,9 @@ def match(
 
     **Returns:** A `Correspondence`, whose attribute `pointwise_map` (m,) is an int64 array of 0-based
     vertices of Y. A `Correspondence` also has the attributes `functional_map`, `spectrum_x`, `spectrum_y`,
-    `distortion` and `suspicious`. An unreferenced vertex of X (in no face) receives the match of the nearest
-    referenced vertex. Unreferenced vertices of Y are never matched.
+    `distortion` and `suspicious`. Small components, such as eyes, move with their surroundings and are
+    matched to their counterparts on Y; see `jaxsmw.transfer.match_small_components`. Any other unreferenced
+    vertex of X (in no face) receives the match of the nearest vertex. Such vertices of Y are never matched.
 
     **Raises:** `InputError` if a mesh cannot be used or has too few vertices, if the preset or the initial
     map is unknown or does not fit the meshes, or if another argument is invalid. `ArithmeticError` if the
@@ -216,11 +219,18 @@ class Match(NamedTuple):
     decision: Decision
 
     def warn_if_suspicious(self) -> None:
-        """Issue a `UserWarning` if the map looks wrong, or if the hand of X is doubtful."""
+        """Issue a `UserWarning` if the map looks wrong or leaves much out, or the hand of X is doubtful."""
         if self.outcome.suspicious:
             repair = self.correspondence.preset.repair
             warning = _warning(self.prepared, repair, self.outcome, mirrored=self.decision.mirrored)
             warnings.warn(warning, stacklevel=3)
+        if (share := self.correspondence.left_out) > SMALL_CLOSED:
+            warnings.warn(
+                f"{self.correspondence.pair.name}: {share:.0%} of the source's area lies in small components "
+                "that have no counterpart on the target, so they only move with their surroundings. If they "
+                "are parts of one surface, join them, for example by welding (weld=True, --weld).",
+                stacklevel=3,
+            )
         if self.decision.doubtful:
             warnings.warn(_doubt(self.prepared.pair, self.decision), stacklevel=3)
 
@@ -363,9 +373,10 @@ def _correspondence(
         )
         raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
     spectrum_x, spectrum_y = prepared.view(preset.stages[-1], padded=False)
+    pointwise_map, left_out = pair.with_small_components(np.asarray(last.pointwise_map).astype(np.int64))
     return Correspondence(
         pair=pair,
-        pointwise_map=np.asarray(last.pointwise_map).astype(np.int64),
+        pointwise_map=pointwise_map,
         initial_map=np.asarray(outcome.initial_map)[:m].astype(np.int64),
         init=prepared.init if isinstance(prepared.init, str) else None,
         preset=preset,
@@ -377,6 +388,7 @@ def _correspondence(
         suspicious=outcome.suspicious or decision.doubtful,
         mirrored=decision.mirrored,
         mirror_evidence=decision.evidence,
+        left_out=left_out,
         seconds=seconds,
     )
 

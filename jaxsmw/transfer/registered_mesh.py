@@ -14,11 +14,12 @@ from scipy.sparse.linalg import cg
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
-from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
+from jaxsmw.geometry.mesh import Mesh, connected_components
 from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_facing_points, nearest_surface_points
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.transfer.coverage import Attraction, UncoveredVertices
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
+from jaxsmw.transfer.small_components import follow_surroundings
 from jaxsmw.wording import count_of
 
 DEFAULT_STIFFNESS = 0.005
@@ -91,8 +92,9 @@ class RegisteredMesh:
       rotations (m, 3, 3) and scales (m,). These transformations take X to the registered mesh. The scales
       include the change from X's unit of length to Y's.
 
-    An unreferenced vertex of X moves with the nearest referenced vertex. Both vertices have the same
-    similarity transformation. Vertices that welding merges keep exactly the same position.
+    A small component of X moves rigidly with its surroundings, to its counterpart on Y if there is one; see
+    `follow_surroundings`. Any other unreferenced vertex moves with the nearest vertex. Vertices that welding
+    merges keep exactly the same position.
     """
 
     mesh_x: Mesh
@@ -346,7 +348,8 @@ def register_mesh(
                 near = around.averaging @ near
             weights = np.where(near > 0, of_round.factor * weights, weights)
     similarities = Similarities(similarities.rotations, around.size * similarities.scales)
-    return RegisteredMesh(mesh_x, mesh_y, *_with_unreferenced(mesh_x, positions + middle, similarities))
+    following = follow_surroundings(mesh_x, mesh_y, positions + middle, similarities)
+    return RegisteredMesh(mesh_x, mesh_y, following.positions, following.similarities)
 
 
 def _islands(
@@ -375,16 +378,6 @@ def _with_islands_moved(
         similarities = around.similarities(positions)
     moved = RegisteredMesh(around.mesh, target, positions, similarities).surface_points.positions(target)
     return np.where(weights[:, None] == 0, moved, mapped)
-
-
-def _with_unreferenced(
-    mesh_x: Mesh, positions: Float64[np.ndarray, "m 3"], similarities: Similarities
-) -> tuple[Float64[np.ndarray, "m 3"], Similarities]:
-    """Move each unreferenced vertex with the nearest referenced vertex."""
-    nearest = extend_to_unreferenced(mesh_x, np.arange(len(positions)))
-    followed = Similarities(similarities.rotations[nearest], similarities.scales[nearest])
-    offsets = followed.of_vectors(mesh_x.vertices - mesh_x.vertices[nearest])
-    return positions[nearest] + offsets, followed
 
 
 def points_of_map(
