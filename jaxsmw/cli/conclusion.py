@@ -78,6 +78,8 @@ def show_quality(correspondence: Correspondence, expected_error: Float[np.ndarra
             from jaxsmw.wording import percentage
 
             parts.append(f"wrong on a part of the body with probability {percentage(probability)}")
+    if correspondence.left_out:
+        parts.append(f"{correspondence.left_out:.1%} of the source has no counterpart (small components)")
     if correspondence.suspicious:
         parts.append("the map is suspicious")
     if parts:
