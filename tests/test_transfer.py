@@ -26,7 +26,7 @@ from jaxsmw.transfer import (
     transfer_attributes,
     transfer_landmarks,
 )
-from jaxsmw.transfer.coverage import UncoveredVertices
+from jaxsmw.transfer.coverage import UncoveredVertices, at_slits
 from jaxsmw.transfer.landmarks import nearest_vertices
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 from jaxsmw.transfer.registered_mesh import _follow
@@ -433,6 +433,71 @@ def decorated(mesh: Mesh) -> MeshData:
         blend_shapes={"smile": random.normal(size=(n, 3))},
         label_names={"group": ("left", "unused", "right")},
     )
+
+
+def without_strip(mesh: Mesh, width: float) -> Mesh:
+    """The mesh without the faces whose centroid has an x coordinate of at most half the width."""
+    x = mesh.vertices[mesh.faces, 0].mean(axis=1)
+    return mesh.without_faces(np.abs(x) <= width / 2)
+
+
+class TestSlits:
+    """The registered mesh bridges thin slits of the target."""
+
+    PLATE = make_mesh((grid_mesh(21, 21)[0] - 0.5) * [1, 1, 0], grid_mesh(21, 21)[1])
+
+    def test_both_lips_of_a_slit_are_found(self):
+        slit = without_strip(self.PLATE, 0.11)
+        x, y = slit.vertices[:, 0], slit.vertices[:, 1]
+        lips = np.isclose(np.abs(x), 0.05) & (np.abs(y) < 0.49)
+        found = at_slits(slit, 0.12)
+        assert lips.sum() == 38 and found[lips].all()
+        assert not found[np.abs(x) > 0.06].any()  # the outer boundary has no opposite lip
+        assert not at_slits(slit, 0.09).any()
+
+    def test_the_result_does_not_depend_on_numbers_and_place(self):
+        slit = without_strip(self.PLATE, 0.11)
+        order = np.random.default_rng(0).permutation(len(slit.vertices))
+        turned = make_mesh(5 * slit.vertices[order] @ TURN.T + SHIFT, np.argsort(order)[slit.faces])
+        assert np.array_equal(at_slits(turned, 5 * 0.12), at_slits(slit, 0.12)[order])
+
+    def test_bridges_seams_and_back_to_back_boundaries_are_no_slits(self):
+        x = np.abs(self.PLATE.vertices[self.PLATE.faces, 0].mean(axis=1))
+        bridge = self.PLATE.without_faces((x > 0.05) & (x < 0.3))  # a strip of surface between two wide holes
+        assert not at_slits(bridge, 0.12).any()
+        left = self.PLATE.vertices[self.PLATE.faces, 0].mean(axis=1) < 0
+        copies = np.where(left[:, None], self.PLATE.faces, self.PLATE.faces + len(self.PLATE.vertices))
+        seam = make_mesh(np.vstack([self.PLATE.vertices, self.PLATE.vertices]), copies)
+        assert len(seam.boundary_edges) > len(self.PLATE.boundary_edges) and not at_slits(seam, 0.12).any()
+        tube = cylinder(20, 60).mesh  # opposite sides of an open end are nearer than the width
+        assert len(tube.boundary_edges) and not at_slits(tube, 3.0).any()
+        assert not at_slits(bumpy_mesh(3), 1.0).any()
+
+    def test_a_map_that_is_drawn_to_the_lips_is_bridged(self):
+        mesh, width = bumpy_mesh(4), 0.02
+        slit = without_strip(mesh, width)
+        drawn = mesh.vertices.copy()
+        near = np.abs(drawn[:, 0]) < 0.1
+        drawn[near, 0] = np.where(drawn[near, 0] < 0, -0.05, 0.05)
+        points = nearest_surface_points(drawn, slit)[0]
+        with pytest.warns(UserWarning, match=r"thin slits cut the target\. \d+% of the area"):
+            registered = register_mesh(mesh, slit, points, scale=1.0)
+        on_closed = register_mesh(mesh, mesh, nearest_surface_points(points.positions(slit), mesh)[0])
+        error, without = (
+            in_percent(one.vertices - mesh.vertices, mesh)[near].mean() for one in (registered, on_closed)
+        )
+        assert error < 0.5 * without
+        assert 0.05 < registered.bridged < 0.5 and on_closed.bridged == 0
+        assert any("slits" in sentence for sentence in registered.sentences())
+        assert not any("slits" in sentence for sentence in on_closed.sentences())
+
+    def test_slits_of_the_source_itself_are_kept(self):
+        """A mouth, for example, is matched to a mouth."""
+        slit = without_strip(bumpy_mesh(4), 0.02)
+        registered = register_mesh(slit, slit, nearest_surface_points(slit.vertices, slit)[0], scale=1.0)
+        assert registered.bridged == 0
+        used = slit.referenced_vertices
+        assert in_percent(registered.vertices - slit.vertices, slit)[used].max() < 1e-3
 
 
 class TestAttributes:

@@ -63,6 +63,8 @@ def show_quality(correspondence: Correspondence) -> None:
     parts.append(f"area-weighted mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)")
     if (probability := correspondence.wrong_probability()) is not None:
         parts.append(f"wrong on a part of the body with probability {percentage(probability)}")
+    if correspondence.left_out:
+        parts.append(f"{correspondence.left_out:.1%} of the source has no counterpart (small components)")
     if correspondence.suspicious:
         parts.append("the map is suspicious")
     show(f"quality:     {', '.join(parts)}")

@@ -62,6 +62,8 @@ class Mesh:
       unreferenced vertices.
     - `dropped_faces`: the faces of the file that cleaning dropped, as ascending 0-based indices (d,).
       In ground-truth files, face numbers refer to all faces of the mesh file, including dropped faces.
+    - `small_faces`: the faces of small components (g, 3), which are among the dropped faces. Small components
+      take no part in a match, but move with their surroundings; see `make_mesh`.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -69,6 +71,7 @@ class Mesh:
     name: str = "mesh"
     notes: tuple[str, ...] = ()
     dropped_faces: Int64[np.ndarray, " d"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    small_faces: Int64[np.ndarray, "g 3"] = field(default_factory=lambda: np.empty((0, 3), dtype=np.int64))
 
     def mirrored(self) -> Mesh:
         """Return the mirror image of the mesh: all x coordinates change sign.
@@ -80,6 +83,7 @@ class Mesh:
             self,
             vertices=self.vertices * np.array([-1.0, 1.0, 1.0]),
             faces=np.ascontiguousarray(self.faces[:, ::-1]),
+            small_faces=np.ascontiguousarray(self.small_faces[:, ::-1]),
         )
 
     @property
@@ -422,7 +426,8 @@ def make_mesh(
     faces do not count: they are always moved if their position is not finite. If one component has
     at least half of the area, the faces of components with less than 1 % of the area are dropped. For closed
     components, such as enclosed bubbles, the limit is 5 %. Vertices that lose all their faces become
-    unreferenced, and receive the match of the nearest referenced vertex.
+    unreferenced. The vertices of small components are matched by `jaxsmw.transfer.match_small_components`.
+    All other unreferenced vertices receive the match of the nearest vertex.
 
     **Arguments:**
 
@@ -505,10 +510,10 @@ def make_mesh(
     if count:
         notes.append(
             f"{count_of(count, 'small component')} with {mesh.face_areas[small].sum() / mesh.area:.1%} of "
-            f"the area ignored ({count_of(int(small.sum()), 'face')}): the vertices receive the match of the "
-            "nearest vertex."
+            f"the area left out ({count_of(int(small.sum()), 'face')}): they take no part in the match, but "
+            "move with their surroundings."
         )
-        mesh = with_faces(number[~small])
+        mesh = replace(with_faces(number[~small]), small_faces=triangles[number[small]])
     return replace(mesh, notes=(*notes, *_unusual_vertices(mesh)))
 
 

@@ -13,11 +13,11 @@ _MOST_LOST = 1e-3
 # distances. It is also lost if its position is not finite. Some scans have coordinates of about 1e30, because
 # a program wrote uninitialised memory.
 _FAR = 100.0
-# A component is small if its share of the mesh's area is below _SMALL, or below _SMALL_CLOSED for a closed
+# A component is small if its share of the mesh's area is below _SMALL, or below SMALL_CLOSED for a closed
 # component. If the share of the largest component is below _LARGEST, no component is small. In scans, small
 # components are dust and enclosed bubbles. A component with 5 % of the area has fewer than 10 of 200
 # eigenfunctions, so its vertices cannot be matched. An open component of this size can be a severed limb.
-_SMALL, _SMALL_CLOSED, _LARGEST = 0.01, 0.05, 0.5
+_SMALL, SMALL_CLOSED, _LARGEST = 0.01, 0.05, 0.5
 
 
 def usable_positions(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
@@ -76,7 +76,7 @@ def in_small_components(
     areas = np.bincount(component, weights=face_areas)
     has_faces = np.bincount(component) > 0
     is_open = np.bincount(component, weights=at_boundary) > 0
-    small = (areas < np.where(is_open, _SMALL, _SMALL_CLOSED) * areas.sum()) & has_faces
+    small = (areas < np.where(is_open, _SMALL, SMALL_CLOSED) * areas.sum()) & has_faces
     if areas.max() < _LARGEST * areas.sum():
         small[:] = False
     return small[component], int(small.sum())

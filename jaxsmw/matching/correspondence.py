@@ -79,6 +79,8 @@ class Correspondence:
       to two pairs of coarse maps and keeps the smaller evidence (`jaxsmw.matching.search.chirality.Hands`).
       If X and Y differ enough from their own mirror images, a value of at least 0.05 leads to
       `mirrored=True`. Most correct decisions with `mirrored=True` have values above 0.3.
+    - `left_out`: the share of X's area in small components that have no counterpart on Y and only move with
+      their surroundings; see `jaxsmw.transfer.match_small_components`.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. If meshes of a certain
       size are refined for the first time, the time includes compilation.
     """
@@ -96,6 +98,7 @@ class Correspondence:
     suspicious: bool = False
     mirrored: bool = False
     mirror_evidence: float | None = None
+    left_out: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -113,7 +116,8 @@ class Correspondence:
                 else ""
             )
             raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
-        found = extend_to_unreferenced(prepared.pair.mesh_x, outcome.pointwise_map)
+        extended = extend_to_unreferenced(prepared.pair.mesh_x, outcome.pointwise_map)
+        found, left_out = pair.with_small_components(extended)
         seen = prepared.spectra.seen_by(preset.stages[-1])
         return cls(
             pair=pair,
@@ -130,6 +134,7 @@ class Correspondence:
             distortion=scored.distortion,
             suspicious=scored.suspicious,
             mirrored=prepared.mirrored,
+            left_out=left_out,
         )
 
     def __repr__(self) -> str:
@@ -196,7 +201,8 @@ class Correspondence:
         """
         with self._precision():
             found = reverse_map(self._refiner, self._spectra, self.refinement.state)
-        return extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, found)
+        found = extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, found)
+        return self.pair.reversed().with_small_components(found)[0]
 
     def _points_near(
         self,
@@ -207,6 +213,8 @@ class Correspondence:
     ) -> SurfacePoints:
         """Return, for each embedded source vertex, the nearest point on the triangles around its match."""
         mesh_y = pair.mesh_y
+        # A vertex of a small component of Y is in no face, so the nearest vertex with faces stands for it.
+        matches = extend_to_unreferenced(mesh_y, np.arange(len(mesh_y.vertices)))[matches]
         with self._precision():
             rows, candidates = mesh_y.faces_around(matches)
             faces, weights = nearest_points(queries, database, mesh_y.faces, rows, candidates)
@@ -249,7 +257,8 @@ class Correspondence:
         queries, database = self._embeddings()
         used = self.mesh_x.referenced_vertices
         found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.referenced_vertices)
-        return extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, found)
+        found = extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, found)
+        return self.pair.with_small_components(found)[0]
 
     def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
         """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.

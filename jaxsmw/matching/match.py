@@ -27,6 +27,7 @@ from jaxsmw.choices import (
 from jaxsmw.errors import check_choice
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike
+from jaxsmw.geometry.scans import SMALL_CLOSED
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import Outcome, Start, compile_stage
 from jaxsmw.matching.judge import Scored, estimate_error
@@ -66,7 +67,8 @@ def match(
     hand with a hip; see `jaxsmw.geometry.cut_shortcuts`. The result refers to the given meshes.
 
     The function issues a `UserWarning` if the final map looks wrong, if X and its mirror image match Y about
-    equally well, or if a mesh is too coarse for the descriptors of the preset.
+    equally well, or if a mesh is too coarse for the descriptors of the preset. It also issues one if small
+    components without a counterpart have more than 5 % of X's area.
 
     **Arguments:**
 
@@ -138,8 +140,9 @@ def match(
 
     **Returns:** A `Correspondence`, whose attribute `pointwise_map` (m,) is an int64 array of 0-based
     vertices of Y. A `Correspondence` also has the attributes `functional_map`, `spectrum_x`, `spectrum_y`,
-    `distortion` and `suspicious`. An unreferenced vertex of X (in no face) receives the match of the nearest
-    referenced vertex. Unreferenced vertices of Y are never matched.
+    `distortion` and `suspicious`. Small components, such as eyes, move with their surroundings and are
+    matched to their counterparts on Y; see `jaxsmw.transfer.match_small_components`. Any other unreferenced
+    vertex of X (in no face) receives the match of the nearest vertex. Such vertices of Y are never matched.
 
     **Raises:** `InputError` if a mesh cannot be used or has too few vertices, if the preset or the initial
     map is unknown or does not fit the meshes, or if another argument is invalid. `ArithmeticError` if the
@@ -184,6 +187,8 @@ def match(
     found = match_prepared(prepared, starts, chosen, history=history, step=step)
     if found.suspicious:
         warnings.warn(_warning(found, landmarks=starts[0].origin == "landmarks"), stacklevel=2)
+    if found.left_out > SMALL_CLOSED:
+        warnings.warn(_omission(found), stacklevel=2)
     if decision.doubtful:
         warnings.warn(_doubt(pair, decision), stacklevel=2)
     return replace(
@@ -285,6 +290,15 @@ def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> None:
     numbers = [len(mesh.vertices) for mesh in pair.meshes]
     for stage in stages:
         compile_stage(stage, *numbers, partial=pair.partial, history=history)
+
+
+def _omission(found: Correspondence) -> str:
+    """Return the text of the warning that small components have no counterpart."""
+    return (
+        f"{found.pair.name}: {found.left_out:.0%} of the source's area lies in small components that have no "
+        "counterpart on the target, so they only move with their surroundings. If they are parts of one "
+        "surface, join them, for example by welding (weld=True, --weld)."
+    )
 
 
 def _doubt(pair: Pair, decision: Decision) -> str:

@@ -7,12 +7,14 @@ import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Int64
 
 from jaxsmw.choices import Scale
 from jaxsmw.errors import InputError, check_choice, check_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.geometry.scale import estimate_scale, relative_boundary
 from jaxsmw.geometry.shortcuts import cut_shortcuts
+from jaxsmw.transfer.small_components import match_small_components
 
 logger = logging.getLogger("jaxsmw")
 
@@ -147,6 +149,13 @@ class Pair:
         """
         meshes = cut_shortcuts(self.mesh_x), cut_shortcuts(self.mesh_y)
         return self if meshes == self.meshes else replace(self, mesh_x=meshes[0], mesh_y=meshes[1])
+
+    def with_small_components(
+        self, pointwise_map: Int64[np.ndarray, " m"]
+    ) -> tuple[Int64[np.ndarray, " m"], float]:
+        """Match the small components of X as well; see `jaxsmw.transfer.match_small_components`."""
+        unit_x, unit_y = self.units_of_length
+        return match_small_components(*self.meshes, pointwise_map, scale=unit_y / unit_x)
 
     def reversed(self) -> Pair:
         """Return the pair with X and Y exchanged."""

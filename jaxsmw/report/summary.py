@@ -401,6 +401,8 @@ def summarize(
     facts["expected error, mean"] = f"{expected:.4f} √area"
     if (probability := correspondence.wrong_probability()) is not None:
         facts["probability of a wrong part"] = percentage(probability)
+    if correspondence.left_out:
+        facts["small components without counterpart"] = f"{correspondence.left_out:.1%} of the source's area"
     steps = correspondence.seconds if seconds is None else seconds
     times = {**steps, "total": sum(steps.values())}
     return facts | {f"time, {step}": f"{time:.2f} s" for step, time in times.items()}

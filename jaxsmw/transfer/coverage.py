@@ -1,4 +1,4 @@
-"""Vertices of the target that a deformed source should reach but does not."""
+"""Vertices of the target that a deformed source should reach but does not, and slits that it bridges."""
 
 from __future__ import annotations
 
@@ -6,16 +6,19 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.sparse import csr_array, diags_array
+from scipy.spatial import KDTree
 
-from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.mesh import Mesh, first_equal_rows
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 
 # A vertex of the target is uncovered if its distance from the source is between `_UNCOVERED` and `_MISSING`.
 # Distances are in units of the square root of the target's area. Vertices at larger distances would stretch
 # single triangles into spikes. (Entry R37 of docs/research_log.md)
 _UNCOVERED, _MISSING = 0.005, 0.03
+# A vertex on the lip of a slit is compared with this number of nearest boundary vertices.
+_NEIGHBORS = 32
 
 
 class Attraction(NamedTuple):
@@ -97,3 +100,50 @@ class UncoveredVertices:
         return Attraction(
             interpolation, self._areas[rows] * (interpolation @ strengths), self._positions[rows]
         )
+
+
+def at_slits(mesh: Mesh, width: float) -> Bool[np.ndarray, " n"]:
+    """Return a mask of the vertices on the lips of slits and pinholes (n,).
+
+    Two boundary vertices lie on opposite lips if their distance is at most `width`, each lies in front of the
+    other's boundary, and their normals agree. Seams of duplicated vertices are not slits.
+    """
+    n = len(mesh.vertices)
+    tails, heads, thirds = (np.roll(mesh.faces, -shift, axis=1).ravel() for shift in range(3))
+    numbers = np.minimum(tails, heads) * n + np.maximum(tails, heads)
+    at_boundary = np.isin(numbers, mesh.boundary_edges @ [n, 1])
+    tails, heads, thirds = tails[at_boundary], heads[at_boundary], thirds[at_boundary]
+    # The outward direction of a boundary edge is perpendicular to the edge, in the plane of its face.
+    along, inward = (mesh.vertices[ends] - mesh.vertices[tails] for ends in (heads, thirds))
+    along = _unit(along)
+    outward = _unit(along * (along * inward).sum(axis=1, keepdims=True) - inward)
+    sums = np.zeros((n, 3))
+    np.add.at(sums, tails, outward)
+    np.add.at(sums, heads, outward)
+    rows = np.unique(mesh.boundary_edges)
+    # Vertices at one position belong to a seam, where the surface does not end.
+    lowest = first_equal_rows(mesh.vertices[rows])
+    rows = rows[np.bincount(lowest, minlength=len(rows))[lowest] == 1]
+    if not len(rows):
+        return np.zeros(n, bool)
+    # A limited number of neighbours bounds the memory.
+    positions = mesh.vertices[rows]
+    distances, others = KDTree(positions).query(
+        positions, k=np.arange(1, _NEIGHBORS), distance_upper_bound=width
+    )
+    near = np.isfinite(distances)
+    first, second = np.repeat(rows, near.sum(axis=1)), rows[others[near]]
+    between = mesh.vertices[second] - mesh.vertices[first]
+    normals = mesh.vertex_normals
+    facing = (sums[first] * sums[second]).sum(axis=1) < 0
+    facing &= (sums[first] * between).sum(axis=1) >= 0
+    facing &= (sums[second] * between).sum(axis=1) <= 0
+    facing &= (normals[first] * normals[second]).sum(axis=1) > 0
+    found = np.zeros(n, bool)
+    found[np.concatenate([first[facing], second[facing]])] = True
+    return found
+
+
+def _unit(vectors: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)

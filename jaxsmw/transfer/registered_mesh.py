@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -14,11 +15,12 @@ from scipy.sparse.linalg import cg
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
-from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
+from jaxsmw.geometry.mesh import Mesh, connected_components
 from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_facing_points, nearest_surface_points
 from jaxsmw.runtime.threads import one_blas_thread
-from jaxsmw.transfer.coverage import Attraction, UncoveredVertices
+from jaxsmw.transfer.coverage import Attraction, UncoveredVertices, at_slits
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
+from jaxsmw.transfer.small_components import follow_surroundings
 from jaxsmw.wording import count_of
 
 DEFAULT_STIFFNESS = 0.005
@@ -69,7 +71,11 @@ _MANY_FLIPPED, _MANY_DEGREES = 0.003, 16.0
 # Torn edges can cut X into several components. A component is an island if its share of the area is below
 # _ISLAND. Lengths are in units of the square root of Y's area. (Entry R38)
 _TORN_FACTOR, _TORN_LENGTH, _ISLAND = 4.0, 0.03, 0.005
-# The number of deformations that move islands together with their surroundings.
+# A slit of Y is at most as wide as a torn edge is long. While vertices at slits move with their surroundings,
+# their weights are multiplied by _BRIDGING. A warning is issued if more than the share _MUCH_BRIDGED of X's
+# area is at slits.
+_BRIDGING, _MUCH_BRIDGED = 1e-3, 0.05
+# The number of deformations that move islands and vertices at slits together with their surroundings.
 _FILLING = 3
 # The linear solver stops when the norm of the residual is at most this fraction of the norm of the right-hand
 # side.
@@ -90,15 +96,19 @@ class RegisteredMesh:
     - `similarities`: the rotation and the scale of each vertex's neighbourhood, as `Similarities` with
       rotations (m, 3, 3) and scales (m,). These transformations take X to the registered mesh. The scales
       include the change from X's unit of length to Y's.
+    - `bridged`: the share of X's area that is matched to the lips of thin slits of Y, and moved with its
+      surroundings instead.
 
-    An unreferenced vertex of X moves with the nearest referenced vertex. Both vertices have the same
-    similarity transformation. Vertices that welding merges keep exactly the same position.
+    A small component of X moves rigidly with its surroundings, to its counterpart on Y if there is one; see
+    `follow_surroundings`. Any other unreferenced vertex moves with the nearest vertex. Vertices that welding
+    merges keep exactly the same position.
     """
 
     mesh_x: Mesh
     mesh_y: Mesh
     vertices: Float64[np.ndarray, "m 3"]
     similarities: Similarities
+    bridged: float = 0.0
 
     def __repr__(self) -> str:
         return f"RegisteredMesh({self.mesh_x.name} on {self.mesh_y.name}: {len(self.vertices)} vertices)"
@@ -251,6 +261,11 @@ class RegisteredMesh:
             f"({flipped / len(self.mesh_x.faces):.3%}).",
             f"area distortion: 90 % of the triangles have {areas[0]:.2f} to {areas[1]:.2f} times their area "
             f"on the source; angle distortion: {self.angle_distortions.mean():.1f} degrees in the mean.",
+            *(
+                [f"{self.bridged:.1%} of the source lies at thin slits of the target, and bridges them."]
+                if self.bridged
+                else []
+            ),
         )
 
 
@@ -270,7 +285,9 @@ def register_mesh(
     deformation (Sorkine, Alexa 2007); jaxsmw adds the scales. Where faces would flip, the map has less
     weight, and vertices are also drawn to the nearest points of Y. Some vertices of Y, such as the tips of
     ears, are not reached by the deformation. The nearest points of X are drawn to these vertices, unless
-    `scale` is given and X has less area than Y.
+    `scale` is given and X has less area than Y. Vertices that are matched to the lips of a thin slit of Y do
+    not follow the map, but their surroundings, unless X has a boundary there. The function issues a
+    `UserWarning` if more than 5 % of X's area is at slits.
 
     **Arguments:**
 
@@ -307,9 +324,12 @@ def register_mesh(
     areas = around.size**2 * mesh_x.vertex_areas
     # A vertex of no or little area still follows the map.
     areas = np.maximum(areas, 0.1 * np.median(areas[areas > 0]))
-    islands = _islands(around, areas, mapped, root)
-    if islands.any():
-        mapped = _with_islands_moved(around, target, np.where(islands, 0, areas), mapped, stiffness * root)
+    bridging = _bridging(mesh_x, target, points, _TORN_LENGTH * root)
+    unguided = bridging | _islands(around, areas, mapped, root)
+    if unguided.any():
+        guides = np.where(unguided, np.where(bridging, _BRIDGING * areas, 0), areas)
+        moved = _moved_along(around, target, guides, mapped, stiffness * root)
+        mapped = np.where(unguided[:, None], moved, mapped)
     targets, positions, similarities = mapped.copy(), mapped, around.similarities(mapped)
     weights, number = areas.copy(), 0
     normals = _normals(mesh_x.vertices, mesh_x)
@@ -346,7 +366,24 @@ def register_mesh(
                 near = around.averaging @ near
             weights = np.where(near > 0, of_round.factor * weights, weights)
     similarities = Similarities(similarities.rotations, around.size * similarities.scales)
-    return RegisteredMesh(mesh_x, mesh_y, *_with_unreferenced(mesh_x, positions + middle, similarities))
+    following = follow_surroundings(mesh_x, mesh_y, positions + middle, similarities)
+    bridged = float(mesh_x.average(bridging))
+    if bridged > _MUCH_BRIDGED:
+        warnings.warn(
+            f"{mesh_y.name}: thin slits cut the target. {bridged:.0%} of the area of {mesh_x.name} lies at "
+            "slits and moves with its surroundings, but the map is less accurate there: fill the slits.",
+            stacklevel=2,
+        )
+    return RegisteredMesh(mesh_x, mesh_y, following.positions, following.similarities, bridged)
+
+
+def _bridging(mesh_x: Mesh, mesh_y: Mesh, points: SurfacePoints, width: float) -> Bool[np.ndarray, " m"]:
+    """Return a mask of the vertices of X that are matched to lips of slits which X does not have."""
+    at_lips = at_slits(mesh_y, width)[mesh_y.faces[points.faces]].any(axis=1)
+    own = np.zeros(len(at_lips), bool)
+    own[mesh_x.boundary_edges] = True
+    own[mesh_x.faces[own[mesh_x.faces].any(axis=1)]] = True
+    return at_lips & ~own
 
 
 def _islands(
@@ -361,30 +398,19 @@ def _islands(
     return (share < _ISLAND)[component] & around.mesh.referenced_vertices
 
 
-def _with_islands_moved(
+def _moved_along(
     around: Neighborhoods,
     target: Mesh,
     weights: Float64[np.ndarray, " m"],
     mapped: Float64[np.ndarray, "m 3"],
     stiffness: float,
 ) -> Float64[np.ndarray, "m 3"]:
-    """Move islands with their surroundings, and then to the target. The weights of islands are zero."""
+    """Move vertices of little or no weight with their surroundings, and then all vertices to the target."""
     positions, similarities = mapped, around.similarities(mapped)
     for _ in range(_FILLING):
         positions = _follow(around, similarities, weights, mapped, stiffness, positions)
         similarities = around.similarities(positions)
-    moved = RegisteredMesh(around.mesh, target, positions, similarities).surface_points.positions(target)
-    return np.where(weights[:, None] == 0, moved, mapped)
-
-
-def _with_unreferenced(
-    mesh_x: Mesh, positions: Float64[np.ndarray, "m 3"], similarities: Similarities
-) -> tuple[Float64[np.ndarray, "m 3"], Similarities]:
-    """Move each unreferenced vertex with the nearest referenced vertex."""
-    nearest = extend_to_unreferenced(mesh_x, np.arange(len(positions)))
-    followed = Similarities(similarities.rotations[nearest], similarities.scales[nearest])
-    offsets = followed.of_vectors(mesh_x.vertices - mesh_x.vertices[nearest])
-    return positions[nearest] + offsets, followed
+    return RegisteredMesh(around.mesh, target, positions, similarities).surface_points.positions(target)
 
 
 def points_of_map(
