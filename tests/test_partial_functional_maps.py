@@ -25,9 +25,8 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import creature
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching.descriptors import describe
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import paired_spectra
+from jaxsmw.matching.preparation import describe, paired_spectra
 from jaxsmw.runtime.compilation import compiled
 
 pytestmark = pytest.mark.study
