@@ -480,7 +480,7 @@ class TestStatistics:
             coverage(Y, [9])
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_errors_agree_with_published_errors_of_the_same_maps(shared):
     # The published means use exact distances at 1000 selected vertices. This test uses other rows of the same
     # ground truth, so the difference is mainly a sampling error.

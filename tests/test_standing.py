@@ -106,7 +106,7 @@ def test_real_bodies_stand_upright(shared: Path, name: str, up: str) -> None:
     assert guess_up(read_mesh(shared / "data" / name)) == up
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize("up", ["y", "z", "-y"])
 def test_real_animals_stand_upright_in_every_convention(shared: Path, up: str) -> None:
     for name in ("cat0", "dog0", "wolf0", "horse0", "horse6"):
