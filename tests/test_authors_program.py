@@ -11,7 +11,7 @@ from jaxsmw.core.solutions import Filtering
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.metrics import geodesic_error
-from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.io.meshes import read_mesh
 
 SETTINGS = {"demo": 128, "paper": 100}
 

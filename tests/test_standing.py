@@ -12,7 +12,7 @@ from synthetic import grid_mesh
 from jaxsmw.creature import creature_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.io.meshes import read_mesh
 from jaxsmw.report.rendering import camera_axes, choose_azimuth
 from jaxsmw.report.standing import facing, guess_up, placement, stand, stand_pair
 
