@@ -18,8 +18,8 @@ from .evaluation.ground_truth import read_ground_truth
 from .evaluation.metrics import geodesic_error
 from .geometry.eigenbasis import compute_spectrum
 from .geometry.mesh import Mesh, make_mesh
-from .io.map_files import read_pointwise_map, write_pointwise_map
-from .io.mesh_files import read_mesh, write_mesh
+from .io.maps import read_pointwise_map, write_pointwise_map
+from .io.meshes import read_mesh, write_mesh
 from .matching.correspondence import Correspondence
 from .matching.match import match
 from .matching.pair import Pair

@@ -45,7 +45,7 @@ from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.io.meshes import read_mesh
 from jaxsmw.matching.executor import Start, padded_map, run
 from jaxsmw.matching.presets import PRESETS, PresetName
 from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack

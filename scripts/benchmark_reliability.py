@@ -31,7 +31,7 @@ from tqdm import tqdm
 from jaxsmw.collection import match_pairs
 from jaxsmw.creature import creature, creature_pair
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.io.meshes import read_mesh
 from jaxsmw.matching.match import match
 from jaxsmw.report.figures import save_figure
 

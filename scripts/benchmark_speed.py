@@ -76,7 +76,7 @@ from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, poisson_disk_samples
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.io.mesh_files import read_mesh, write_mesh
+from jaxsmw.io.meshes import read_mesh, write_mesh
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import paired_spectra

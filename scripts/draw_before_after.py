@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 import jaxsmw
 from jaxsmw import geodesic_error, read_mesh
 from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
-from jaxsmw.io.map_files import read_pointwise_map
+from jaxsmw.io.maps import read_pointwise_map
 from jaxsmw.report.colors import ERROR_LIMIT, error_colors
 from jaxsmw.report.figures import draw_mesh
 

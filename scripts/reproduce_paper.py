@@ -49,7 +49,7 @@ from jaxsmw.benchmark.opponents.registry import METHODS, suited_methods
 from jaxsmw.benchmark.tables import MethodSummary, markdown, write_tables
 from jaxsmw.choices import DEFAULT_MATCH_INIT
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.io.mesh_files import read_mesh, write_mesh
+from jaxsmw.io.meshes import read_mesh, write_mesh
 from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.workers import open_executor
 

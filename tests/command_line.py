@@ -10,7 +10,7 @@ from synthetic import bumpy_mesh
 
 from jaxsmw.cli.run import run_command
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.io.meshes import write_mesh
 
 COMMANDS = ("demo", "match", "transfer", "collection", "evaluate", "benchmark", "spectrum", "render")
 # Options that make the paper's method fast. The mirror test would compile further programs.

@@ -6,6 +6,7 @@ import pickle
 import shutil
 import signal
 import sys
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,27 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # A Hypothesis example may compile a program, which can take longer than Hypothesis's default deadline.
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("default")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option that chooses a tenth of the tests with the marker `sampled`."""
+    parser.addoption(
+        "--sample",
+        metavar="COMMIT",
+        help="run only a tenth of the tests marked `sampled`, which a hash chooses",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep every tenth test with the marker `sampled`, from a start that the option `--sample` chooses."""
+    commit = config.getoption("sample")
+    if commit is None:
+        return
+    sampled = [item for item in items if item.get_closest_marker("sampled")]
+    kept = set(sampled[zlib.crc32(commit.encode()) % 10 :: 10])
+    left_out = [item for item in sampled if item not in kept]
+    items[:] = [item for item in items if item not in set(left_out)]
+    config.hook.pytest_deselected(items=left_out)
 
 
 def pytest_collection_finish() -> None:

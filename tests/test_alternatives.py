@@ -273,7 +273,7 @@ def test_a_second_attempt_uses_crease_eigenvectors(
     assert found.suspicious
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_a_pair_that_only_crease_eigenvectors_match_right(shared):
     """The two cats have a mean error above 0.1 without the second attempt."""
     cats = open_data_set(shared / "data" / "tosca_r")
@@ -331,7 +331,7 @@ def test_further_alternatives_differ_from_all_maps_before_them(unchecked):
         assert [one.found for one in chosen] == expected
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize(
     ("names", "looks_right"),
     [

@@ -11,7 +11,7 @@ from jaxsmw.core.solutions import Filtering
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.metrics import geodesic_error
-from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.io.meshes import read_mesh
 
 SETTINGS = {"demo": 128, "paper": 100}
 
@@ -70,7 +70,7 @@ def test_the_sampled_variant_agrees_with_the_reference(reference, setting):
     np.testing.assert_allclose(c, reference[f"{setting}_Cfast"], atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_float32_agrees_at_nearly_all_vertices(reference, setting):
     t, _ = run(reference, setting, 5, np.float32)
@@ -88,13 +88,13 @@ def mean_error(shared, name):
     return lambda t: geodesic_error(mesh_y, t, truth, number_of_samples=1000).mean
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_float32_is_as_accurate(reference, mean_error):
     single, double = (mean_error(run(reference, "paper", 3, dtype)[0]) for dtype in (np.float32, np.float64))
     assert single == pytest.approx(double, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_pushforward_reaches_fewer_targets_with_larger_errors(reference, mean_error):
     """With the pushforward, C shrinks the queries, so a few targets with small norms attract most queries."""
     pullback, _ = run(reference, "paper", 5)
@@ -103,7 +103,7 @@ def test_pushforward_reaches_fewer_targets_with_larger_errors(reference, mean_er
     assert len(np.unique(pushforward)) < 0.8 * len(np.unique(pullback))
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_common_lambda_max_changes_little_for_bodies_of_the_same_size(reference, mean_error):
     """Both bodies have the same size, so their largest eigenvalues are nearly equal."""
     own, _ = run(reference, "paper", 3)

@@ -34,7 +34,7 @@ from jaxsmw.benchmark.opponents.registry import METHODS, PEERS, find_methods
 from jaxsmw.benchmark.tables import _introduction, latex_table, markdown, markdown_table, summarize_methods
 from jaxsmw.cli.run import run_command
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.io.meshes import write_mesh
 from jaxsmw.runtime.provenance import measured_code
 from jaxsmw.runtime.workers import open_executor
 

@@ -17,7 +17,7 @@ from jaxsmw.benchmark.measurement import FIGURES, Settings, measure_pair, measur
 from jaxsmw.benchmark.opponents.baselines import Unrefined
 from jaxsmw.benchmark.opponents.registry import METHODS
 from jaxsmw.evaluation import coverage
-from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.io.meshes import write_mesh
 from jaxsmw.runtime.cache import cached
 
 

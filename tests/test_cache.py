@@ -19,7 +19,7 @@ from synthetic import sphere_mesh
 from jaxsmw.cli.run import run_command
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.io.meshes import write_mesh
 from jaxsmw.runtime.cache import cache_compiled_programs, cache_contents, cached, clear_cache
 from jaxsmw.runtime.program_checksums import remove_damaged_programs
 

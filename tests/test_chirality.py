@@ -185,7 +185,7 @@ def test_evidence_has_opposite_signs_for_opposite_hands(lump):
         assert np.sign(Hands(pair, *paired_spectra(pair, 40)).evidence()) == sign
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize(("names", "opposite"), [(("T04", "J12"), True), (("T04", "Q28"), False)])
 def test_hands_of_teeth(shared, names, opposite):
     directory = shared / "data" / "primate_molars"

@@ -37,7 +37,7 @@ from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.io.mesh_files import read_mesh, write_mesh
+from jaxsmw.io.meshes import read_mesh, write_mesh
 from jaxsmw.matching.match import match
 from jaxsmw.matching.stages import Stage
 from jaxsmw.report.texture import TEXTURE_FILES

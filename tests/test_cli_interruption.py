@@ -13,7 +13,7 @@ import pytest
 from command_line import SMALL, write_pair
 from synthetic import bumpy_mesh
 
-from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.io.meshes import write_mesh
 from jaxsmw.runtime.files import atomic_write, remove_unfinished
 
 LINE = "jaxsmw: interrupted; output files are complete or were not written.\n"

@@ -9,7 +9,7 @@ from command_line import SMALL, assert_refused, runner, write_pair
 from synthetic import bumpy_mesh
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.io.meshes import write_mesh
 from jaxsmw.runtime.files import atomic_write, check_directory, check_writable, make_directory
 
 

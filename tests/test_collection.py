@@ -351,7 +351,7 @@ def test_shapes_of_the_other_hand_are_recognised(tmp_path):
     assert np.sqrt(model.total_variance) < 0.02 * np.sqrt(lump.area)
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_real_people_through_the_template(shared):
     """Maps through the template are as good as direct maps, and no pair is lost."""
     data = shared / "data" / "faust_r"

@@ -13,7 +13,7 @@ from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.geometry import crease_eigenvectors
 from jaxsmw.geometry.eigenbasis import eigenpairs
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.io.meshes import read_mesh
 from jaxsmw.matching.executor import SpectralPair
 from jaxsmw.matching.presets import PRESETS
 

@@ -15,7 +15,7 @@ from jaxsmw import InputError, read_mesh
 from jaxsmw.benchmark.datasets import DataSet, open_data_set, read_pairs
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.io.meshes import write_mesh
 
 VERTICES, FACES = grid_mesh(4, 5)
 

@@ -16,7 +16,7 @@ from jaxsmw.evaluation.ground_truth import (
 )
 from jaxsmw.evaluation.metrics import GeodesicError, coverage, geodesic_error
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
-from jaxsmw.io.map_files import read_landmarks, read_pointwise_map, write_pointwise_map
+from jaxsmw.io.maps import read_landmarks, read_pointwise_map, write_pointwise_map
 
 # X has 4 vertices and 2 faces. Y has 9 vertices and 8 faces.
 X = make_mesh(*grid_mesh(2, 2), name="mesh_x")
@@ -480,7 +480,7 @@ class TestStatistics:
             coverage(Y, [9])
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_errors_agree_with_published_errors_of_the_same_maps(shared):
     # The published means use exact distances at 1000 selected vertices. This test uses other rows of the same
     # ground truth, so the difference is mainly a sampling error.

@@ -23,7 +23,7 @@ from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 import jaxsmw
 from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh
 from jaxsmw.io import make_spectrum
-from jaxsmw.io.map_files import read_landmarks
+from jaxsmw.io.maps import read_landmarks
 
 K = 12
 

@@ -1,12 +1,12 @@
 """Damaged files and strange options cause one sentence: no traceback, no hang, no large memory, no output file.
 
 The tests damage the files in `tests/corpus`. Some damages know the structure of the formats: they replace
-numbers, words and lines of texts, integers of binary files, and members of archives. Together, the tests try
-1000 cases. The command
+numbers, words and lines of texts, integers of binary files, and members of archives. Each test has ten parts with
+different cases, of which the quick selection runs the first. Together, the parts try 1000 cases. The command
 
-    JAXSMW_FUZZING=20000 python -m pytest tests/test_fuzzing.py
+    JAXSMW_FUZZING=20000 python -m pytest -m "" tests/test_fuzzing.py
 
-tries 20 000 cases in each test.
+tries 20 000 cases in the ten parts of each test.
 """
 
 import contextlib
@@ -24,12 +24,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import COMMANDS
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, example, given, seed, settings
 from hypothesis import strategies as st
 
 from jaxsmw.cli.run import run_command
 from jaxsmw.errors import InputError
-from jaxsmw.io.landmark_files import read_landmark_file
+from jaxsmw.io.landmarks import read_landmark_file
 
 CORPUS = Path(__file__).parent / "corpus"
 MESHES = sorted(
@@ -40,6 +40,7 @@ MAPS = ["map.txt", "map.npy", "map.mat"]
 TRUTHS = ["map.txt", "pairs.txt", "points.baryc_gt"]
 # The largest time of a command, and the largest growth of the memory of the process.
 SECONDS, BYTES = 20, 2 * 2**30
+PARTS = 10
 
 NUMBERS = (
     b"-1",
@@ -57,10 +58,28 @@ NUMBERS = (
 INTEGERS = (0, 1, -1, 3, 127, 2**31 - 1, -(2**31), 2**32 - 1, 2**62, -(2**63))
 
 
-def fuzzed(cases: int) -> settings:
-    """The settings for a number of cases, which the environment variable `JAXSMW_FUZZING` replaces."""
+def fuzzed(cases: int, *strategies: st.SearchStrategy, first: tuple | None = None) -> Callable:
+    """Return a decorator that makes a test with ten parts of a function that checks one case.
+
+    **Arguments:** the number of cases, which the environment variable `JAXSMW_FUZZING` replaces, the strategies for
+    the arguments of the function, and the arguments of the case that every part tries first.
+    """
     checks = [HealthCheck.too_slow, HealthCheck.large_base_example]
-    return settings(max_examples=int(os.environ.get("JAXSMW_FUZZING", cases)), suppress_health_check=checks)
+    chosen = settings(
+        max_examples=int(os.environ.get("JAXSMW_FUZZING", cases)) // PARTS, suppress_health_check=checks
+    )
+
+    def decorate(check: Callable) -> Callable:
+        @pytest.mark.parametrize(
+            "part", [pytest.param(part, marks=pytest.mark.sampled if part else ()) for part in range(PARTS)]
+        )
+        def test(part: int) -> None:
+            cases = given(*strategies)(check)
+            chosen(seed(part)(example(*first)(cases) if first else cases))()
+
+        return test
+
+    return decorate
 
 
 # A kind of damage, a place from 0 to 1, another place, and a choice.
@@ -213,9 +232,8 @@ def files(names: list[str]) -> st.SearchStrategy:
     return st.tuples(st.sampled_from(names), st.lists(damages, min_size=1, max_size=4), suffix)
 
 
-@fuzzed(500)
-@given(files(MESHES))
-@example(("binary.pcd", [("integer", 0.96875, 0.939453125, 8)], None))  # a signalling NaN
+# The first case has a signalling NaN.
+@fuzzed(500, files(MESHES), first=(("binary.pcd", [("integer", 0.96875, 0.939453125, 8)], None),))
 def test_damaged_meshes(case):
     name, changes, suffix_of = case
     with directories() as (inputs, outputs):
@@ -228,9 +246,12 @@ def test_damaged_meshes(case):
 
 # A damaged header of an array can look like one that NumPy wrote under Python 2. NumPy reads it with a warning.
 @pytest.mark.filterwarnings("default:Reading `.npy`:UserWarning")
-@fuzzed(150)
-@given(files(MAPS), files(TRUTHS))
-@example(("map.npy", [("number", 0.5, 0.0, 1)], None), ("map.txt", [("cut", 0.0, 0.0, 0)], None))
+@fuzzed(
+    150,
+    files(MAPS),
+    files(TRUTHS),
+    first=(("map.npy", [("number", 0.5, 0.0, 1)], None), ("map.txt", [("cut", 0.0, 0.0, 0)], None)),
+)
 def test_damaged_maps_and_ground_truth(pointwise_map, truth):
     with directories() as (inputs, outputs):
         map_file = write_damaged(inputs, *pointwise_map)
@@ -259,8 +280,7 @@ def message_of(function: Callable[[], object]) -> str | None:
     return None
 
 
-@fuzzed(250)
-@given(files(LANDMARKS))
+@fuzzed(250, files(LANDMARKS))
 def test_damaged_landmarks(case):
     with directories() as (inputs, _):
         file = write_damaged(inputs, *case)
@@ -278,8 +298,7 @@ words = st.one_of(
 )  # fmt: skip
 
 
-@fuzzed(100)
-@given(st.lists(words, max_size=8))
+@fuzzed(100, st.lists(words, max_size=8))
 def test_strange_options(arguments):
     """Only the commands that never compile or match are completed by these words."""
     with directories() as (inputs, outputs), contextlib.chdir(outputs):

@@ -27,7 +27,7 @@ from command_line import SMALL, write_pair
 from synthetic import bumpy_mesh
 
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.io.mesh_files import write_mesh
+from jaxsmw.io.meshes import write_mesh
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="signals need Linux")]
 

@@ -347,7 +347,7 @@ def test_too_large_files_are_refused_unread(tmp_path):
     ("names", "positions", "coordinates", "fault"),
     [
         ((), np.zeros((0, 3)), None, "no landmarks"),
-        (("a", "a"), np.zeros((2, 3)), None, "'a' is repeated"),
+        (("a", "a"), np.zeros((2, 3)), None, "same name 'a'"),
         (("a", ""), np.zeros((2, 3)), None, "is empty"),
         ((" a",), np.zeros((1, 3)), None, "begins or ends with a blank"),
         (("a\nb",), np.zeros((1, 3)), None, "line break"),

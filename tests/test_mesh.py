@@ -20,7 +20,7 @@ from hypothesis.extra import numpy as hnp
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Diagnosis, Mesh, coincident_vertices, diagnose, make_mesh
-from jaxsmw.io.mesh_files import read_mesh, write_mesh
+from jaxsmw.io.meshes import read_mesh, write_mesh
 
 OCTAHEDRON = make_mesh(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]],

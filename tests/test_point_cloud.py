@@ -143,7 +143,7 @@ def test_two_clouds_are_matched():
     assert error.mean < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_real_clouds_are_matched_like_meshes(shared):
     directory = shared / "data" / "faust_r"
     files = [directory / "off" / f"tr_reg_0{number}.off" for number in (30, 50)]

@@ -18,7 +18,7 @@ import reproduce_paper
 from jaxsmw.benchmark.datasets import open_data_set
 from jaxsmw.benchmark.opponents.registry import METHODS
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.io.mesh_files import read_mesh, write_mesh
+from jaxsmw.io.meshes import read_mesh, write_mesh
 
 pytestmark = pytest.mark.study
 

@@ -270,7 +270,7 @@ def test_the_setting_is_checked():
         settings.__post_init__()  # without the run-time type checks of the tests
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
 def test_real_contacts(shared):
     """With topological noise, the map becomes better if contacts are cut."""

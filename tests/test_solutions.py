@@ -501,7 +501,7 @@ def test_minimize_accepts_another_energy(pair):
         solution.minimize(None, pair[0].eigenvalues, pair[1].eigenvalues)
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 @pytest.mark.parametrize("norm", ["area", "frobenius"])
 @pytest.mark.parametrize("bank", [Meyer(6), CubicSpline(6)], ids=["tight", "general"])

@@ -12,7 +12,7 @@ from synthetic import grid_mesh
 from jaxsmw.creature import creature_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.io.meshes import read_mesh
 from jaxsmw.report.rendering import camera_axes, choose_azimuth
 from jaxsmw.report.standing import facing, guess_up, placement, stand, stand_pair
 
@@ -106,7 +106,7 @@ def test_real_bodies_stand_upright(shared: Path, name: str, up: str) -> None:
     assert guess_up(read_mesh(shared / "data" / name)) == up
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize("up", ["y", "z", "-y"])
 def test_real_animals_stand_upright_in_every_convention(shared: Path, up: str) -> None:
     for name in ("cat0", "dog0", "wolf0", "horse0", "horse6"):

@@ -778,7 +778,7 @@ class TestTexture:
         assert weights.min() >= 0 and np.allclose(weights.sum(axis=1), 1)
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.parametrize("y", ["tr_reg_001", "tr_reg_004"])
 def test_real_people(shared, y):
     directory = shared / "data" / "faust_r"
@@ -806,7 +806,7 @@ def nearest_known(mesh: Mesh, known: np.ndarray) -> np.ndarray:
     return np.flatnonzero(known)[distances.argmin(axis=1)]
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_real_wolves(shared):
     """The poses of TOSCA's wolf have the same triangles."""
     mesh_x, mesh_y = (read_mesh(shared / "data" / "tosca" / "off" / f"wolf{pose}.off") for pose in (0, 1))

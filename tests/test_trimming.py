@@ -190,7 +190,7 @@ def test_wrong_settings_of_trimming_are_refused(wrong):
         RepairSettings(**wrong)
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_trimming_lowers_the_error_of_a_real_part(shared):
     data = open_data_set(shared / "data" / "shrec16_partial")
     pair = next(one for one in data.pairs if one.names == ("cuts_david_shape_3", "david"))

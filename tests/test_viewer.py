@@ -19,7 +19,7 @@ from jaxsmw.core.functional_map import encode
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.io.meshes import read_mesh
 from jaxsmw.report import colors
 from jaxsmw.report.page import ShownMap, write_page
 from jaxsmw.report.page_data import encode_rounded

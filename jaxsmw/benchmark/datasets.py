@@ -243,7 +243,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 def _meshes(directory: Path) -> dict[str, Path]:
     """Return a dictionary from the name of each mesh in a directory to its file, sorted by `_natural`."""
-    from jaxsmw.io.mesh_files import MESH_SUFFIXES
+    from jaxsmw.io.meshes import MESH_SUFFIXES
 
     if not directory.is_dir():
         return {}

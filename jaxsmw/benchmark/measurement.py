@@ -30,7 +30,7 @@ from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, g
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.io.mesh_files import read_mesh
+from jaxsmw.io.meshes import read_mesh
 from jaxsmw.matching.pair import Pair
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.runtime.provenance import machine

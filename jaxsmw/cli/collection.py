@@ -154,8 +154,7 @@ def run(options: argparse.Namespace) -> None:
         files = _mesh_files(options)
         _check(options, files)
         from jaxsmw.collection.files import RESULT_DIRECTORIES, check_replaceable, replace_results
-        from jaxsmw.io.landmark_files import read_landmark_file
-        from jaxsmw.io.landmarks import check_frame
+        from jaxsmw.io.landmarks import check_frame, read_landmark_file
         from jaxsmw.runtime.files import make_directory, remove_leftovers
         from jaxsmw.runtime.provenance import claimed_directory
     with stopwatch.step("reading"):
@@ -199,7 +198,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
     """Return the paths of the mesh files that are not excluded, by their names and in alphabetical order."""
-    from jaxsmw.io.mesh_data import MESH_SUFFIXES
+    from jaxsmw.io.meshes import MESH_SUFFIXES
     from jaxsmw.wording import count_of
 
     directory = options.directory
@@ -235,8 +234,8 @@ _NAMED_FILES = 8
 
 def _note_other_files(options: argparse.Namespace) -> None:
     """Print a note that names the files that are neither meshes nor usual companions of meshes."""
-    from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
-    from jaxsmw.io.mesh_data import MESH_SUFFIXES
+    from jaxsmw.io.landmarks import LANDMARK_SUFFIXES
+    from jaxsmw.io.meshes import MESH_SUFFIXES
 
     known = (*MESH_SUFFIXES, *LANDMARK_SUFFIXES, *_COMPANIONS)
     names = []
@@ -269,8 +268,8 @@ def _inside(options: argparse.Namespace, option: str, file: str, files: Mapping[
 def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
     """Check the options and the output directory before the long computation."""
     from jaxsmw.collection.files import RESULT_FILES
-    from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
-    from jaxsmw.io.mesh_data import check_mesh_suffix
+    from jaxsmw.io.landmarks import check_landmark_suffix, check_readable_suffix
+    from jaxsmw.io.meshes import check_mesh_suffix
     from jaxsmw.runtime.files import size_of_file
 
     refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_of")
@@ -350,7 +349,7 @@ def _mesh_of(landmarks: str, files: Mapping[str, Path]) -> str:
 
 def _read(files: Mapping[str, Path], *, weld: bool) -> tuple[dict[str, MeshData], dict[str, str]]:
     """Return the meshes by their file names, and the reasons why other files cannot be read."""
-    from jaxsmw.io.mesh_data import read_mesh_data
+    from jaxsmw.io.meshes import read_mesh_data
 
     data, unreadable = {}, {}
     for name, file in files.items():

@@ -53,8 +53,8 @@ def run(options: argparse.Namespace) -> None:
         _check_output(options)
         from jaxsmw.creature import creature_pair
         from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
-        from jaxsmw.io.map_files import write_pointwise_map
-        from jaxsmw.io.mesh_files import write_mesh
+        from jaxsmw.io.maps import write_pointwise_map
+        from jaxsmw.io.meshes import write_mesh
         from jaxsmw.runtime.files import make_directory
     report_progress("generating the creature ...")
     with stopwatch.step("creature"):

@@ -32,7 +32,7 @@ def check_inputs(*paths: str | None) -> None:
 
 def read_mesh_file(file: str, *, weld: bool) -> Mesh:
     """Read a mesh, and print a summary of it as progress messages."""
-    from jaxsmw.io.mesh_files import read_mesh
+    from jaxsmw.io.meshes import read_mesh
 
     mesh = read_mesh(file, weld=weld)
     report_mesh(file, mesh)
@@ -63,7 +63,7 @@ def read_maps(
     files: Sequence[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
 ) -> dict[str, Int64[np.ndarray, " m"]]:
     """Read pointwise maps X -> Y. The keys of the result are the file names."""
-    from jaxsmw.io.map_files import read_pointwise_map
+    from jaxsmw.io.maps import read_pointwise_map
 
     maps = {}
     for file in files:
@@ -98,7 +98,7 @@ def check_initial_map_files(init: str) -> None:
     files = initial_map_files(init)
     if not init.startswith("landmarks:"):
         return
-    from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES, check_readable_suffix
+    from jaxsmw.io.landmarks import LANDMARK_SUFFIXES, check_readable_suffix
 
     if len(files) > 1:
         for file in files:
@@ -113,8 +113,8 @@ def check_initial_map_files(init: str) -> None:
 
 def _has_positions(file: str) -> bool:
     """Return whether a table contains positions of landmarks, and not pairs of vertices."""
-    from jaxsmw.io.landmark_files import read_landmark_file
-    from jaxsmw.io.map_files import Table
+    from jaxsmw.io.landmarks import read_landmark_file
+    from jaxsmw.io.maps import Table
 
     with suppress(InputError):
         Table(Path(file), columns=2)
@@ -129,7 +129,7 @@ def read_initial_map(
     init: str, mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None
 ) -> MatchInit | Int64[np.ndarray, "l 2"] | Int64[np.ndarray, " m"]:
     """Convert a value of `--init` to the argument `init` of `jaxsmw.match`."""
-    from jaxsmw.io.map_files import read_landmarks, read_pointwise_map
+    from jaxsmw.io.maps import read_landmarks, read_pointwise_map
 
     match initial_map_files(init):
         case []:
@@ -144,8 +144,7 @@ def read_initial_map(
 
 def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int64[np.ndarray, "l 2"]:
     """Read landmarks on X and on Y, and return the nearest vertices of those with a name in both files."""
-    from jaxsmw.io.landmark_files import read_landmark_file
-    from jaxsmw.io.landmarks import match_landmarks
+    from jaxsmw.io.landmarks import match_landmarks, read_landmark_file
     from jaxsmw.transfer.landmarks import nearest_vertices
     from jaxsmw.wording import count_of
 

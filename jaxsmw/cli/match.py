@@ -166,7 +166,7 @@ def _check(options: argparse.Namespace) -> None:
         files=[options.output, points, options.one_to_one, expected, overlap],
         directories=_directories(options),
     )
-    from jaxsmw.io.map_files import check_map_name
+    from jaxsmw.io.maps import check_map_name
 
     for file in filter(None, (options.output, options.one_to_one)):
         check_map_name(file)
@@ -190,7 +190,7 @@ def _write_files(
     options: argparse.Namespace, correspondence: Correspondence, stopwatch: Stopwatch
 ) -> dict[str, Int64[np.ndarray, " m"] | SurfacePoints]:
     """Write all files except the expected errors and the report. Return the further maps to measure."""
-    from jaxsmw.io.map_files import write_pointwise_map
+    from jaxsmw.io.maps import write_pointwise_map
 
     others: dict[str, Int64[np.ndarray, " m"] | SurfacePoints] = {}
     with stopwatch.step("writing"):

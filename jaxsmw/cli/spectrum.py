@@ -58,7 +58,7 @@ def run(options: argparse.Namespace) -> None:
     from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
     from jaxsmw.geometry.laplacian import choose_laplacian
     from jaxsmw.geometry.mesh import diagnose
-    from jaxsmw.io.mesh_files import read_mesh
+    from jaxsmw.io.meshes import read_mesh
 
     mesh = read_mesh(options.mesh, weld=options.weld)
     laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian

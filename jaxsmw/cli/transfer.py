@@ -106,7 +106,7 @@ def run(options: argparse.Namespace) -> None:
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         _check(options)
-    from jaxsmw.io.mesh_data import read_mesh_data
+    from jaxsmw.io.meshes import read_mesh_data
 
     with stopwatch.step("reading"):
         source, target = (
@@ -185,8 +185,8 @@ def _check(options: argparse.Namespace) -> None:
     init_files = initial_map_files(options.init)
     check_method(options)
     refuse_without(options, "--map or a file of --init", bool(options.map or init_files), "index_base")
-    from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
-    from jaxsmw.io.mesh_data import check_attribute_suffix, check_mesh_suffix
+    from jaxsmw.io.landmarks import check_landmark_suffix, check_readable_suffix
+    from jaxsmw.io.meshes import check_attribute_suffix, check_mesh_suffix
 
     if options.registered:
         check_mesh_suffix(options.registered)
@@ -208,8 +208,7 @@ def _check(options: argparse.Namespace) -> None:
 
 def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
     """Read the landmarks of the source, convert them to the coordinates of the meshes, and check them."""
-    from jaxsmw.io.landmark_files import check_known_system, read_landmark_file
-    from jaxsmw.io.landmarks import check_frame
+    from jaxsmw.io.landmarks import check_frame, check_known_system, read_landmark_file
 
     landmarks = read_landmark_file(options.landmarks)
     for note in landmarks.notes:
@@ -285,7 +284,7 @@ def _transfer_landmarks(
     stopwatch: Stopwatch,
 ) -> Landmarks:
     """Transfer the landmarks, print their expected errors, write them if requested, and return them."""
-    from jaxsmw.io.landmark_files import write_landmark_file
+    from jaxsmw.io.landmarks import write_landmark_file
     from jaxsmw.transfer.landmarks import transfer_landmarks
 
     with stopwatch.step("landmarks"):
@@ -319,7 +318,7 @@ _LARGE = 2
 
 def _write(file: str, data: MeshData, stopwatch: Stopwatch) -> None:
     """Write a mesh with its data, and print notes about data that the file does not contain."""
-    from jaxsmw.io.mesh_data import write_mesh_data
+    from jaxsmw.io.meshes import write_mesh_data
 
     with stopwatch.step("writing"):
         notes = write_mesh_data(file, data)

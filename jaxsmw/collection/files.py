@@ -20,10 +20,10 @@ from jaxsmw.collection.result import Collection
 from jaxsmw.collection.shape_models import ShapeModel
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.landmark_files import write_landmark_file
-from jaxsmw.io.landmarks import Landmarks
-from jaxsmw.io.map_files import write_pointwise_map
-from jaxsmw.io.mesh_data import MeshData, write_mesh_data
+from jaxsmw.io.landmarks import Landmarks, write_landmark_file
+from jaxsmw.io.maps import write_pointwise_map
+from jaxsmw.io.mesh_data import MeshData
+from jaxsmw.io.meshes import write_mesh_data
 from jaxsmw.runtime.files import atomic_write, check_writable, make_directory
 from jaxsmw.transfer.attributes import registered_data, transfer_attributes
 from jaxsmw.transfer.landmarks import transfer_landmarks

@@ -1,6 +1,6 @@
 """Reads ground truth from common file formats, and writes ground truth.
 
-`jaxsmw.io.map_files` parses the files. By default, the format of a file determines whether its vertices are
+`jaxsmw.io.maps` parses the files. By default, the format of a file determines whether its vertices are
 counted from 0 or from 1.
 """
 
@@ -20,7 +20,7 @@ from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.map_files import Table
+from jaxsmw.io.maps import Table
 from jaxsmw.runtime.files import atomic_write
 
 # The barycentric weights in a file are rounded. A weight may be slightly negative, and the sum of three

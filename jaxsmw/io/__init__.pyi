@@ -1,8 +1,16 @@
-from .landmark_files import read_landmark_file, write_landmark_file
-from .landmarks import FrameDistances, LandmarkMatch, Landmarks, check_frame, find_frame, match_landmarks
-from .map_files import read_landmarks, read_pointwise_map, write_pointwise_map
-from .mesh_data import MeshData, Skin, Texture, read_mesh_data, write_mesh_data
-from .mesh_files import read_mesh, write_mesh
+from .landmarks import (
+    FrameDistances,
+    LandmarkMatch,
+    Landmarks,
+    check_frame,
+    find_frame,
+    match_landmarks,
+    read_landmark_file,
+    write_landmark_file,
+)
+from .maps import read_landmarks, read_pointwise_map, write_pointwise_map
+from .mesh_data import MeshData, Skin, Texture
+from .meshes import read_mesh, read_mesh_data, write_mesh, write_mesh_data
 from .spectra import make_spectrum, read_functional_map, read_spectrum, write_functional_map, write_spectrum
 
 __all__ = [

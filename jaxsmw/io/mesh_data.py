@@ -1,282 +1,232 @@
-"""Readers and writers of meshes together with their data, and the table of all formats of mesh files.
-
-Vertices must keep their order, and a damaged file must cause one clear error message. Therefore this library
-has its own parsers, one per module of `jaxsmw.io.formats`. The reader of libigl accepts indices out of range
-and aborts the process on some invalid headers. The reader of trimesh splits and drops vertices of OBJ files.
-It also cannot read binary PLY files whose polygons have different numbers of corners. pygltflib parses only
-the JSON part of glTF files, and has no checks.
-
-The other libraries were tried on the files of `tests/corpus`, with one to three damages of
-`tests/test_fuzzing.py` each. On 1000 damaged VTK legacy files, the reader of VTK 9.7.2 ended the process with
-a segmentation fault 15 times, and returned cells with indices or offsets out of range 162 times. On 1000
-damaged VTK XML files, it aborted the process twice, hung once, and returned such cells 11 times. cvista-io
-has the same readers. On 1000 damaged PCD files, pypcd4 1.5.1 hung twice, and silently returned too few points
-25 times. It needs python-lzf, which has no wheels. On 2000 damaged MATLAB files of version 7.3, pymatreader
-and h5py only raised exceptions, so these read such files.
-"""
+"""Meshes together with their colours, textures, blend shapes, skins and other data."""
 
 from __future__ import annotations
 
-import codecs
-import os
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.geometry.point_cloud import triangulate_points
-from jaxsmw.io.formats.data import (
-    NORMALS,
-    Corners,
-    MeshData,
-    Polygons,
-    Skin,
-    Texture,
-    Written,
-    checked_texture,
-    texture_or_note,
-    triangles_of,
-)
-from jaxsmw.io.formats.gltf import parse_glb, parse_gltf
-from jaxsmw.io.formats.gltf_writing import format_glb, format_gltf
-from jaxsmw.io.formats.mat import format_mat, parse_mat
-from jaxsmw.io.formats.npz import format_npz, parse_npz
-from jaxsmw.io.formats.obj import format_obj, parse_obj
-from jaxsmw.io.formats.off import format_off, parse_off
-from jaxsmw.io.formats.pcd import parse_pcd
-from jaxsmw.io.formats.ply import format_ply, parse_ply
-from jaxsmw.io.formats.stl import format_stl, parse_stl
-from jaxsmw.io.formats.vtk import format_vtk, parse_vtk
-from jaxsmw.io.formats.vtp import format_vtp, parse_vtp
-from jaxsmw.io.formats.xyz import parse_npy, parse_xyz
-from jaxsmw.runtime.files import atomic_write, read_bytes
+from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.wording import count_of
 
-__all__ = ["MESH_SUFFIXES", "MeshData", "Skin", "Texture", "read_mesh_data", "write_mesh_data"]
-
-_PARSERS: dict[str, Callable[[bytes], Polygons]] = {
-    ".off": parse_off,
-    ".obj": parse_obj,
-    ".ply": parse_ply,
-    ".stl": parse_stl,
-    ".mat": parse_mat,
-    ".vtk": parse_vtk,
-    ".vtp": parse_vtp,
-    ".glb": parse_glb,
-    ".npz": parse_npz,
-    ".xyz": parse_xyz,
-    ".pcd": parse_pcd,
-    ".npy": parse_npy,
-}
-_FORMATTERS: dict[str, Callable[[MeshData], Written]] = {
-    ".off": format_off,
-    ".obj": format_obj,
-    ".ply": format_ply,
-    ".stl": format_stl,
-    ".mat": format_mat,
-    ".vtk": format_vtk,
-    ".vtp": format_vtp,
-    ".gltf": format_gltf,
-    ".glb": format_glb,
-    ".npz": format_npz,
-}
-# The formats whose files begin with text, even if numbers are binary.
-_TEXT = (".off", ".obj", ".ply", ".vtk", ".pcd")
-MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
-"""The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
-POINT_CLOUD_SUFFIXES = tuple(suffix for suffix in _PARSERS if suffix not in _FORMATTERS)
-"""The suffixes of files that contain only points."""
+COLORS, NORMALS = "colors", "normals"
+"""The names of the vertex data with these meanings."""
 
 
-def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshData:
-    """Read a mesh together with all data on its vertices and faces.
+class Texture(NamedTuple):
+    """Texture coordinates of a mesh.
 
-    The data of each format:
+    Along a seam, one vertex has several texture vertices.
 
-    - `.off`: colours of vertices and faces, normals, and texture coordinates (COFF, NOFF, STOFF).
-    - `.obj`: the `vt` lines become the texture. The `g`, `o` and `usemtl` lines become the face data `group`,
-      `object` and `material`. These arrays (f,) contain 0-based integers, and `label_names` contains the
-      names. Colours that follow the positions are read as well.
-    - `.ply`: all properties with one number per row. Properties `a_0`, `a_1`, … become the columns of an
-      array `a`, and so do lists of the same length in all rows. The texture comes from the lists `texcoord`
-      of the faces or vertices, or from the vertex properties `s` and `t`, `u` and `v`, or `texture_u` and
-      `texture_v`.
-    - `.stl`: none.
-    - `.mat`: the data that `write_mesh_data` writes into the struct, besides vertices and faces.
-    - `.vtk`: all arrays on points and cells. The file is a VTK legacy file up to version 5.1, text or binary.
-      It contains a POLYDATA or an UNSTRUCTURED_GRID of triangles, polygons and triangle strips.
-    - `.vtp`: all arrays on points and cells. The file is a VTK XML file in any encoding, and may be
-      compressed. Compression with LZ4 needs the extra `vtk`.
-    - `.gltf`, `.glb`: glTF 2.0 files. The attribute TEXCOORD_0 is the texture, and COLOR_0 becomes `colors`.
-      Further attributes, morph targets and skins are read as well. If the file has several parts, the face
-      data `group` contains 0-based integers, and `label_names` contains the names of the parts.
-    - `.npz`: the arrays that `write_mesh_data` writes, such as `vertices`, `faces` and `vertex_data/NAME`.
-    - `.xyz`: a text file with one point per line. Columns 4 to 6 become `normals` if they are unit vectors.
-      Further columns are ignored.
-    - `.pcd`: all fields of a file of the Point Cloud Library, which may be text, binary or compressed. The
-      fields `normal_x`, `normal_y` and `normal_z` become `normals`.
-    - `.npy`: an array with one row per point. It has the same columns as an `.xyz` file.
+    **Attributes:**
 
-    If a file has no faces, `jaxsmw.geometry.triangulate_points` adds faces, with the help of `normals`.
-
-    A glTF file duplicates vertices along texture seams. Duplicates that `write_mesh_data` recorded are
-    joined. `MeshData.mesh` keeps all other duplicates as vertices. However, the faces of `MeshData.mesh` use
-    only one vertex per position, as if `weld` were True.
-    The transforms of the nodes are applied, and all meshes of the scene are joined in the order of the nodes.
-    Skinned meshes stay in their bind pose. Buffers in other files are read only if these files are in the
-    folder of the glTF file or in its subfolders. Normals, tangents, animations and pictures in glTF files are
-    not read.
-
-    **Arguments:**
-
-    - `path`: the file. The suffix, in upper or lower case, determines the format.
-    - `weld`: if True, vertices at the same position are merged in `MeshData.mesh`, as `read_mesh`
-        explains. `MeshData.faces` are not welded.
-
-    **Returns:**
-
-    A `MeshData` with n vertices and f triangles, in the units of the file. Its attributes are `mesh`, `faces`
-    (f, 3), `vertex_data`, `face_data`, `texture`, `blend_shapes`, `skin` and `label_names`. Triangle strips,
-    and polygons with more than three corners, are split into triangles. Each triangle has the data of its
-    strip or polygon.
-
-    **Raises:**
-
-    `InputError` if `read_mesh` refuses the file, or if its data is damaged, for example because an array has
-    a wrong length. A damaged texture is left out with a note.
+    - `coordinates`: the coordinates (u, v) of the texture vertices (t, 2), float64, in units of the picture's
+      width and height. The origin of the picture is its lower left corner.
+    - `corners`: the 0-based texture vertex of each corner of each triangle (f, 3), int64. The number -1 marks
+      a corner without a texture vertex.
     """
-    path = Path(path)
-    data = read_bytes(path)
-    suffix = path.suffix.lower()
-    if suffix != ".gltf" and suffix not in _PARSERS:
-        raise InputError(
-            f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
-            f"mesh to one of {', '.join([*_FORMATTERS, *POINT_CLOUD_SUFFIXES])}."
-        )
-    _check_readable(path, data)
-    try:
-        # Damaged files can contain numbers that overflow, or signalling NaN. `make_mesh` refuses them later.
-        with np.errstate(all="ignore"):
-            polygons = parse_gltf(data, path.parent) if suffix == ".gltf" else _PARSERS[suffix](data)
-        at, polygon = triangles_of(polygons.sizes, polygons.is_strip)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    faces = polygons.corners[at]
-    notes = list(polygons.notes)
-    sizes = polygons.sizes[~polygons.is_strip]
-    edges = int((sizes == 2).sum())
-    if (edges or polygons.lines) and not len(faces):
-        raise InputError(
-            f"{path}: contains {count_of(edges + polygons.lines, 'line')} (edges or faces with 2 corners), "
-            "but no triangles, so it describes no surface: export the mesh with its faces."
-        )
-    if edges:
-        notes.append(f"{count_of(edges, 'face')} with 2 corners ignored: lines are not part of a surface.")
-    large = int((sizes > 3).sum())
-    if large:
-        notes.append(f"{count_of(large, 'face')} with more than three corners split into triangles.")
-    if len(faces) or not len(polygons.vertices):
-        mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
-    else:
-        normals = polygons.vertex_data.get(NORMALS)
-        mesh = triangulate_points(polygons.vertices, normals, name=str(path), notes=notes)
-        faces = mesh.faces
-        polygons = polygons._replace(face_data={}, texture=None)  # data of no faces
-    texture, lost = texture_or_note(lambda: _texture(polygons.texture, at))
-    return MeshData(
-        replace(mesh, notes=(*mesh.notes, *lost)),
-        faces.astype(np.int64),
-        vertex_data=polygons.vertex_data,
-        face_data={name: _repeated(values, polygon) for name, values in polygons.face_data.items()},
-        texture=texture,
-        blend_shapes=polygons.blend_shapes,
-        skin=polygons.skin,
-        label_names=polygons.label_names,
-    )
+
+    coordinates: np.ndarray
+    corners: np.ndarray
 
 
-def _texture(texture: Corners | None, at: Int64[np.ndarray, "t 3"]) -> Corners | None:
-    return None if texture is None else checked_texture((texture[0], texture[1][at]), len(at), InputError)
+class Skin(NamedTuple):
+    """The weights that bind the vertices of a mesh to the joints of a skeleton.
 
+    **Attributes:**
 
-def _check_readable(path: Path, data: bytes) -> None:
-    if not data:
-        raise InputError(f"{path}: is empty: export the mesh again.")
-    if path.suffix.lower() in _TEXT and data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise InputError(f"{path}: is UTF-16 text, which cannot be read: save the file as UTF-8.")
-
-
-def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarray:
-    """Return the data of the triangles: each row is a copy of the row of the triangle's polygon.
-
-    Arrays that are too short are returned unchanged, because `MeshData` refuses them.
+    - `joints`: the names of the joints, a tuple of distinct strings.
+    - `weights`: the weight of each joint at each vertex (n, joints), float64. The weights are finite numbers
+      without unit, as in the file. They are usually from 0 to 1 with sum 1 at each vertex, but neither range
+      nor sum is checked.
     """
-    if values.ndim == 0 or len(values) <= polygon.max(initial=-1):
-        return values
-    return values[polygon]
+
+    joints: tuple[str, ...]
+    weights: np.ndarray
 
 
-def check_mesh_suffix(path: str | os.PathLike[str]) -> None:
-    """Check that a file's suffix belongs to a format in which meshes can be written.
+@dataclass(frozen=True, eq=False)
+class MeshData:
+    """A mesh together with everything that a file says about its vertices and faces.
 
-    **Raises:** `InputError` if the suffix belongs to no format.
+    Use `read_mesh_data` to read a `MeshData` from a file. The constructor checks all lengths, types and
+    indices, so a `MeshData` is always consistent.
+
+    **Attributes:**
+
+    - `mesh`: the `Mesh` that matching uses, with n vertices. The positions are in the unit of the file.
+    - `faces`: all triangles of the file, in the order of the file, before cleaning and welding. The array
+      (f, 3), int64, contains 0-based vertices of `mesh`. Polygons are split into fans of triangles.
+    - `vertex_data`: a dictionary from names to arrays (n,) or (n, c) with numbers for each vertex. The arrays
+      contain integers, floats or Booleans; Booleans are stored as uint8. Colours are called `colors`; they
+      are uint8, or floats from 0 to 1. Normals are called `normals`.
+    - `face_data`: a dictionary from names to arrays (f,) or (f, c) with numbers for each triangle, of the
+      same types.
+    - `texture`: a `Texture`, or None. A `Texture` is a pair of arrays: texture coordinates (t, 2), and the
+      0-based texture vertex of each corner (f, 3).
+    - `blend_shapes`: a dictionary from the names of blend shapes (morph targets) to displacements (n, 3) of
+      the vertices, float64, in the unit of the vertices.
+    - `skin`: a `Skin`, or None. A `Skin` is a pair: the names of the joints, and the weight of each joint at
+      each vertex (n, joints), without unit.
+    - `label_names`: a dictionary for arrays of labels 0, 1, … in `vertex_data` or `face_data`. Its keys are
+      the names of these arrays, and its values are tuples of the names of the labels. For example,
+      `face_data["group"]` of an OBJ file contains the number of each triangle's group, and
+      `label_names["group"]` contains the names of all groups.
+
+    **Raises:** `InputError` if an array has a wrong length or type, an index is out of range, or a
+    displacement, weight or texture coordinate is not finite.
     """
-    if Path(path).suffix.lower() not in _FORMATTERS:
-        raise InputError(
-            f"{path}: meshes cannot be written as {Path(path).suffix!r}: choose a name that ends in "
-            f"{', '.join(_FORMATTERS)}."
+
+    mesh: Mesh
+    faces: np.ndarray
+    vertex_data: Mapping[str, np.ndarray] = field(default_factory=dict)
+    face_data: Mapping[str, np.ndarray] = field(default_factory=dict)
+    texture: tuple[np.ndarray, np.ndarray] | None = None
+    blend_shapes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    skin: tuple[tuple[str, ...], np.ndarray] | None = None
+    label_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.mesh.vertices)
+        try:
+            faces = _indices(self.faces, n, "faces", "vertices")
+            checked = {
+                "faces": faces,
+                "vertex_data": _rows(self.vertex_data, "vertex data", n, "vertex"),
+                "face_data": _rows(self.face_data, "face data", len(faces), "face"),
+                "blend_shapes": {
+                    name: _real(values, f"the blend shape {name!a}", (n, 3))
+                    for name, values in self.blend_shapes.items()
+                },
+                "texture": None if self.texture is None else checked_texture(self.texture, len(faces)),
+                "skin": None if self.skin is None else _checked_skin(*self.skin, n),
+                "label_names": {name: tuple(map(str, names)) for name, names in self.label_names.items()},
+            }
+            for attribute, value in checked.items():
+                object.__setattr__(self, attribute, value)
+            self._check_labels()
+        except InputError as error:
+            raise InputError(f"{self.mesh.name}: {error}") from None
+
+    @property
+    def has_attributes(self) -> bool:
+        """Whether there are data besides positions and normals. `transfer_attributes` can transfer them."""
+        return bool(
+            {*self.vertex_data} - {NORMALS}
+            or self.face_data
+            or self.texture is not None
+            or self.blend_shapes
+            or self.skin is not None
         )
 
+    def _check_labels(self) -> None:
+        for name, names in self.label_names.items():
+            arrays = [data[name] for data in (self.vertex_data, self.face_data) if name in data]
+            if not arrays or any(
+                array.ndim != 1 or array.dtype.kind not in "iu" or not _within(array, len(names))
+                for array in arrays
+            ):
+                raise InputError(
+                    f"the array of labels {name!a} must contain integers from 0 to {len(names) - 1}, one for "
+                    "each label name: correct the array or the names."
+                )
 
-def check_attribute_suffix(path: str | os.PathLike[str]) -> None:
-    """Check that a file's suffix belongs to a format in which meshes can be written with attributes.
 
-    **Raises:** `InputError` if the suffix belongs to no format, or to a format that holds only triangles.
-    """
-    check_mesh_suffix(path)
-    if Path(path).suffix.lower() == ".stl":
+def _rows(data: Mapping[str, Any], what: str, count: int, noun: str) -> dict[str, np.ndarray]:
+    """Check data with one row per vertex or face. Integers and floats keep their types."""
+    checked = {}
+    for name, values in data.items():
+        array = np.asarray(values)
+        if not name or array.ndim not in (1, 2) or array.dtype.kind not in "biuf" or not array.shape[-1]:
+            raise InputError(
+                f"the {what} {name!a} are {array.dtype.name} of shape {array.shape}: give each array a "
+                f"name, and one number or one row of numbers for each {noun}."
+            )
+        if len(array) != count:
+            raise InputError(
+                f"the {what} {name!a} have {count_of(len(array), 'row')}, but need {count}: give one row "
+                f"for each {noun}."
+            )
+        checked[name] = _canonical(array[:, 0] if array.shape[1:] == (1,) else array)
+    return checked
+
+
+def _checked_skin(joints: tuple[str, ...], weights: Any, n: int) -> Skin:
+    if len(set(joints)) != len(joints) or not joints:
+        raise InputError("the names of the joints are not distinct: give each joint its own name.")
+    return Skin(tuple(map(str, joints)), _real(weights, "the skin", (n, len(joints))))
+
+
+def checked_texture(texture: tuple[np.ndarray, np.ndarray], f: int) -> Texture:
+    """Check the texture of f triangles."""
+    coordinates = _real(texture[0], "the texture", (*np.shape(texture[0])[:1], 2))
+    corners = _indices(texture[1], len(coordinates), "the texture's corners", "texture vertices", -1)
+    if len(corners) != f:
         raise InputError(
-            f"{path}: STL files contain only triangles, so no attribute can be written: choose a name that "
-            "ends in .ply, .vtp or .glb."
+            f"the texture has {count_of(len(corners), 'row')} of corners, but the mesh has "
+            f"{count_of(f, 'face')}: give one row for each face."
         )
+    return Texture(coordinates, corners)
 
 
-def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, ...]:
-    """Write a mesh together with all data on its vertices and faces.
+def _real(values: Any, what: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "*shape"]:
+    array = np.asarray(values)
+    if array.shape != shape or array.dtype.kind not in "biuf":
+        raise InputError(
+            f"{what} is {array.dtype.name} of shape {array.shape}, but needs numbers of shape {shape}: "
+            "give an array of this shape."
+        )
+    array = array.astype(np.float64)
+    if not np.isfinite(array).all():
+        raise InputError(f"{what} contains a number that is not finite: repair the numbers.")
+    return array
 
-    The docstring of `read_mesh_data` lists the formats. `read_mesh_data` reads the same data from the file,
-    in the precision of the format: float32 in STL and glTF files, and float64 in the other formats. Colours
-    in OBJ files become floats.
 
-    Vertices keep their order in all formats except STL. glTF files need one texture vertex per vertex, so
-    vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
-    them again.
+def _within(array: np.ndarray, count: int, first: int = 0) -> bool:
+    return not array.size or bool(array.min() >= first and array.max() < count)
 
-    The write is atomic: an incomplete file never appears at `path`.
 
-    **Arguments:**
+def _canonical(array: np.ndarray) -> np.ndarray:
+    """Return a contiguous copy of Booleans as uint8, and of other numbers in types that all formats have."""
+    kind = {"b": np.uint8, "f2": np.float32, "f16": np.float64, "f12": np.float64}
+    wanted = kind.get(array.dtype.str[1:], kind.get(array.dtype.kind, array.dtype.newbyteorder("=")))
+    return np.array(array, dtype=wanted, order="C")
 
-    - `path`: the file to create or to replace. The suffix determines the format: `.off`, `.obj`, `.ply`,
-        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb` or `.npz`.
-    - `data`: a `MeshData`. The file contains all triangles of `data.faces`, including triangles that cleaning
-        dropped from `data.mesh`.
 
-    **Returns:** A tuple of sentences about the data that the format cannot hold. The tuple is empty if the
-    file contains everything. Only a `.npz` file can contain all data of any `MeshData`.
+def _indices(values: Any, count: int, what: str, whole: str, first: int = 0) -> Int64[np.ndarray, "f 3"]:
+    array = np.asarray(values)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in "iu":
+        raise InputError(
+            f"{what} are {array.dtype.name} of shape {array.shape}: give integers of shape (number of faces, "
+            "3)."
+        )
+    if not _within(array, count, first):
+        raise InputError(f"{what} use a number outside the {count} {whole}: correct the indices.")
+    return array.astype(np.int64)
 
-    **Raises:** `InputError` for another suffix, positions that the format cannot hold, or a file that cannot
-    be written.
+
+def texture_at_corners(texture: tuple[np.ndarray, np.ndarray]) -> Float64[np.ndarray, "f 6"]:
+    """Return the texture coordinates (u0, v0, u1, v1, u2, v2) of each triangle. Missing ones are NaN."""
+    coordinates, corners = texture
+    return np.vstack([coordinates, [[np.nan, np.nan]]])[corners].reshape(-1, 6)
+
+
+def texture_of_corners(
+    corners: np.ndarray, at_corners: Float64[np.ndarray, "c 2"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return texture vertices, and the texture vertex of each corner, given the coordinates of all corners.
+
+    Two corners share a texture vertex if they belong to the same vertex and have equal texture coordinates.
+    The texture vertices of vertex 0 come first, then the texture vertices of vertex 1, and so on. A corner
+    has no texture vertex if its texture coordinates are NaN.
     """
-    path = Path(path)
-    check_mesh_suffix(path)
-    try:
-        written = _FORMATTERS[path.suffix.lower()](data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(written.content)
-    return written.notes
+    known = np.isfinite(at_corners).all(axis=1)
+    rows = np.column_stack([corners, at_corners])[known]
+    distinct, number = np.unique(rows, axis=0, return_inverse=True)
+    of_corner = np.full(len(corners), -1)
+    of_corner[known] = number.ravel()
+    return distinct[:, 1:], of_corner

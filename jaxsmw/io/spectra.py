@@ -127,10 +127,7 @@ def _parts(shape: SpectrumLike, name: str) -> tuple[Any, Any, Any]:
 
 
 def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
-    """Return vertex areas as a list. The vertex areas of a mass matrix are the sums of its rows.
-
-    `shape` is the shape (n, k) of the eigenvectors.
-    """
+    """Return vertex areas as a list. Those of a mass matrix (n, n) are the sums of its rows."""
     areas = to_host(areas)
     if hasattr(areas, "to_sparse_coo") and "sparse" in str(areas.layout):  # a sparse tensor of PyTorch
         matrix = areas.to_sparse_coo().coalesce()
@@ -278,14 +275,7 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
 
 
 def check_spectrum_path(path: str | os.PathLike[str]) -> None:
-    """Check that a file name has the suffix `.npz` or `.mat`, as `write_spectrum` requires.
-
-    **Arguments:**
-
-    - `path`: the name of a file, which need not exist.
-
-    **Raises:** `InputError` for any other suffix.
-    """
+    """Refuse a file name that ends neither in `.npz` nor in `.mat`."""
     if Path(path).suffix.lower() != ".npz" and not is_mat_file(path):
         raise InputError(
             f"{path}: spectra are written as .npz or .mat: choose a name that ends in one of these."

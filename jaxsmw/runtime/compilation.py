@@ -43,19 +43,25 @@ def compiler_options() -> dict[str, str | bool]:
 
     JAX accepts these options only in the outermost `jax.jit`. Other compiled functions may call
     `jaxsmw.refine`, so `jaxsmw.refine` does not set the options itself. The options depend on the default
-    backend of JAX, not on `jax.default_device`.
+    backend of JAX, not on `jax.default_device`. If JAX's setting `jax_disable_most_optimizations` asks for the
+    shortest compilation, the options do not raise the level of optimisation.
 
     **Returns:** A dictionary from the names of the options to their values. Options that the installed XLA
     does not support are left out. The dictionary is empty if the default backend is not the CPU.
     """
-    return dict(_options_for(jax.default_backend()))
+    return _options_for(jax.default_backend())
+
+
+def _options_for(backend: str) -> dict[str, str | bool]:
+    if backend != "cpu":
+        return {}
+    options = {name: value for name, value in _OPTIONS.items() if _known(name, value)}
+    if jax.config.read("jax_disable_most_optimizations"):
+        options.pop("xla_backend_optimization_level", None)
+    return options
 
 
 @cache
-def _options_for(backend: str) -> dict[str, str | bool]:
-    return {name: value for name, value in _OPTIONS.items() if backend == "cpu" and _known(name, value)}
-
-
 def _known(option: str, value: str | bool) -> bool:
     """Return whether the installed XLA supports an option."""
     try:

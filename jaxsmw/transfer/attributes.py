@@ -13,8 +13,7 @@ from scipy.sparse import csr_array
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
-from jaxsmw.io.formats.data import COLORS, NORMALS
-from jaxsmw.io.mesh_data import MeshData, Skin, Texture
+from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, Skin, Texture
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
 from jaxsmw.transfer.textures import transfer_texture
 from jaxsmw.wording import count_of

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from jaxsmw.geometry.mesh import connected_components
 from jaxsmw.geometry.surface_distance import nearest_points_of_triangles, nearest_surface_points
-from jaxsmw.io.formats.data import Texture, texture_at_corners, texture_of_corners
+from jaxsmw.io.mesh_data import Texture, texture_at_corners, texture_of_corners
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
 
 # Texture vertices of one vertex are merged if their coordinates are equal after rounding to a grid. The

@@ -38,7 +38,7 @@ from jaxsmw.core.solutions import Filtering, NearestOrthogonal
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.map_files import read_pointwise_map
+from jaxsmw.io.maps import read_pointwise_map
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.match import match
 from jaxsmw.matching.presets import PRESETS, PresetName

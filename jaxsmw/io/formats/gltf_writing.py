@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import MeshData, Written, always, is_color, omissions
-from jaxsmw.io.formats.gltf import RECORD
-from jaxsmw.io.formats.gltf_accessors import TYPES
+from jaxsmw.io.formats.gltf import RECORD, TYPES
+from jaxsmw.io.formats.polygons import Formatted, is_color, omissions
+from jaxsmw.io.mesh_data import MeshData
 
 _VERTICES, _INDICES = 34962, 34963
 _COMPONENTS = {kind: number for number, kind in TYPES.items()}
@@ -21,27 +21,27 @@ _SHAPES = ("SCALAR", "VEC2", "VEC3", "VEC4")
 _LARGEST_EXACT = 2**24  # float32 represents all integers up to this number
 
 
-def format_gltf(data: MeshData) -> Written:
+def format_gltf(data: MeshData) -> Formatted:
     """Format a JSON file that needs no other file, because its buffer is a data URI."""
-    file = _File(data)
+    file = _Writer(data)
     uri = b"data:application/octet-stream;base64," + base64.b64encode(file.buffer)
     file.json["buffers"] = [{"byteLength": len(file.buffer), "uri": uri.decode()}]
-    return Written(json.dumps(file.json, ensure_ascii=False, indent=1).encode(), file.notes())
+    return json.dumps(file.json, ensure_ascii=False, indent=1).encode(), file.notes()
 
 
-def format_glb(data: MeshData) -> Written:
+def format_glb(data: MeshData) -> Formatted:
     """Format a binary file."""
-    file = _File(data)
+    file = _Writer(data)
     file.json["buffers"] = [{"byteLength": len(file.buffer)}]
     text = json.dumps(file.json, ensure_ascii=False, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = [(b"JSON", text), (b"BIN\0", bytes(file.buffer))]
     body = b"".join(len(content).to_bytes(4, "little") + kind + content for kind, content in chunks)
     content = b"glTF" + (2).to_bytes(4, "little") + (12 + len(body)).to_bytes(4, "little") + body
-    return Written(content, file.notes())
+    return content, file.notes()
 
 
-class _File:
+class _Writer:
     """The JSON part and the buffer of a file. The file contains one mesh, which has one primitive."""
 
     def __init__(self, data: MeshData) -> None:
@@ -97,10 +97,7 @@ class _File:
         return {"POSITION": self.accessor(_single(moves)[self.original], _VERTICES, limits=True)}
 
     def add_skin(self, attributes: dict[str, int]) -> None:
-        """Add a skin whose joints are nodes below one root.
-
-        Each pair of attributes JOINTS_i and WEIGHTS_i contains four joints per vertex.
-        """
+        """Add a skin whose joints are nodes below one root, with four joints in each pair of attributes."""
         assert self.data.skin is not None
         names, weights = self.data.skin
         if len(names) > 65535:
@@ -171,9 +168,9 @@ class _File:
             self.data,
             "glTF",
             vertex_data=lambda name, values: _storable(name, values) is not None,
-            blend_shapes=always,
-            skin=always,
-            texture=always,
+            blend_shapes=True,
+            skin=True,
+            texture=True,
         )
 
 
@@ -209,10 +206,7 @@ def _split(
 
 
 def _semantic(name: str, values: np.ndarray) -> str:
-    """Return the name of the glTF attribute for an array of vertex data.
-
-    Application-specific names begin with an underscore.
-    """
+    """Return the name of the attribute. The names of other programs' data begin with an underscore."""
     if is_color(name, values):
         return "COLOR_0"
     columns = values.shape[1] if values.ndim == 2 else 1
@@ -221,10 +215,7 @@ def _semantic(name: str, values: np.ndarray) -> str:
 
 
 def _storable(name: str, values: np.ndarray) -> np.ndarray | None:
-    """Return values in a type that glTF attributes can have, or None if no such type fits.
-
-    Floats become float32. Long integers become float32 if float32 represents them exactly.
-    """
+    """Return values in a type of glTF that represents them, or None. Floats become float32."""
     if values.ndim == 2 and values.shape[1] > 4:
         return None
     if values.dtype.kind == "f":

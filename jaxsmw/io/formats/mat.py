@@ -31,16 +31,8 @@ from jaxtyping import Float64
 from scipy.io.matlab import MatWriteError, matfile_version
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import (
-    NOTHING,
-    MeshData,
-    Polygons,
-    Skin,
-    Written,
-    always,
-    omissions,
-    texture_or_note,
-)
+from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, texture_or_note
+from jaxsmw.io.mesh_data import MeshData, Skin
 from jaxsmw.runtime.files import atomic_write, largest_contents, read_bytes
 
 POINTWISE_MAP, FUNCTIONAL_MAP = "T12", "C21"
@@ -145,13 +137,7 @@ def _check_hdf5(h5py: Any, file: Any, limit: int) -> None:
 
 
 def unpacked(data: bytes) -> bytes:
-    """Return the contents of an equivalent file in which no variable is compressed.
-
-    The format is described in The MathWorks, "MAT-File Format", level 5.
-
-    **Raises:** `InputError` if the variables are too large; `ValueError`, `struct.error` or `zlib.error` if
-    the file is damaged.
-    """
+    """Return an equivalent file of the "MAT-File Format", level 5, without compressed variables."""
     if matfile_version(io.BytesIO(data))[0] == 0:
         return data  # level 4 has neither compression nor nested arrays
     order = "<" if data[126:128] == b"IM" else ">"
@@ -233,11 +219,7 @@ def _too_large() -> InputError:
 
 
 def find_structs(variables: Mapping[str, Any], *fields: str) -> dict[str, Mapping[str, Any]]:
-    """Find all structs, including nested structs, that have all of the given fields.
-
-    The result maps the full names of the structs, such as `S.surface`, to the structs. The variables of the
-    file are themselves treated as a struct with an empty name.
-    """
+    """Return all structs that have the given fields, under their full names such as `S.surface`."""
     found: dict[str, Mapping[str, Any]] = {}
     pending: list[tuple[str, Mapping[str, Any]]] = [("", variables)]
     while pending:
@@ -294,10 +276,7 @@ def _is_real(value: Any) -> bool:
 
 
 def write_variables(path: str | os.PathLike[str], variables: Mapping[str, Any]) -> None:
-    """Write arrays, numbers and dictionaries, which become structs, to a `.mat` file. Lists become columns.
-
-    **Raises:** `InputError` if a variable is too large for the format, or the file cannot be written.
-    """
+    """Write arrays, numbers and dictionaries, which become structs. Lists become columns."""
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         try:
             scipy.io.savemat(file, dict(variables), do_compression=True, oned_as="column")
@@ -356,7 +335,7 @@ def parse_mat(data: bytes) -> Polygons:
 
 def _struct(struct: Mapping[str, Any], field: str) -> Mapping[str, Any]:
     value = struct.get(field)
-    return value if isinstance(value, dict) else NOTHING
+    return value if isinstance(value, dict) else {}
 
 
 def _rows(values: Any, count: int) -> np.ndarray:
@@ -389,7 +368,7 @@ def _is_field(name: str, _: Any = None) -> bool:
     return bool(re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,30}", name))
 
 
-def format_mat(data: MeshData) -> Written:
+def format_mat(data: MeshData) -> Formatted:
     """Format the mesh and its data as a struct `surface`, with 1-based faces and texture vertices."""
     surface: dict[str, Any] = dict(zip("XYZ", data.mesh.vertices.T, strict=True))
     surface["TRIV"] = data.faces + 1.0
@@ -416,10 +395,10 @@ def format_mat(data: MeshData) -> Written:
         face_data=_is_field,
         blend_shapes=_is_field,
         label_names=_is_field,
-        texture=always,
-        skin=always,
+        texture=True,
+        skin=True,
     )
-    return Written(file.getvalue(), notes)
+    return file.getvalue(), notes
 
 
 def _cells(words: tuple[str, ...]) -> np.ndarray:

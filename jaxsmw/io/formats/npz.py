@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import MeshData, Polygons, Skin, Written, texture_or_note
+from jaxsmw.io.formats.polygons import Formatted, Polygons, texture_or_note
+from jaxsmw.io.mesh_data import MeshData, Skin
 from jaxsmw.runtime.files import largest_contents
 
 _FOLDERS = "vertex_data", "face_data", "blend_shapes", "label_names"
@@ -94,10 +95,7 @@ def _arrays(data: bytes) -> dict[str, np.ndarray]:
 
 
 def check_header(stream: Any, size: int) -> None:
-    """Check that the header of an array declares at most `size` bytes and no Python objects.
-
-    **Raises:** `ValueError` if the header declares more bytes, a negative length or Python objects.
-    """
+    """Raise `ValueError` if a header declares more than `size` bytes, a negative length or objects."""
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, kind = read(stream)
@@ -105,7 +103,7 @@ def check_header(stream: Any, size: int) -> None:
         raise ValueError("the array is larger than its file")
 
 
-def format_npz(data: MeshData) -> Written:
+def format_npz(data: MeshData) -> Formatted:
     """Format a mesh and all its data as arrays, without any loss."""
     arrays: dict[str, Any] = {"vertices": data.mesh.vertices, "faces": data.faces}
     for folder in _FOLDERS:
@@ -123,4 +121,4 @@ def format_npz(data: MeshData) -> Written:
             member.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(member, "w", force_zip64=True) as stream:
                 np.lib.format.write_array(stream, array, allow_pickle=False)
-    return Written(file.getvalue(), ())
+    return file.getvalue(), ()

@@ -10,17 +10,9 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import (
-    COLORS,
-    MeshData,
-    Polygons,
-    Written,
-    always,
-    is_color,
-    omissions,
-    texture_or_note,
-)
-from jaxsmw.io.formats.lines import excerpt, numbers, polygon_lines, text
+from jaxsmw.io.formats.polygons import Formatted, Polygons, is_color, omissions, texture_or_note
+from jaxsmw.io.formats.text import excerpt, numbers, polygon_lines, text
+from jaxsmw.io.mesh_data import COLORS, MeshData
 
 # A dictionary from each kind of label to the keyword of its lines in OBJ files. Such a line sets the label of
 # all faces below it, up to the next line with this keyword.
@@ -157,7 +149,7 @@ def _decoded(name: str) -> str:
         return name
 
 
-def format_obj(data: MeshData) -> Written:
+def format_obj(data: MeshData) -> Formatted:
     """Format positions, colours, texture coordinates, triangles and the labels of `parse_obj` as text."""
     colors = data.vertex_data.get(COLORS, np.empty(0))
     columns = data.mesh.vertices
@@ -183,9 +175,9 @@ def format_obj(data: MeshData) -> Written:
         vertex_data=_fits_vertices,
         face_data=lambda name, _: _fits_faces(data, name),
         label_names=lambda name, _: _fits_faces(data, name),
-        texture=always,
+        texture=True,
     )
-    return Written("\n".join([*lines, *faces, ""]).encode(), notes)
+    return "\n".join([*lines, *faces, ""]).encode(), notes
 
 
 def _fits_vertices(name: str, values: np.ndarray) -> bool:

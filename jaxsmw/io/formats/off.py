@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import COLORS, NORMALS, MeshData, Polygons, Written, is_color, omissions
-from jaxsmw.io.formats.lines import numbers, polygon_lines, text
+from jaxsmw.io.formats.polygons import Formatted, Polygons, is_color, omissions
+from jaxsmw.io.formats.text import numbers, polygon_lines, text
+from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData
 from jaxsmw.wording import count_of
 
 
@@ -58,11 +59,7 @@ def _within(corners: np.ndarray, n: int) -> bool:
 
 
 def _vertex_data(lines: list[str], keyword: str) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-    """Return the vertex data (normals and colours) and the texture coordinates.
-
-    They are read from the columns after the positions. If any line has more or fewer columns than the keyword
-    announces, the function returns no data.
-    """
+    """Return normals and colours, and texture coordinates, if all lines have the announced columns."""
     first = len(lines[0].split()) if keyword and lines else 0
     normals, coordinates = 3 * ("N" in keyword), 2 * ("ST" in keyword)
     colors = first - 3 - normals - coordinates
@@ -99,10 +96,7 @@ def _columns(lines: list[str], width: int) -> Float64[np.ndarray, "lines columns
 
 
 def _colors(lines: list[str], table: Float64[np.ndarray, "lines columns"], columns: slice) -> np.ndarray:
-    """Return colours as bytes if all components are written as whole numbers up to 255, otherwise as floats.
-
-    A fourth component is dropped if it is opaque everywhere.
-    """
+    """Return bytes if all components are whole numbers up to 255, without an alpha that is opaque."""
     values = table[:, columns]
     whole = not any(set(".eE") & set(word) for line in lines for word in line.split()[columns])
     if whole and ((values >= 0) & (values <= 255)).all():
@@ -111,7 +105,7 @@ def _colors(lines: list[str], table: Float64[np.ndarray, "lines columns"], colum
     return values[:, :3] if values.shape[1] == 4 and (values[:, 3] == opaque).all() else values
 
 
-def format_off(data: MeshData) -> Written:
+def format_off(data: MeshData) -> Formatted:
     """Format positions, triangles and colours as text."""
     # `repr` returns the shortest text from which `float` restores the same number.
     vertices = [f"{x!r} {y!r} {z!r}" for x, y, z in data.mesh.vertices.tolist()]
@@ -122,7 +116,7 @@ def format_off(data: MeshData) -> Written:
     if is_color(COLORS, colors := data.face_data.get(COLORS, _NONE)):
         faces = _with_colors(faces, colors)
     content = "\n".join([keyword, f"{len(vertices)} {len(faces)} 0", *vertices, *faces, ""])
-    return Written(content.encode(), omissions(data, "OFF", vertex_data=is_color, face_data=is_color))
+    return content.encode(), omissions(data, "OFF", vertex_data=is_color, face_data=is_color)
 
 
 _NONE = np.empty(0)

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import NORMALS, Polygons
-from jaxsmw.io.formats.lines import excerpt, numbers, text
+from jaxsmw.io.formats.polygons import Polygons
+from jaxsmw.io.formats.text import excerpt, numbers, text
+from jaxsmw.io.mesh_data import NORMALS
 from jaxsmw.wording import count_of
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}

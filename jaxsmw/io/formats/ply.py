@@ -9,23 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import (
-    COLORS,
-    NORMALS,
+from jaxsmw.io.formats.polygons import (
     TEXTURE_OF_CORNERS,
-    MeshData,
+    Formatted,
     Polygons,
-    Written,
-    always,
     is_color,
     is_texture_of_vertices,
     omissions,
-    texture_at_corners,
-    texture_of_corners,
     texture_or_note,
 )
-from jaxsmw.io.formats.lines import excerpt
-from jaxsmw.io.text import is_number
+from jaxsmw.io.formats.text import excerpt, is_number
+from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, texture_at_corners, texture_of_corners
 
 _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
@@ -259,10 +253,7 @@ def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _
 def _ply_table(
     body: bytes, offset: int, count: int, properties: dict[str, _Property]
 ) -> tuple[dict[str, _Column], int]:
-    """Return the columns of the table that begins at `offset`, and the offset of the table's end.
-
-    **Raises:** `EOFError` if the body ends within the table.
-    """
+    """Return the columns of the table that begins at `offset`, and its end. `EOFError` if it has none."""
     shortest = sum((p.length or p.type).itemsize for p in properties.values())
     if count * shortest > len(body) - offset:
         raise EOFError
@@ -299,12 +290,7 @@ def _ply_table(
 
 
 def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tuple[list[tuple[int, int]], int]:
-    """Return the place of each property in a row, and the offset at which the row ends.
-
-    A place is a pair: the offset of the property's first value, and the number of the property's values.
-
-    **Raises:** `EOFError` if the body ends within the row.
-    """
+    """Return the offset and the length of each property in a row, and the end of the row, or `EOFError`."""
     spans = []
     for kind, length, _ in properties.values():
         size = 1
@@ -331,11 +317,8 @@ _TYPE_NAMES = {
 }
 
 
-def format_ply(data: MeshData) -> Written:
-    """Format positions, triangles, texture coordinates and all data as a little-endian binary file.
-
-    The columns of an array a become the properties a_0, a_1, …, except for colours and normals.
-    """
+def format_ply(data: MeshData) -> Formatted:
+    """Format a little-endian binary file. The columns of an array a become the properties a_0, a_1, …."""
     vertex_columns = dict(zip("xyz", data.mesh.vertices.T, strict=True))
     extra, lost_of_vertices = _columns(
         data.vertex_data, {*vertex_columns, *(n for pair in _TEXTURES for n in pair)}
@@ -360,17 +343,13 @@ def format_ply(data: MeshData) -> Written:
         "PLY",
         vertex_data=lambda name, _: name not in lost_of_vertices,
         face_data=lambda name, _: name not in lost_of_faces,
-        texture=always,
+        texture=True,
     )
-    return Written("\n".join(header).encode() + vertices.tobytes() + faces.tobytes(), notes)
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes(), notes
 
 
 def _columns(data: Mapping[str, np.ndarray], reserved: set[str]) -> tuple[dict[str, np.ndarray], set[str]]:
-    """Return a dictionary from property names to columns, and the names of arrays that do not fit.
-
-    An array does not fit if its name contains blanks or characters outside ASCII, or if another property has
-    the same name. An array with an integer of more than 53 bits does not fit either.
-    """
+    """Return columns for a PLY file by name, and the names of the arrays that do not fit."""
     columns: dict[str, np.ndarray] = {}
     lost = set()
     for name, values in data.items():
@@ -388,10 +367,7 @@ def _columns(data: Mapping[str, np.ndarray], reserved: set[str]) -> tuple[dict[s
 
 
 def _storable(values: np.ndarray) -> np.ndarray | None:
-    """Return the values in a data type that PLY files allow, or None if no such type can represent them.
-
-    Long integers become int32 or float64 if these types can represent them.
-    """
+    """Return values in a type of PLY that represents them, or None."""
     if values.dtype.str[1:] in _TYPE_NAMES:
         return values
     for kind in (np.int32, np.float64):

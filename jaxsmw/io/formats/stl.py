@@ -8,8 +8,9 @@ import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import coincident_vertices, first_equal_rows
-from jaxsmw.io.formats.data import MeshData, Polygons, Written, omissions
-from jaxsmw.io.formats.lines import numbers, text
+from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions
+from jaxsmw.io.formats.text import numbers, text
+from jaxsmw.io.mesh_data import MeshData
 from jaxsmw.wording import count_of
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -66,7 +67,7 @@ def parse_stl(data: bytes) -> Polygons:
     return Polygons(corners[appearance], faces, np.full(len(corners) // 3, 3), tuple(notes))
 
 
-def format_stl(data: MeshData) -> Written:
+def format_stl(data: MeshData) -> Formatted:
     """Format all triangles as a binary file with float32 positions."""
     corners = data.mesh.vertices[data.faces].astype(np.float32)
     facets = np.zeros(len(corners), _FACET)
@@ -76,4 +77,4 @@ def format_stl(data: MeshData) -> Written:
     facets["corners"] = corners
     note = "STL files contain only the positions of corners, so the order of the vertices is lost."
     content = b"triangles".ljust(80) + len(facets).to_bytes(4, "little") + facets.tobytes()
-    return Written(content, (note, *omissions(data, "STL")))
+    return content, (note, *omissions(data, "STL"))

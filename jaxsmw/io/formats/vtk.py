@@ -8,10 +8,9 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import MeshData, Polygons, Written, always, omissions
-from jaxsmw.io.formats.lines import excerpt
+from jaxsmw.io.formats.polygons import DAMAGED, Formatted, Polygons, omissions
+from jaxsmw.io.formats.text import excerpt
 from jaxsmw.io.formats.vtk_cells import (
-    DAMAGED,
     LARGEST_COLUMNS,
     LINE,
     POLYGON,
@@ -25,6 +24,7 @@ from jaxsmw.io.formats.vtk_cells import (
     numbers_of,
     polygons_of,
 )
+from jaxsmw.io.mesh_data import MeshData
 from jaxsmw.wording import count_of
 
 _TYPES = {
@@ -44,10 +44,10 @@ _COLUMNS["EDGE_FLAGS"] = 1
 
 def parse_vtk(data: bytes) -> Polygons:
     """Parse a text or binary file up to version 5.1 with a POLYDATA or an UNSTRUCTURED_GRID."""
-    return _File(data).polygons()
+    return _Reader(data).polygons()
 
 
-class _File:
+class _Reader:
     """A cursor in a file, and the parts of the mesh that were read so far."""
 
     def __init__(self, data: bytes) -> None:
@@ -241,10 +241,7 @@ class _File:
                 self.truncated(count)
 
     def take_cells(self, kind: int, count: int, size: int) -> Cells:
-        """Return cells.
-
-        Files of version 5 store offsets and corners. Older files store sizes and corners.
-        """
+        """Return cells: offsets and corners since version 5, sizes and corners before."""
         if self.major >= 5:
             parts = []
             for keyword, length in (("OFFSETS", count), ("CONNECTIVITY", size)):
@@ -280,7 +277,7 @@ def _count(word: str) -> int:
     return int(word)
 
 
-def format_vtk(data: MeshData) -> Written:
+def format_vtk(data: MeshData) -> Formatted:
     """Format a binary POLYDATA in version 3.0, which all programs read."""
     point_data, cell_data, coordinates = arrays_of(data)
     n, f = len(data.mesh.vertices), len(data.faces)
@@ -297,8 +294,8 @@ def format_vtk(data: MeshData) -> Written:
     parts += _field(point_data)
     if cell_data:
         parts += [f"CELL_DATA {f}\n".encode(), *_field(cell_data)]
-    notes = omissions(data, "VTK", vertex_data=always, face_data=always, texture=always)
-    return Written(b"".join(parts), notes)
+    notes = omissions(data, "VTK", vertex_data=True, face_data=True, texture=True)
+    return b"".join(parts), notes
 
 
 def _field(arrays: dict[str, np.ndarray]) -> list[bytes]:

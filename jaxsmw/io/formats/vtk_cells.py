@@ -10,24 +10,21 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import (
+from jaxsmw.io.formats.polygons import (
+    DAMAGED,
     TEXTURE_OF_CORNERS,
-    MeshData,
     Polygons,
     is_texture_of_vertices,
-    texture_at_corners,
-    texture_of_corners,
     unique_name,
 )
-from jaxsmw.io.formats.lines import excerpt
-from jaxsmw.io.text import is_number
+from jaxsmw.io.formats.text import excerpt, is_number
+from jaxsmw.io.mesh_data import MeshData, texture_at_corners, texture_of_corners
 from jaxsmw.wording import count_of
 
 # Types of cells (https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html).
 VERTEX, LINE, STRIP, POLYGON = 1, 3, 6, 7
 _POINTS, _LINES = (0, VERTEX, 2), (LINE, 4)
 _SURFACE = 5, STRIP, POLYGON, 9
-DAMAGED = "so the file is damaged: export the mesh again."
 
 LARGEST_COLUMNS = 2**16
 
@@ -137,20 +134,14 @@ def _within(corners: np.ndarray, n: int) -> bool:
 
 
 def add_array(data: dict[str, np.ndarray], name: str, values: np.ndarray) -> str:
-    """Add an array with one row per point or cell, and return its name.
-
-    If the name is already taken, the array receives a name with a number.
-    """
+    """Add an array with one row per point or cell. If its name is taken, it receives a number."""
     chosen = unique_name(name or "unnamed", data)
     data[chosen] = values[:, 0] if values.shape[1] == 1 else values
     return chosen
 
 
 def arrays_of(data: MeshData) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray | None]:
-    """Return the arrays to write on the points and on the cells, and the texture coordinates of the points.
-
-    Texture coordinates with seams become an array on the cells.
-    """
+    """Return the arrays on points and cells, which contain a texture with seams, and the one of points."""
     cell_data = dict(data.face_data)
     if data.texture is None:
         return dict(data.vertex_data), cell_data, None

@@ -13,10 +13,9 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import MeshData, Polygons, Written, always, omissions, unique_name
-from jaxsmw.io.formats.lines import excerpt
+from jaxsmw.io.formats.polygons import DAMAGED, Formatted, Polygons, omissions, unique_name
+from jaxsmw.io.formats.text import excerpt
 from jaxsmw.io.formats.vtk_cells import (
-    DAMAGED,
     LARGEST_COLUMNS,
     LINE,
     POLYGON,
@@ -30,6 +29,7 @@ from jaxsmw.io.formats.vtk_cells import (
     numbers_of,
     polygons_of,
 )
+from jaxsmw.io.mesh_data import MeshData
 from jaxsmw.runtime.files import largest_contents
 from jaxsmw.wording import count_of
 
@@ -45,7 +45,7 @@ _COMPRESSORS = {"vtkZLibDataCompressor", "vtkLZMADataCompressor", "vtkLZ4DataCom
 
 def parse_vtp(data: bytes) -> Polygons:
     """Parse a file with PolyData. Several pieces become one mesh."""
-    file = _File(data)
+    file = _Reader(data)
     pieces = file.root.findall("PolyData/Piece")
     if not pieces:
         raise InputError("contains no piece of PolyData: export the mesh again.")
@@ -92,7 +92,7 @@ def _common(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     }
 
 
-class _File:
+class _Reader:
     """The XML tree of a file, and a decoder of its arrays."""
 
     def __init__(self, data: bytes) -> None:
@@ -183,10 +183,7 @@ class _File:
         return values.reshape(rows, columns)
 
     def decode(self, content: bytes, is_raw: bool, count: int, kind: str) -> np.ndarray:
-        """Decode the numbers of an array from raw bytes or base64.
-
-        The data begins with its size, and can be compressed.
-        """
+        """Decode numbers from raw bytes or base64, which begin with their size and can be compressed."""
         expected = count * np.dtype(kind).itemsize
         if expected > self.budget:
             raise InputError(f"declares {count_of(count, 'number')}, more than the file contains, {DAMAGED}")
@@ -280,7 +277,7 @@ def _integer(element: ElementTree.Element, name: str, default: int) -> int:
     return int(word)
 
 
-def format_vtp(data: MeshData) -> Written:
+def format_vtp(data: MeshData) -> Formatted:
     """Format PolyData in version 1.0, with arrays in base64 and compressed with zlib."""
     point_data, cell_data, coordinates = arrays_of(data)
     n, f = len(data.mesh.vertices), len(data.faces)
@@ -306,8 +303,8 @@ def format_vtp(data: MeshData) -> Written:
         "</Polys></Piece></PolyData></VTKFile>",
         "",
     ]
-    notes = omissions(data, "VTP", vertex_data=_fits, face_data=_fits, texture=always)
-    return Written("\n".join(lines).encode(), notes)
+    notes = omissions(data, "VTP", vertex_data=_fits, face_data=_fits, texture=True)
+    return "\n".join(lines).encode(), notes
 
 
 def _fits(name: str, _: np.ndarray) -> bool:

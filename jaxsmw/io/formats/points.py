@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float64, Shaped
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.data import NORMALS, Polygons
-from jaxsmw.io.formats.lines import numbers, text
 from jaxsmw.io.formats.npz import check_header
-from jaxsmw.io.text import is_number
+from jaxsmw.io.formats.polygons import Polygons
+from jaxsmw.io.formats.text import is_number, numbers, text
+from jaxsmw.io.mesh_data import NORMALS
 
 # Columns 4 to 6 are normals if the length of every vector differs from 1 by less than this number.
 # Otherwise the columns contain something else, such as colours.

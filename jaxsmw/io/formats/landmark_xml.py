@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.landmark_entries import Entries, check_count, left_out, parse_positions
-from jaxsmw.io.landmarks import Landmarks
-from jaxsmw.io.text import is_number
+from jaxsmw.io.formats.text import is_number
+from jaxsmw.io.landmarks import Landmarks, check_count, landmarks_of, left_out
 
 # These limits are far above what any file of points needs. They prevent a malicious file from using gigabytes
 # of memory.
@@ -70,20 +69,13 @@ def _parse_xml(text: str, root: str, on_start: _OnStart, on_text: _OnText | None
 
 
 def _check_doctype(name: str, system: str | None, public: str | None, has_declarations: int) -> None:
-    """Refuse a DOCTYPE that declares entities, which can expand to gigabytes or refer to other files.
-
-    MeshLab begins each file with `<!DOCTYPE PickedPoints>`, which declares nothing.
-    """
+    """Refuse declarations of entities, which can expand to gigabytes. MeshLab's DOCTYPE has none."""
     if has_declarations or system is not None or public is not None:
         raise InputError("has a DOCTYPE with declarations, which are not read: remove the DOCTYPE.")
 
 
-def parse_picked_points(text: str) -> Entries:
-    """Parse a `.pp` file of MeshLab (the class PickedPoints in MeshLab's source code).
-
-    Positions are in the coordinate system of the mesh. Points with `active="0"` are left out, because nobody
-    has placed them; their names come from a template.
-    """
+def parse_picked_points(text: str) -> Landmarks:
+    """Parse a `.pp` file of MeshLab (PickedPoints), without the points that nobody has placed."""
     names: list[str] = []
     words: list[str] = []
     numbers: list[int] = []
@@ -105,7 +97,7 @@ def parse_picked_points(text: str) -> Entries:
 
     _parse_xml(text, "PickedPoints", on_start)
     notes = left_out(inactive, len(numbers) + len(inactive), "they are not active in MeshLab")
-    return Entries(names, parse_positions(words, "point", numbers), "point", numbers, None, notes)
+    return landmarks_of(names, words, "point", numbers, notes=notes)
 
 
 def _refuse(number: int, fault: str) -> NoReturn:
@@ -122,7 +114,7 @@ def format_picked_points(landmarks: Landmarks) -> str:
     return f"<!DOCTYPE PickedPoints>\n<PickedPoints>\n{head}{points}</PickedPoints>\n"
 
 
-def parse_point_set(text: str) -> Entries:
+def parse_point_set(text: str) -> Landmarks:
     """Parse an `.mps` file of MITK (PointSetReaderService in MITK's source code).
 
     The file contains index coordinates, and its element Geometry3D takes them to world coordinates. MITK's
@@ -151,12 +143,14 @@ def parse_point_set(text: str) -> Entries:
         raise InputError("contains several point sets or time steps: save each in its own file.")
     names = [_point_name(point, number) for number, point in enumerate(points, start=1)]
     numbers = range(1, len(points) + 1)
-    positions = parse_positions([point[axis] for point in points for axis in "xyz"], "point", numbers)
-    if geometry:
-        matrix, offset = _index_to_world(geometry)
-        with np.errstate(all="ignore"):  # `Entries` refuses results that are not finite
-            positions = positions @ matrix.T + offset
-    return Entries(names, positions, "point", numbers, "LPS")
+    words = [point[axis] for point in points for axis in "xyz"]
+    landmarks = landmarks_of(names, words, "point", numbers, coordinates="LPS")
+    if not geometry:
+        return landmarks
+    matrix, offset = _index_to_world(geometry)
+    with np.errstate(all="ignore"):
+        positions = landmarks.positions @ matrix.T + offset
+    return landmarks_of(names, positions, "point", numbers, coordinates="LPS")
 
 
 def _point_name(point: dict[str, str], number: int) -> str:

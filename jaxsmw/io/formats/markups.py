@@ -13,8 +13,7 @@ import numpy as np
 
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
-from jaxsmw.io.landmark_entries import SYSTEMS, Entries, left_out
-from jaxsmw.io.landmarks import Landmarks
+from jaxsmw.io.landmarks import SYSTEMS, Landmarks, landmarks_of, left_out
 from jaxsmw.wording import count_of
 
 _SCHEMA = (
@@ -24,7 +23,7 @@ _SCHEMA = (
 _NOT_DEFINED = ("undefined", "preview", "missing")
 
 
-def parse_markups(text: str) -> Entries:
+def parse_markups(text: str) -> Landmarks:
     """Parse the control points of a Markups file. The file must contain a single list of points."""
     markup = _single_list(_parse_json(text))
     coordinates, notes = _coordinate_system(markup)
@@ -54,7 +53,9 @@ def parse_markups(text: str) -> Entries:
         names.append(label.strip() or str(number))
     notes += left_out(undefined, len(points), "Slicer has no defined position for them")
     table = np.array(positions, dtype=np.float64).reshape(-1, 3)
-    return Entries(names, table, "control point", numbers, coordinates, notes, unit)
+    return landmarks_of(
+        names, table, "control point", numbers, coordinates=coordinates, notes=notes, unit=unit
+    )
 
 
 def _parse_json(text: str) -> Any:
@@ -137,10 +138,7 @@ def _refuse(number: int, fault: str) -> NoReturn:
 
 
 def format_markups(landmarks: Landmarks) -> str:
-    """Return landmarks as a Markups file with one point per line. The coordinate system must be known.
-
-    The file states a unit only if the unit of the landmarks is known. Otherwise, Slicer assumes mm.
-    """
+    """Return a Markups file with one point per line. Without a unit in the file, Slicer assumes mm."""
     # The orientation is the identity in Slicer's RAS axes, so two of its entries are negative in LPS axes.
     sign = -1.0 if landmarks.coordinates == "LPS" else 1.0
     points = [

@@ -1,4 +1,4 @@
-"""Readers of the numbers in lines of text files."""
+"""Numbers in text files."""
 
 from __future__ import annotations
 
@@ -9,8 +9,19 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.text import is_number
 from jaxsmw.wording import count_of
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+_NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+
+
+def is_number(word: str, *, finite: bool = True) -> bool:
+    """Return whether a word is a decimal number in the usual notation, such as `-1.5e3`.
+
+    Unlike `float`, this function refuses underscores (`1_0`) and digits of other scripts. If `finite` is
+    False, `nan` and `inf` are also accepted.
+    """
+    return bool(_NUMBER.fullmatch(word)) or (not finite and bool(_NOT_FINITE.fullmatch(word)))
 
 
 def text(data: bytes) -> str:

@@ -12,9 +12,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.landmark_entries import SYSTEMS, Entries, check_count, left_out, parse_positions
-from jaxsmw.io.landmarks import Landmarks
-from jaxsmw.io.text import is_number
+from jaxsmw.io.formats.text import is_number
+from jaxsmw.io.landmarks import SYSTEMS, Landmarks, check_count, landmarks_of, left_out
 from jaxsmw.wording import count_of
 
 _NAME_COLUMNS = ("name", "label", "landmark", "id", "point", "")
@@ -35,7 +34,7 @@ class _Columns(NamedTuple):
     total: int
 
 
-def parse_table(text: str) -> Entries:
+def parse_table(text: str) -> Landmarks:
     """Parse rows of `name x y z` or `x y z`, with or without a line of column names.
 
     The separator is the first of semicolon, tab and comma that occurs at least twice in the first line. If
@@ -68,7 +67,7 @@ def parse_table(text: str) -> Entries:
         numbers.append(number)
         words += (cells[x], cells[y], cells[z])
         names.append((cells[columns.name] if columns.name is not None else "") or str(len(numbers)))
-    return Entries(names, parse_positions(words, "line", numbers), "line", numbers)
+    return landmarks_of(names, words, "line", numbers)
 
 
 def _is_value(cell: str) -> bool:
@@ -137,8 +136,15 @@ def _named_columns(number: int, cells: list[str]) -> _Columns:
     return _Columns([titles.index(axis) for axis in "xyz"], name, len(titles))
 
 
-def format_table(landmarks: Landmarks, separator: str) -> str:
-    """Return landmarks as a table with the columns name, x, y and z."""
+def format_csv(landmarks: Landmarks) -> str:
+    return _format_table(landmarks, ",")
+
+
+def format_txt(landmarks: Landmarks) -> str:
+    return _format_table(landmarks, "\t")
+
+
+def _format_table(landmarks: Landmarks, separator: str) -> str:
     text = io.StringIO()
     writer = csv.writer(text, delimiter=separator, lineterminator="\n")
     writer.writerow(["name", "x", "y", "z"])
@@ -147,7 +153,7 @@ def format_table(landmarks: Landmarks, separator: str) -> str:
     return text.getvalue()
 
 
-def parse_fcsv(text: str) -> Entries:
+def parse_fcsv(text: str) -> Landmarks:
     """Parse an `.fcsv` file of 3D Slicer (vtkMRMLMarkupsFiducialStorageNode in Slicer's source code).
 
     Newer versions append a 15th value, which has no column name. This value is the status of the position
@@ -185,7 +191,7 @@ def parse_fcsv(text: str) -> Entries:
             )
     else:
         notes += ("The file states no coordinate system.",)
-    return Entries(names, parse_positions(words, "line", numbers), "line", numbers, coordinates, notes)
+    return landmarks_of(names, words, "line", numbers, coordinates=coordinates, notes=notes)
 
 
 def _setting(line: str) -> tuple[str, str]:

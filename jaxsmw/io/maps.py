@@ -21,9 +21,9 @@ from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.formats.mat import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
-from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
-from jaxsmw.io.mesh_data import MESH_SUFFIXES, POINT_CLOUD_SUFFIXES
-from jaxsmw.io.text import is_number
+from jaxsmw.io.formats.text import is_number
+from jaxsmw.io.landmarks import LANDMARK_SUFFIXES
+from jaxsmw.io.meshes import MESH_SUFFIXES, POINT_CLOUD_SUFFIXES
 from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
 
@@ -119,18 +119,7 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 
 
 def check_map_name(path: str | os.PathLike[str]) -> None:
-    """Check that a pointwise map can be written under a file name.
-
-    Suffixes that belong to other kinds of files are refused: pictures, pages, meshes, point clouds,
-    landmarks, and the formats `.npz`, `.baryc_gt`, `.vts` and `.json`. All other suffixes are accepted, such
-    as `.txt` and `.csv`.
-
-    **Arguments:**
-
-    - `path`: the name of a file, which need not exist.
-
-    **Raises:** `InputError` for the suffix of another kind of file.
-    """
+    """Refuse the suffixes of pictures, pages, meshes, points and landmarks as the name of a map."""
     suffix = Path(path).suffix.lower()
     if suffix in _NOT_MAPS:
         raise InputError(
@@ -144,28 +133,13 @@ def _is_npy_file(path: str | os.PathLike[str]) -> bool:
 
 
 class Table:
-    """The numbers of a file as a matrix.
+    """The numbers of a `.npy` file, a `.mat` file or a text file as a matrix `values`, float64.
 
-    Each row of the matrix is one line of a text file, or one row of an array in a file.
+    Each row of the matrix is one line of a text file, or one row of an array in a file. In text files, spaces
+    or tabs separate numbers. Commas are refused, because `3,5` could be a number with a decimal comma or the
+    two vertices 3 and 5. `columns` is the required number of columns, or None for any number.
 
-    The readers of maps, landmarks and ground truth all use this class, so a fault causes the same message in
-    each of them.
-    In text files, spaces or tabs separate numbers. Commas are refused, because `3,5` could be a number with a
-    decimal comma or the two vertices 3 and 5.
-
-    **Arguments:**
-
-    - `path`: a `.npy` file, a `.mat` file, or a text file with any other suffix.
-    - `columns`: the required number of columns. None accepts any number of columns.
-
-    **Attributes:**
-
-    - `path`: the file.
-    - `values`: the numbers (rows, columns), float64.
-    - `rows`, `columns`: the shape of `values`.
-
-    **Raises:** `InputError` if the file cannot be read, or does not contain a matrix of numbers with the
-    required number of columns.
+    **Raises:** `InputError` if the file cannot be read, or does not contain such a matrix.
     """
 
     def __init__(self, path: Path, *, columns: int | None = None) -> None:
@@ -181,11 +155,7 @@ class Table:
         self.rows, self.columns = self.values.shape
 
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
-        """Read an array in the `.npy` format as a matrix.
-
-        A list becomes a matrix with one column. If `columns` is 1, an array with a single row also becomes
-        one column.
-        """
+        """Read an array as a matrix. A list becomes one column, and so does a row if `columns` is 1."""
         data = io.BytesIO(read_bytes(self.path))
         try:
             array = np.lib.format.read_array(data, allow_pickle=False)
@@ -205,10 +175,7 @@ class Table:
         return table.astype(np.float64)
 
     def _read_text(self, columns: int | None) -> list[list[str]]:
-        """Read a text file and return the words of each line.
-
-        **Raises:** `InputError` if a word is not a number, or if a line has a wrong number of words.
-        """
+        """Return the words of each line. All of them are numbers, and each line has as many."""
         path = self.path
         try:
             text = read_bytes(path).decode("utf-8-sig")
@@ -238,13 +205,7 @@ class Table:
         return rows
 
     def index_base(self, chosen: IndexBase | None, *, default: IndexBase = 0) -> IndexBase:
-        """Return the index of the first vertex or face in the file, 0 or 1.
-
-        **Arguments:**
-
-        - `chosen`: the index base that the user chose, 0 or 1. None selects the default for this file.
-        - `default`: the default for files that are not `.mat` files. For `.mat` files the default is 1.
-        """
+        """Return the chosen index of the first vertex or face, or else the default; 1 for `.mat` files."""
         if chosen is not None:
             return chosen
         return 1 if is_mat_file(self.path) else default
@@ -258,10 +219,7 @@ class Table:
         return self._words[row][column][:40] if self._is_text else f"{self.values[row, column]:.15g}"
 
     def require_rows(self, mesh_x: Mesh) -> None:
-        """Check that the file has one row for each vertex of X.
-
-        **Raises:** `InputError` if the number of rows differs from the number of vertices of `mesh_x`.
-        """
+        """Refuse a file without exactly one row for each vertex of X."""
         m = len(mesh_x.vertices)
         if self.rows != m:
             raise InputError(
@@ -271,27 +229,11 @@ class Table:
             )
 
     def vertices(self, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
-        """Return a column as 0-based vertices of a mesh, in an array (p,) where p is the number of rows.
-
-        **Arguments:**
-
-        - `column`: the 0-based position of the column.
-        - `base`: the index of the first vertex in the file, 0 or 1.
-
-        **Raises:** `InputError` if a number is not a vertex of the mesh. The message names the first such
-        row.
-        """
+        """Return a column as 0-based vertices (p,) of a mesh. The file counts from `base`."""
         return self.indices(column, len(mesh.vertices), f"vertices of {mesh.name}", base)
 
     def indices(self, column: int, count: int, what: str, base: IndexBase) -> Int64[np.ndarray, " p"]:
-        """Return a column as 0-based indices (p,), where p is the number of rows.
-
-        **Arguments:**
-
-        - `column`: the 0-based position of the column.
-        - `count`: the number of elements to which the indices refer, such as the vertices of a mesh.
-        - `what`: the plural name of these elements in messages, such as `vertices of Y`.
-        - `base`: the index of the first element in the file, 0 or 1.
+        """Return a column as 0-based indices (p,) of `count` elements, which messages call `what`.
 
         **Raises:** `InputError` if a number is not a valid index. The message names the first such row. If
         all numbers are valid with the other index base, the message recommends that index base.

@@ -1,0 +1,158 @@
+"""What all parsers return and all writers need: polygons with their data, and names for the data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from jaxsmw.errors import InputError
+from jaxsmw.io.mesh_data import COLORS, MeshData, Skin
+from jaxsmw.wording import count_of
+
+DAMAGED = "so the file is damaged: export the mesh again."
+TEXTURE_OF_CORNERS = "texcoord"
+"""The name of the data of faces that contain texture coordinates with seams."""
+
+TextureOfCorners: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Texture coordinates (t, 2), and the texture vertex of each corner in a list of corners, or -1."""
+Formatted: TypeAlias = tuple[bytes, tuple[str, ...]]
+"""The bytes of a file, and sentences about the data that it does not contain."""
+
+
+class Polygons(NamedTuple):
+    """The polygons of a file, and the data on them.
+
+    `corners` lists the corners of all faces, one face after another. `sizes` contains the number of corners
+    of each face, and `strips` marks the faces that are triangle strips. `face_data` has one row per face.
+    `weld` is True if the format duplicates vertices at seams. `lines` counts lines besides the faces.
+    """
+
+    vertices: Float64[np.ndarray, "n 3"]
+    corners: np.ndarray
+    sizes: Int64[np.ndarray, " f"]
+    notes: tuple[str, ...] = ()
+    vertex_data: Mapping[str, np.ndarray] = {}
+    face_data: Mapping[str, np.ndarray] = {}
+    texture: TextureOfCorners | None = None
+    blend_shapes: Mapping[str, np.ndarray] = {}
+    skin: Skin | None = None
+    label_names: Mapping[str, tuple[str, ...]] = {}
+    weld: bool = False
+    lines: int = 0
+    strips: Bool[np.ndarray, " f"] | None = None
+
+    @property
+    def is_strip(self) -> Bool[np.ndarray, " f"]:
+        return np.zeros(len(self.sizes), bool) if self.strips is None else self.strips
+
+
+def triangles_of(
+    sizes: Int64[np.ndarray, " f"], is_strip: Bool[np.ndarray, " f"]
+) -> tuple[Int64[np.ndarray, "t 3"], Int64[np.ndarray, " t"]]:
+    """Split polygons and triangle strips into triangles.
+
+    The triangles of a polygon (c0, c1, …) are (c0, ci, ci+1), and a polygon of two corners has none. The
+    triangles of a strip are (ci, ci+1, ci+2), and every second of them is reversed.
+
+    Return the corners of each triangle (t, 3), as indices into the list of all corners, and the face from
+    which each triangle comes (t,).
+    """
+    if (sizes < 2).any():
+        at = int((sizes < 2).argmax())
+        raise InputError(
+            f"face {at} has {count_of(int(sizes[at]), 'corner')}, but needs at least three: remove the face."
+        )
+    if (sizes[is_strip] < 3).any():
+        raise InputError(f"a triangle strip has fewer than three corners, {DAMAGED}")
+    per_face = sizes - 2
+    face = np.repeat(np.arange(len(sizes)), per_face)
+    start = (np.cumsum(sizes) - sizes)[face]
+    step = np.arange(len(face)) - (np.cumsum(per_face) - per_face)[face]
+    odd = is_strip[face] & (step % 2 == 1)
+    first = np.where(is_strip[face], step, 0)
+    corners = first + odd, np.where(odd, step, step + 1), step + 2
+    return start[:, None] + np.stack(corners, axis=1), face
+
+
+def are_vertices(corners: np.ndarray, n: int) -> bool:
+    """Return whether all corners are among n vertices. `make_mesh` refuses other corners."""
+    return bool(((corners >= 0) & (corners < n) & (corners == np.floor(corners))).all())
+
+
+def texture_or_note(
+    parse: Callable[[], TextureOfCorners | None],
+) -> tuple[TextureOfCorners | None, tuple[str, ...]]:
+    """Parse a texture. Matching does not need a texture, so a note replaces a texture that cannot be read."""
+    try:
+        return parse(), ()
+    except InputError as error:
+        return None, (f"The texture was left out: {error}",)
+
+
+def omissions(data: MeshData, form: str, **holds: Any) -> tuple[str, ...]:
+    """Return a sentence for each kind of data that a format cannot hold.
+
+    `holds` maps attributes of `MeshData` that the format called `form` can hold to True, or to a function
+    that receives the name and the value of an entry, and returns whether the format can hold it.
+    """
+    skin = dict.fromkeys(data.skin[0]) if data.skin is not None else {}
+    texture = {} if data.texture is None else {"coordinates": data.texture}
+    kinds: dict[str, tuple[str, Mapping[str, Any]]] = {
+        "vertex_data": ("the vertex data", data.vertex_data),
+        "face_data": ("the face data", data.face_data),
+        "blend_shapes": ("the blend shapes", data.blend_shapes),
+        "skin": ("the joints", skin),
+        "label_names": ("the names of the labels", data.label_names),
+        "texture": ("texture", texture),
+    }
+    notes = []
+    for attribute, (what, values) in kinds.items():
+        fits = holds.get(attribute, lambda name, value: False)
+        names = [name for name, value in values.items() if fits is not True and not fits(name, value)]
+        quoted = names if attribute == "texture" else [*map(ascii, names)]
+        listed = ", ".join(quoted[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+        if names:
+            notes.append(f"{form} files cannot hold {what} {listed}, so the file does not contain them.")
+    return tuple(notes)
+
+
+def is_color(name: str, values: np.ndarray) -> bool:
+    """Return whether an array contains colours: bytes, or floats from 0 to 1, in three or four columns."""
+    if name != COLORS or values.ndim != 2 or values.shape[1] not in (3, 4):
+        return False
+    in_range = values.dtype.kind == "f" and bool(((values >= 0) & (values <= 1)).all())
+    return values.dtype == np.uint8 or in_range
+
+
+def is_texture_of_vertices(data: MeshData) -> bool:
+    """Return whether texture vertex i belongs to vertex i for all i, so that there is no seam."""
+    return (
+        data.texture is not None
+        and len(data.texture[0]) == len(data.mesh.vertices)
+        and np.array_equal(data.texture[1], data.faces)
+    )
+
+
+def unique_name(name: str, taken: Collection[str]) -> str:
+    """Return a name that is not taken: the name itself, or the name with a number in parentheses."""
+    chosen, number = name, len(taken)  # a search from number 1 is slow if many names are equal
+    while chosen in taken:
+        number += 1
+        chosen = f"{name} ({number})"
+    return chosen
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """Return the names, with numbers in parentheses after repeated names."""
+    chosen: dict[str, None] = {}
+    numbers: dict[str, int] = {}
+    for name in names:
+        one = name
+        while one in chosen:
+            numbers[name] = numbers.get(name, 1) + 1
+            one = f"{name} ({numbers[name]})"
+        chosen[one] = None
+    return list(chosen)

@@ -1,0 +1,316 @@
+"""Readers and writers of meshes, alone or together with their data, and the table of all formats.
+
+Vertices must keep their order, and a damaged file must cause one clear error message. Therefore this library
+has its own parsers, one per module of `jaxsmw.io.formats`, which is imported when such a file is opened. The
+reader of libigl accepts indices out of range and aborts the process on some invalid headers. The reader of
+trimesh splits and drops vertices of OBJ files. It also cannot read binary PLY files whose polygons have
+different numbers of corners. pygltflib parses only the JSON part of glTF files, and has no checks.
+
+The other libraries were tried on the files of `tests/corpus`, with one to three damages of
+`tests/test_fuzzing.py` each. On 1000 damaged VTK legacy files, the reader of VTK 9.7.2 ended the process with
+a segmentation fault 15 times, and returned cells with indices or offsets out of range 162 times. On 1000
+damaged VTK XML files, it aborted the process twice, hung once, and returned such cells 11 times. cvista-io
+has the same readers. On 1000 damaged PCD files, pypcd4 1.5.1 hung twice, and silently returned too few points
+25 times. It needs python-lzf, which has no wheels. On 2000 damaged MATLAB files of version 7.3, pymatreader
+and h5py only raised exceptions, so these read such files.
+"""
+
+from __future__ import annotations
+
+import codecs
+import os
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Int64, UInt8
+from numpy.typing import ArrayLike
+
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh, make_mesh
+from jaxsmw.geometry.point_cloud import triangulate_points
+from jaxsmw.io.formats.polygons import Polygons, texture_or_note, triangles_of
+from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, Texture, checked_texture
+from jaxsmw.runtime.files import atomic_write, read_bytes
+from jaxsmw.wording import count_of
+
+# The module of each suffix. Its functions are called `parse_` and `format_`, followed by the suffix.
+_WRITABLE = {
+    **{".off": "off", ".obj": "obj", ".ply": "ply", ".stl": "stl", ".mat": "mat", ".vtk": "vtk"},
+    **{".vtp": "vtp", ".gltf": "gltf", ".glb": "gltf", ".npz": "npz"},
+}
+_ONLY_POINTS = {".xyz": "points", ".pcd": "pcd", ".npy": "points"}
+# The formats whose files begin with text, even if numbers are binary.
+_TEXT = (".off", ".obj", ".ply", ".vtk", ".pcd")
+MESH_SUFFIXES = tuple(suffix for suffix in _WRITABLE if suffix != ".npz")
+"""The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
+POINT_CLOUD_SUFFIXES = tuple(_ONLY_POINTS)
+"""The suffixes of files that contain only points."""
+
+
+def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
+    """Read a triangle mesh, or a point cloud, from a file in any format of `read_mesh_data`.
+
+    Vertices keep the order of the file. An STL file contains only the corners of triangles, so corners at
+    the same position become one vertex. The vertices of an STL file are numbered in the order in which their
+    positions first appear. Faces with more than three corners are split into fans of triangles, and triangle
+    strips into triangles. A glTF file duplicates vertices along texture seams, so these vertices are always
+    welded. The points of a point cloud become the vertices of a mesh, as in
+    `jaxsmw.geometry.triangulate_points`.
+
+    **Arguments:**
+
+    - `path`: the file. The suffix, in upper or lower case, determines the format: `.off`, `.obj`, `.ply`,
+        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.xyz`, `.pcd` or `.npy`.
+    - `weld`: if True, vertices at the same position are merged, as in `make_mesh`. Faces then use only the
+        lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so no vertex is
+        renumbered. Welding has no effect on an STL file, whose corners are always merged.
+
+    **Returns:**
+
+    A `Mesh` whose `name` is the path, with positions (n, 3) in the unit of the file and 0-based faces (f, 3).
+    The `notes` of the mesh report changes such as dropped faces, and peculiarities such as unreferenced
+    vertices. Flaws that do not concern the surface are also noted there: faces with two corners, a damaged
+    texture, bytes behind the triangles of a binary STL file, or a text STL file without `endsolid`.
+
+    **Raises:**
+
+    `InputError` if the file cannot be read, does not have the format of its suffix, ends early, contains
+    lines but no faces, or continues after the declared end. `InputError` is also raised if `make_mesh`
+    refuses the mesh, for example because an index is out of range, the position of a corner is not finite, or
+    all faces are degenerate.
+    """
+    return read_mesh_data(path, weld=weld).mesh
+
+
+def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshData:
+    """Read a mesh together with all data on its vertices and faces.
+
+    The data of each format:
+
+    - `.off`: a text file with colours of vertices and faces, normals, and texture coordinates (COFF, NOFF,
+      STOFF).
+    - `.obj`: the `vt` lines become the texture. The `g`, `o` and `usemtl` lines become the face data `group`,
+      `object` and `material`. These arrays (f,) contain 0-based integers, and `label_names` contains the
+      names. Colours that follow the positions are read as well.
+    - `.ply`: a text file, or a binary file in either byte order, with all properties that have equally many
+      numbers in all rows. Properties `a_0`, `a_1`, … become the columns of an array `a`. The texture comes
+      from the lists `texcoord` of the faces or vertices, or from the vertex properties `s` and `t`, `u` and
+      `v`, or `texture_u` and `texture_v`.
+    - `.stl`: a text or binary file, which contains no data.
+    - `.mat`: a struct, such as `surface` in the TOSCA data set, with the coordinates X, Y and Z (or a matrix
+      VERT) and the 1-based faces TRIV. The struct may be nested in another struct, as in the files of
+      `write_spectrum`. It also has the data that `write_mesh_data` writes. Files of MATLAB's format 7.3 need
+      the extra `matlab`.
+    - `.vtk`: all arrays on points and cells. The file is a VTK legacy file up to version 5.1, text or binary.
+      It contains a POLYDATA or an UNSTRUCTURED_GRID of triangles, polygons and triangle strips.
+    - `.vtp`: all arrays on points and cells. The file is a VTK XML file in any encoding, and may be
+      compressed. Compression with LZ4 needs the extra `vtk`.
+    - `.gltf`, `.glb`: glTF 2.0 files. The attribute TEXCOORD_0 is the texture, and COLOR_0 becomes `colors`.
+      Further attributes, morph targets and skins are read as well. If the file has several parts, the face
+      data `group` contains 0-based integers, and `label_names` contains the names of the parts.
+    - `.npz`: the arrays that `write_mesh_data` writes, such as `vertices`, `faces` and `vertex_data/NAME`.
+    - `.xyz`: a text file with one point per line. Columns 4 to 6 become `normals` if they are unit vectors.
+      Further columns are ignored.
+    - `.pcd`: all fields of a file of the Point Cloud Library, which may be text, binary or compressed. The
+      fields `normal_x`, `normal_y` and `normal_z` become `normals`.
+    - `.npy`: an array with one row per point. It has the same columns as an `.xyz` file.
+
+    If a file has no faces, `jaxsmw.geometry.triangulate_points` adds faces, with the help of `normals`.
+
+    A glTF file duplicates vertices along texture seams. Duplicates that `write_mesh_data` recorded are
+    joined. `MeshData.mesh` keeps all other duplicates as vertices. However, the faces of `MeshData.mesh` use
+    only one vertex per position, as if `weld` were True.
+    The transforms of the nodes are applied, and all meshes of the scene are joined in the order of the nodes.
+    Skinned meshes stay in their bind pose. Buffers in other files are read only if these files are in the
+    folder of the glTF file or in its subfolders. Normals, tangents, animations and pictures in glTF files are
+    not read.
+
+    **Arguments:**
+
+    - `path`, `weld`: as for `read_mesh`. Welding changes `MeshData.mesh`, but not `MeshData.faces`.
+
+    **Returns:**
+
+    A `MeshData` with n vertices and f triangles, in the units of the file. Its attributes are `mesh`, `faces`
+    (f, 3), `vertex_data`, `face_data`, `texture`, `blend_shapes`, `skin` and `label_names`. Each triangle has
+    the data of the polygon or strip from which it comes.
+
+    **Raises:**
+
+    `InputError` if `read_mesh` refuses the file, or if its data is damaged, for example because an array has
+    a wrong length. A damaged texture is left out with a note.
+    """
+    path = Path(path)
+    data = read_bytes(path)
+    suffix = path.suffix.lower()
+    if suffix not in _WRITABLE | _ONLY_POINTS:
+        raise InputError(
+            f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
+            f"mesh to one of {', '.join(_WRITABLE | _ONLY_POINTS)}."
+        )
+    try:
+        polygons = _parse(data, suffix, path.parent)
+        at, polygon = triangles_of(polygons.sizes, polygons.is_strip)
+        faces, notes = _triangles(polygons, at)
+        texture, lost = texture_or_note(lambda: _texture_at(polygons, at))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    face_data = {name: _repeated(values, polygon) for name, values in polygons.face_data.items()}
+    if len(faces) or not len(polygons.vertices):
+        mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
+    else:
+        normals = polygons.vertex_data.get(NORMALS)
+        mesh = triangulate_points(polygons.vertices, normals, name=str(path), notes=notes)
+        faces, face_data, texture, lost = mesh.faces, {}, None, ()
+    return MeshData(
+        replace(mesh, notes=(*mesh.notes, *lost)),
+        faces.astype(np.int64),
+        vertex_data=polygons.vertex_data,
+        face_data=face_data,
+        texture=texture,
+        blend_shapes=polygons.blend_shapes,
+        skin=polygons.skin,
+        label_names=polygons.label_names,
+    )
+
+
+def _function(kind: str, suffix: str) -> Any:
+    module = (_WRITABLE | _ONLY_POINTS)[suffix]
+    if kind == "format" and module == "gltf":
+        module = "gltf_writing"  # the writer shares little with the reader
+    return getattr(import_module(f"jaxsmw.io.formats.{module}"), f"{kind}_{suffix[1:]}")
+
+
+def _parse(data: bytes, suffix: str, folder: Path) -> Polygons:
+    if not data:
+        raise InputError("is empty: export the mesh again.")
+    if suffix in _TEXT and data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InputError("is UTF-16 text, which cannot be read: save the file as UTF-8.")
+    parse = _function("parse", suffix)
+    # Damaged files can contain numbers that overflow, or signalling NaN. `make_mesh` refuses them later.
+    with np.errstate(all="ignore"):
+        return parse(data, folder) if suffix == ".gltf" else parse(data)
+
+
+def _triangles(polygons: Polygons, at: Int64[np.ndarray, "t 3"]) -> tuple[np.ndarray, list[str]]:
+    """Return the vertices of the triangles (t, 3), and the notes of the file."""
+    sizes = polygons.sizes[~polygons.is_strip]
+    notes = list(polygons.notes)
+    edges, large = int((sizes == 2).sum()), int((sizes > 3).sum())
+    if (edges or polygons.lines) and not len(at):
+        raise InputError(
+            f"contains {count_of(edges + polygons.lines, 'line')} (edges or faces with 2 corners), but no "
+            "triangles, so it describes no surface: export the mesh with its faces."
+        )
+    if edges:
+        notes.append(f"{count_of(edges, 'face')} with 2 corners ignored: lines are not part of a surface.")
+    if large:
+        notes.append(f"{count_of(large, 'face')} with more than three corners split into triangles.")
+    return polygons.corners[at], notes
+
+
+def _texture_at(polygons: Polygons, at: Int64[np.ndarray, "t 3"]) -> Texture | None:
+    if polygons.texture is None:
+        return None
+    coordinates, corners = polygons.texture
+    return checked_texture((coordinates, corners[at]), len(at))
+
+
+def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarray:
+    """Return the data of the polygon of each triangle. `MeshData` refuses arrays that are too short."""
+    too_short = values.ndim == 0 or len(values) <= polygon.max(initial=-1)
+    return values if too_short else values[polygon]
+
+
+def check_mesh_suffix(path: str | os.PathLike[str]) -> None:
+    """Refuse a file name whose suffix belongs to no format in which meshes can be written."""
+    if Path(path).suffix.lower() not in _WRITABLE:
+        raise InputError(
+            f"{path}: meshes cannot be written as {Path(path).suffix!r}: choose a name that ends in "
+            f"{', '.join(_WRITABLE)}."
+        )
+
+
+def check_attribute_suffix(path: str | os.PathLike[str]) -> None:
+    """Refuse a file name whose suffix belongs to no format in which attributes can be written."""
+    check_mesh_suffix(path)
+    if Path(path).suffix.lower() == ".stl":
+        raise InputError(
+            f"{path}: STL files contain only triangles, so no attribute can be written: choose a name that "
+            "ends in .ply, .vtp or .glb."
+        )
+
+
+def write_mesh(
+    path: str | os.PathLike[str], mesh: Mesh, *, colors: ArrayLike | None = None
+) -> tuple[str, ...]:
+    """Write a mesh, and perhaps colours, as `write_mesh_data` does.
+
+    **Arguments:**
+
+    - `path`: the file to create or to replace. The suffix, such as `.off` or `.ply`, determines the format.
+    - `mesh`: the mesh with n vertices, a `Mesh`.
+    - `colors`: the red, green and blue components of the colour of each vertex (n, 3), as floats from 0 to 1
+        or as uint8. None, the default, writes no colours. An OFF file with colours begins with COFF.
+
+    **Returns:** A tuple of sentences about what the format cannot hold, such as colours in an STL file. The
+    tuple is empty if the file contains everything.
+
+    **Raises:** `InputError` if `write_mesh_data` raises it, or `colors` has a wrong shape, type or range.
+    """
+    data = {} if colors is None else {COLORS: _bytes_of_colors(colors, len(mesh.vertices))}
+    return write_mesh_data(path, MeshData(mesh, mesh.faces, vertex_data=data))
+
+
+def _bytes_of_colors(colors: ArrayLike, n: int) -> UInt8[np.ndarray, "n 3"]:
+    array = np.asarray(colors)
+    if array.shape != (n, 3):
+        raise InputError(
+            f"colors have shape {array.shape}, but {n} vertices need ({n}, 3): give one row for each vertex."
+        )
+    if array.dtype == np.uint8:
+        return array
+    if array.dtype.kind != "f" or not ((array >= 0) & (array <= 1)).all():
+        raise InputError(
+            "colors are neither uint8 nor floats from 0 to 1: convert the colors to one of these types."
+        )
+    return np.rint(255 * array.astype(np.float64)).astype(np.uint8)
+
+
+def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, ...]:
+    """Write a mesh together with all data on its vertices and faces.
+
+    `read_mesh_data` lists the formats, and reads the same data from the file, in the precision of the format:
+    float32 in STL and glTF files, and float64 in the other formats. Colours in OBJ files become floats.
+
+    Vertices keep their order in all formats except STL. glTF files need one texture vertex per vertex, so
+    vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
+    them again.
+
+    The write is atomic: an incomplete file never appears at `path`.
+
+    **Arguments:**
+
+    - `path`: the file to create or to replace. The suffix determines the format: `.off`, `.obj`, `.ply`,
+        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb` or `.npz`.
+    - `data`: a `MeshData`. The file contains all triangles of `data.faces`, including triangles that cleaning
+        dropped from `data.mesh`.
+
+    **Returns:** A tuple of sentences about the data that the format cannot hold. The tuple is empty if the
+    file contains everything. Only a `.npz` file can contain all data of any `MeshData`.
+
+    **Raises:** `InputError` for another suffix, positions that the format cannot hold, or a file that cannot
+    be written.
+    """
+    path = Path(path)
+    check_mesh_suffix(path)
+    try:
+        content, notes = _function("format", path.suffix.lower())(data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+    return notes
