@@ -24,9 +24,8 @@ from .matching.correspondence import Correspondence
 from .matching.match import match
 from .matching.pair import Pair
 from .matching.preparation import paired_spectra
-from .matching.presets import PRESETS, Preset
 from .matching.settings import RepairSettings
-from .matching.stages import Stage
+from .matching.stages import PRESETS, Preset, Stage
 from .matching.starts import initial_map
 from .runtime.batches import refine_pairs, stack
 from .runtime.compilation import compiler_options

@@ -47,7 +47,7 @@ from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.meshes import read_mesh
 from jaxsmw.matching.executor import Start, padded_map, run
-from jaxsmw.matching.presets import PRESETS, PresetName
+from jaxsmw.matching.stages import PRESETS, PresetName
 from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
 
 Pair = tuple[Spectrum, Spectrum, Int[Array, " m"]]

@@ -51,7 +51,7 @@ from jaxsmw.collection.synchronization import vertex_map_between, vertices_as_po
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import nearest_surface_points
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal
-from jaxsmw.matching.presets import PRESETS
+from jaxsmw.matching.stages import PRESETS
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import transfer_landmarks
 

@@ -80,8 +80,7 @@ from jaxsmw.io.meshes import read_mesh, write_mesh
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import paired_spectra
-from jaxsmw.matching.presets import PresetName
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import PresetName, Stage
 from jaxsmw.matching.starts import initial_map
 from jaxsmw.report.figures import save_figure
 from jaxsmw.report.summary import provenance

@@ -42,9 +42,9 @@ from jaxsmw import InputError, geodesic_error, match, read_mesh
 from jaxsmw.benchmark.datasets import DataPair, DataSet, choose_pairs, open_data_set
 from jaxsmw.benchmark.tables import markdown
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.presets import PRESETS, PresetName
-from jaxsmw.matching.scores import dirichlet_energy_ratio, distortion, wrong_probability
+from jaxsmw.matching.judge import dirichlet_energy_ratio, distortion, wrong_probability
 from jaxsmw.matching.settings import WrongProbabilitySettings
+from jaxsmw.matching.stages import PRESETS, PresetName
 from jaxsmw.runtime.compilation import release_programs
 from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
@@ -125,7 +125,7 @@ def scores_of(found: Correspondence) -> dict[str, float]:
 
 
 def fitted(maps: Sequence[Measured]) -> WrongProbabilitySettings:
-    """Fit the coefficients of `jaxsmw.matching.scores` to maps by logistic regression."""
+    """Fit the coefficients of `jaxsmw.matching.judge` to maps by logistic regression."""
     features = np.array([[1, np.log(one.distortion), np.log(one.mean_expected)] for one in maps])
     signs = np.where([one.wrong for one in maps], 1, -1)
 

@@ -84,7 +84,7 @@ def test_asymmetric_shapes_are_matched_from_both_initial_maps(monkeypatch):
     from_shot = _expected(each["shot"]) < RepairSettings().aligned_preference * _expected(each["aligned"])
     best = each["shot" if from_shot else "aligned"]
     estimates = _count_calls(monkeypatch, "jaxsmw.matching.judge.expected_error")
-    descriptors = _count_calls(monkeypatch, "jaxsmw.matching.shapes.shot_descriptors")
+    descriptors = _count_calls(monkeypatch, "jaxsmw.matching.preparation.shot_descriptors")
     for mirror in ("auto", "no"):
         estimates.clear()
         descriptors.clear()

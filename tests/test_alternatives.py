@@ -21,13 +21,11 @@ from jaxsmw.matching.executor import Outcome
 from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
-from jaxsmw.matching.presets import PRESETS, Preset
 from jaxsmw.matching.search.alternatives import Alternatives
 from jaxsmw.matching.search.proxies import Proxy, deformation, distance_error, map_difference
 from jaxsmw.matching.search.repair import refine_and_repair
 from jaxsmw.matching.settings import AlternativeSettings
-from jaxsmw.matching.shapes import Sizes
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
 from jaxsmw.matching.starts import make_start
 
 REPAIR = PRESETS["accurate"].repair

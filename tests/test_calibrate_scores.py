@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxsmw import creature_pair, match
-from jaxsmw.matching.presets import choose_preset
-from jaxsmw.matching.scores import wrong_probability
+from jaxsmw.matching.judge import wrong_probability
 from jaxsmw.matching.settings import WrongProbabilitySettings
+from jaxsmw.matching.stages import choose_preset
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 

@@ -31,9 +31,8 @@ from jaxsmw.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.matching.executor import SpectralPair, Start, run
-from jaxsmw.matching.presets import PRESETS, Preset
 from jaxsmw.matching.search.chirality import Decision
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import PRESETS, Preset, Stage
 
 
 def random_distances(number, seed=0):

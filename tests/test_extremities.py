@@ -7,8 +7,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
-from jaxsmw.matching.search.extremities import extremities, plausible_pairings
-from jaxsmw.matching.search.proxies import Proxy
+from jaxsmw.matching.search.proxies import Proxy, extremities, plausible_pairings
 
 
 def reduced(mesh):

@@ -26,15 +26,14 @@ from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import preparation, shapes
+from jaxsmw.matching import preparation
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import reverse_map
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import describe, paired_spectra
-from jaxsmw.matching.presets import PRESETS, Preset, choose_preset
 from jaxsmw.matching.search.repair import refine_and_repair
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import PRESETS, Preset, Stage, choose_preset
 from jaxsmw.matching.starts import initial_map
 from jaxsmw.runtime import threads as threads_module
 
@@ -80,7 +79,7 @@ def test_invalid_arguments_are_refused_before_eigenbases_are_computed(pair, opti
     def refuse(*_, **__):
         raise AssertionError("eigenpairs were computed")
 
-    monkeypatch.setattr("jaxsmw.matching.shapes.eigenpairs", refuse)
+    monkeypatch.setattr("jaxsmw.matching.preparation.eigenpairs", refuse)
     mesh_x, mesh_y, _ = pair
     if options == {"partial": True}:
         mesh_y = make_mesh(1000 * mesh_y.vertices, mesh_y.faces)
@@ -108,8 +107,8 @@ def test_initial_maps_of_large_meshes_use_samples(pair, init, monkeypatch):
     if not isinstance(init, str):
         init = np.array([[i, truth[i]] for i, _ in init])
     spectra = paired_spectra(Pair(mesh_x, mesh_y), 30)
-    monkeypatch.setattr(shapes, "_COMPARED", 1200)
-    monkeypatch.setattr(shapes, "_COMPARED_FROM", 1000)
+    monkeypatch.setattr(preparation, "_COMPARED", 1200)
+    monkeypatch.setattr(preparation, "_COMPARED_FROM", 1000)
     start = initial_map(Pair(mesh_x, mesh_y), *spectra, init=init)
     compared = np.unique(start)
     assert 100 < len(compared) < 1500

@@ -16,15 +16,13 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching import executor
 from jaxsmw.matching.executor import Outcome, Start, run
-from jaxsmw.matching.judge import Judge
+from jaxsmw.matching.judge import Judge, detours, distortion, overlap
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.presets import PRESETS, Preset
-from jaxsmw.matching.scores import detours, distortion, overlap
 from jaxsmw.matching.search.repair import refine_and_repair, refine_further
 from jaxsmw.matching.settings import RepairSettings
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import PRESETS, Preset, Stage
 from jaxsmw.report.summary import summarize
 
 LEVELS = (20, 20, 40, 40)

@@ -14,10 +14,9 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import GeodesicError, geodesic_error
 from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.judge import wrong_probability
 from jaxsmw.matching.match import match
-from jaxsmw.matching.presets import PRESETS
-from jaxsmw.matching.scores import wrong_probability
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import PRESETS, Stage
 from jaxsmw.report.summary import REPORT_FILES, summarize, write_comparison, write_report
 from jaxsmw.wording import percentage
 

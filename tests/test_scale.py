@@ -13,9 +13,9 @@ from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
 from jaxsmw.creature import creature_pair
 from jaxsmw.geometry import estimate_scale
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.matching.judge import distortion
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import paired_spectra
-from jaxsmw.matching.scores import distortion
 
 PRESET = "paper"
 

@@ -12,8 +12,7 @@ from jaxsmw.geometry import sampling
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.sampling import coarse_edges
-from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.scores import (
+from jaxsmw.matching.judge import (
     area_shape_difference,
     dirichlet_energy_ratio,
     discontinuous_parts,
@@ -22,6 +21,7 @@ from jaxsmw.matching.scores import (
     orientation_reversal,
     wrong_probability,
 )
+from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.settings import ExpectedErrorSettings, ScoreSettings
 from jaxsmw.wording import percentage
 

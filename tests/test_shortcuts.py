@@ -23,9 +23,8 @@ from jaxsmw.geometry import SurfacePoints, cut_shortcuts, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, diagnose
 from jaxsmw.geometry.shortcuts import points_on_uncut
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.presets import PRESETS, Preset
 from jaxsmw.matching.settings import RepairSettings
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import PRESETS, Preset, Stage
 
 
 def bent_tube(gap: float, *, spacing: float = 0.08, thickness: float = 0.3) -> Mesh:

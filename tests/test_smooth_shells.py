@@ -18,7 +18,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
-from jaxsmw.matching.shapes import Sizes
+from jaxsmw.matching.stages import Sizes
 
 pytestmark = pytest.mark.study
 

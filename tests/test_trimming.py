@@ -14,10 +14,9 @@ from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.presets import Preset
 from jaxsmw.matching.search.trimming import trimmed, trimmed_stage
 from jaxsmw.matching.settings import RepairSettings
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import Preset, Stage
 
 TRIMMED = Preset(
     repeated=(

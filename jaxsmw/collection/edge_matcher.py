@@ -21,9 +21,8 @@ from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.edges import EdgeMap, EdgeTask, match_edges
 from jaxsmw.collection.shapes import preset_key, shape_key
 from jaxsmw.errors import InputError
-from jaxsmw.matching.descriptors import DescriptorAxes
-from jaxsmw.matching.presets import Preset
-from jaxsmw.matching.shapes import PreparedShape
+from jaxsmw.matching.preparation import DescriptorAxes, PreparedShape
+from jaxsmw.matching.stages import Preset
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress
 from jaxsmw.runtime.workers import run_tasks

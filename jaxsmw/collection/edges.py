@@ -12,8 +12,8 @@ from jaxtyping import Int64
 from jaxsmw.collection.pairs import match_many, prepare_task
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.presets import Preset
-from jaxsmw.matching.shapes import PreparedShape
+from jaxsmw.matching.preparation import PreparedShape
+from jaxsmw.matching.stages import Preset
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +25,8 @@ class EdgeMap:
     - `forward`: the match of every vertex of X, as `SurfacePoints` on Y with m entries.
     - `backward`: the match of every vertex of Y, as `SurfacePoints` on X with n entries.
     - `expected_error`: the mean expected error, in units of the square root of the area; see
-      `jaxsmw.matching.scores`.
-    - `distortion`: the distortion of the map; see `jaxsmw.matching.scores.distortion`.
+      `jaxsmw.matching.judge`.
+    - `distortion`: the distortion of the map; see `jaxsmw.matching.judge.distortion`.
     - `suspicious`: whether the map looks wrong, judged without the maps of other edges.
     """
 

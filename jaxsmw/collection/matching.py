@@ -23,8 +23,8 @@ from jaxsmw.errors import InputError, check_choice, check_number, check_whole_nu
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
 from jaxsmw.geometry.shortcuts import points_on_uncut
-from jaxsmw.matching.presets import Preset, PresetName, choose_preset
-from jaxsmw.matching.shapes import PreparedShape
+from jaxsmw.matching.preparation import PreparedShape
+from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress, timed

@@ -19,9 +19,8 @@ from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import Outcome, Start, run, runs_in_batches
 from jaxsmw.matching.match import match_prepared
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedPair, pair_up
-from jaxsmw.matching.presets import Preset, PresetName, choose_preset
-from jaxsmw.matching.shapes import PreparedShape
+from jaxsmw.matching.preparation import PreparedPair, PreparedShape, pair_up
+from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.matching.starts import make_start
 from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.compilation import release_programs

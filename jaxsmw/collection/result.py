@@ -13,7 +13,7 @@ from jaxsmw.collection.shape_models import ShapeModel, shape_model
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.matching.descriptors import DescriptorAxes
+from jaxsmw.matching.preparation import DescriptorAxes
 from jaxsmw.transfer.registered_mesh import RegisteredMesh, register_mesh
 from jaxsmw.wording import count_of
 
@@ -33,7 +33,7 @@ class MatchedEdge:
     - `source`, `target`: the 0-based numbers of the two shapes in `Collection.meshes`, as integers.
     - `expected_error`: the mean expected error of the map, computed without the other maps; infinite if the
       match failed. The distances are measured on the target.
-    - `distortion`: the distortion of the map (`jaxsmw.matching.scores.distortion`), a number of at least 1
+    - `distortion`: the distortion of the map (`jaxsmw.matching.judge.distortion`), a number of at least 1
       without unit. The distortion is 1 for isometries, larger for worse maps, and infinite if the match
       failed.
     - `estimated_error`: an estimate of the error of the map, which determines the weight of the map. The

@@ -18,10 +18,9 @@ from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.shortcuts import cut_shortcuts
 from jaxsmw.geometry.shot import shot_descriptors
-from jaxsmw.matching.descriptors import DescriptorAxes, PrincipalAxes
 from jaxsmw.matching.pair import number_of_usable_vertices
-from jaxsmw.matching.presets import Preset
-from jaxsmw.matching.shapes import PreparedShape, prepare_shapes
+from jaxsmw.matching.preparation import DescriptorAxes, PreparedShape, PrincipalAxes, prepare_shapes
+from jaxsmw.matching.stages import Preset
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress
 

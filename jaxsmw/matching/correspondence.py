@@ -24,12 +24,11 @@ from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.geodesics import SurfacePoints, check_indices
 from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
 from jaxsmw.matching.executor import SpectralPair, Start, embeddings, nearest_points, reverse_map
-from jaxsmw.matching.judge import Scored, estimate_error
+from jaxsmw.matching.judge import Scored, estimate_error, overlap, wrong_probability
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.presets import Preset
-from jaxsmw.matching.scores import overlap, wrong_probability
 from jaxsmw.matching.settings import WITHOUT_REPAIR, ExpectedErrorSettings
+from jaxsmw.matching.stages import Preset
 from jaxsmw.matching.starts import INITIAL_MAPS
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, register_mesh
@@ -63,7 +62,7 @@ class Correspondence:
     - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
-    - `distortion`: the distortion of the map (`jaxsmw.matching.scores.distortion`), a number without unit.
+    - `distortion`: the distortion of the map (`jaxsmw.matching.judge.distortion`), a number without unit.
       The
       distortion is 1 for isometries and larger for worse maps. The value is None if it was not computed.
     - `suspicious`: whether the map looks wrong. If the preset has repair, the value is True if limbs still
@@ -317,7 +316,7 @@ class Correspondence:
     def expected_error(self) -> Float[np.ndarray, " m"]:
         """Estimate the geodesic error of every match without ground truth.
 
-        `jaxsmw.matching.scores` explains the estimate. An unreferenced vertex of X receives the value
+        `jaxsmw.matching.judge` explains the estimate. An unreferenced vertex of X receives the value
         of the nearest referenced vertex.
 
         **Returns:** The expected geodesic distance between every match and the true match (m,), divided by
@@ -330,7 +329,7 @@ class Correspondence:
     ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
         """Predict which vertices have a counterpart on the other shape, for partial shapes.
 
-        `jaxsmw.matching.scores` explains the prediction.
+        `jaxsmw.matching.judge` explains the prediction.
 
         **Arguments:**
 
@@ -361,7 +360,7 @@ class Correspondence:
         """Estimate the probability that the map is wrong on a part of the body, without ground truth.
 
         A map is called wrong if at least 2 % of X's area have errors above 0.25 times the square root of Y's
-        area, for example because limbs are swapped. `jaxsmw.matching.scores` explains the estimate.
+        area, for example because limbs are swapped. `jaxsmw.matching.judge` explains the estimate.
 
         **Returns:** A probability, from 0 to 1; None if `distortion` is None.
         """

@@ -30,16 +30,14 @@ from jaxsmw.geometry.mesh import Mesh, MeshLike
 from jaxsmw.geometry.scans import SMALL_CLOSED
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import Outcome, Start, compile_stage
-from jaxsmw.matching.judge import Scored, estimate_error
+from jaxsmw.matching.judge import Scored, discontinuous_parts, estimate_error, orientation_reversal
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, prepare
-from jaxsmw.matching.presets import Preset, PresetName, choose_preset
-from jaxsmw.matching.scores import discontinuous_parts, orientation_reversal
 from jaxsmw.matching.search.chirality import Decision, Hands
 from jaxsmw.matching.search.repair import refine_and_repair
 from jaxsmw.matching.search.trimming import complete, trimmed_stage
 from jaxsmw.matching.settings import WITHOUT_REPAIR, ExpectedErrorSettings
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
 from jaxsmw.matching.starts import check_initial_map, make_start
 from jaxsmw.runtime.memory import return_free_memory
 from jaxsmw.runtime.progress import Step, no_step, timed

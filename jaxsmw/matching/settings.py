@@ -9,7 +9,7 @@ from jaxsmw.errors import InputError, check_number, check_whole_number
 
 @dataclass(frozen=True)
 class ScoreSettings:
-    """The settings of `jaxsmw.matching.scores`. Lengths are in units of the square root of the area.
+    """The settings of `jaxsmw.matching.judge`. Lengths are in units of the square root of the area.
 
     The tables with numbers R1, R2, … are in `docs/research_log.md`.
 
@@ -42,7 +42,7 @@ class ScoreSettings:
 
 @dataclass(frozen=True)
 class ExpectedErrorSettings:
-    """The settings of `jaxsmw.matching.scores`. Lengths are in units of the square root of the area.
+    """The settings of `jaxsmw.matching.judge`. Lengths are in units of the square root of the area.
 
     The tables with numbers R1, R2, … are in `docs/research_log.md`.
 
@@ -72,7 +72,7 @@ class ExpectedErrorSettings:
 
 @dataclass(frozen=True)
 class WrongProbabilitySettings:
-    """The coefficients of `jaxsmw.matching.scores`, a logistic regression. (Table R31)
+    """The coefficients of `jaxsmw.matching.judge`, a logistic regression. (Table R31)
 
     **Attributes:**
 
@@ -99,7 +99,7 @@ class AlternativeSettings:
     - `radii`: a tuple with one entry for each initial map from SHOT alone. Each entry is a tuple of radii,
       which are positive integers in units of 0.06.
     - `compared_pairings`: the largest number of pairings of extremities in the comparison of features. The
-      most plausible pairings are compared; see `jaxsmw.matching.search.extremities.plausible_pairings`.
+      most plausible pairings are compared; see `jaxsmw.matching.search.proxies.plausible_pairings`.
     - `pairings` (Tables R27 and R40): the number of initial maps from pairings of extremities.
     - `distance_weight`: the weight of the distances to extremities in the search for initial maps. SHOT has
       the weight 1.

@@ -43,8 +43,8 @@ def compiler_options() -> dict[str, str | bool]:
 
     JAX accepts these options only in the outermost `jax.jit`. Other compiled functions may call
     `jaxsmw.refine`, so `jaxsmw.refine` does not set the options itself. The options depend on the default
-    backend of JAX, not on `jax.default_device`. If JAX's setting `jax_disable_most_optimizations` asks for the
-    shortest compilation, the options do not raise the level of optimisation.
+    backend of JAX, not on `jax.default_device`. If JAX's setting `jax_disable_most_optimizations` asks for
+    the shortest compilation, the options do not raise the level of optimisation.
 
     **Returns:** A dictionary from the names of the options to their values. Options that the installed XLA
     does not support are left out. The dictionary is empty if the default backend is not the CPU.

@@ -23,8 +23,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.executor import SpectralPair, padded_map
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
-from jaxsmw.matching.shapes import Sizes
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import Sizes, Stage
 from jaxsmw.matching.starts import make_start
 
 MOST_SAMPLES = 1000

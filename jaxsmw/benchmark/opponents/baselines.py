@@ -41,8 +41,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.maps import read_pointwise_map
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.match import match
-from jaxsmw.matching.presets import PRESETS, PresetName
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import PRESETS, PresetName, Stage
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.runtime.compilation import compiled
 

@@ -18,11 +18,9 @@ from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 from jaxsmw.matching.executor import Outcome, SpectralPair, Start, run
 from jaxsmw.matching.judge import Judge, Scored
-from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.search.extremities import extremities, plausible_pairings
-from jaxsmw.matching.search.proxies import Proxy, deformation, map_difference
+from jaxsmw.matching.preparation import PreparedPair, PreparedShape
+from jaxsmw.matching.search.proxies import Proxy, deformation, extremities, map_difference, plausible_pairings
 from jaxsmw.matching.settings import RepairSettings
-from jaxsmw.matching.shapes import PreparedShape
 from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime.threads import side_by_side
 

@@ -15,10 +15,9 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.matching.executor import Outcome, SpectralPair, Start, run
 from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.presets import Preset
 from jaxsmw.matching.search.alternatives import Alternatives
 from jaxsmw.matching.settings import WITHOUT_REPAIR
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import Preset, Stage
 
 logger = logging.getLogger("jaxsmw")
 
@@ -36,7 +35,7 @@ def refine_and_repair(
 
     If the initial map exchanges symmetric limbs, refinement does not correct this error, because both limbs
     have the same shape. If the preset has repair, the outcome is checked for orientation reversal and
-    discontinuities (`jaxsmw.matching.scores`). If the outcome looks wrong, repair takes the following two
+    discontinuities (`jaxsmw.matching.judge`). If the outcome looks wrong, repair takes the following two
     steps.
 
     1. Alternatives: `jaxsmw.matching.search.alternatives` refines many initial maps on a thousand samples.

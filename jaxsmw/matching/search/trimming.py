@@ -14,15 +14,12 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
 from jaxsmw.geometry.scans import in_small_components
 from jaxsmw.matching.executor import Start, reverse_map, run
-from jaxsmw.matching.judge import Judge, Scored
+from jaxsmw.matching.judge import Judge, Scored, detours
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedPair, pair_up
-from jaxsmw.matching.presets import Preset
-from jaxsmw.matching.scores import detours
+from jaxsmw.matching.preparation import PreparedPair, pair_up, prepare_shapes
 from jaxsmw.matching.search.repair import finish
 from jaxsmw.matching.settings import WITHOUT_REPAIR
-from jaxsmw.matching.shapes import Sizes, prepare_shapes
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import Preset, Sizes, Stage
 
 logger = logging.getLogger("jaxsmw")
 
@@ -36,7 +33,7 @@ def trimmed(
     """Trim the larger shape of a partial pair to the region that the smaller shape covers.
 
     A vertex of the larger shape probably has a counterpart if its detour is small; see
-    `jaxsmw.matching.scores.detours`. The vertices with the smallest detours are kept, until their area is
+    `jaxsmw.matching.judge.detours`. The vertices with the smallest detours are kept, until their area is
     `area` times the area of the smaller shape. All faces around them are kept as well, except those of small
     components.
 
