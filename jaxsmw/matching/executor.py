@@ -196,9 +196,8 @@ def run(
     - `stages`: the stages, in the order in which they run. A start runs no stage after its first failure.
     - `starts`: the starts.
     - `history`: whether to record a `History` of each stage; see `jaxsmw.refine`.
-    - `batch_size`, `devices`: see `jaxsmw.refine_pairs`. Batches contain full shapes only. Starts whose
-      spectra are the same object share them
-      on the devices.
+    - `batch_size`, `devices`: see `jaxsmw.refine_pairs`. Batches contain full shapes only. Starts with the
+      same spectrum object share it on the devices.
 
     **Returns:** An iterator over one `Outcome` per start, in the order of the starts.
     """
@@ -228,8 +227,9 @@ def _run_one(stages: Sequence[Stage], seen: Sequence[SpectralPair], start: Start
             excluded = jnp.asarray(pad_rows(start.excluded, len(spectra.x.mask)))
             spectra = replace(spectra, x=spectra.x.excluding(excluded))
         x, y, samples, partial = spectra.x, spectra.y, spectra.samples, spectra.partial
-        if program := _compiling.pop(_key(stage, (x, y, matches, samples), partial, history), None):
-            wait([program])
+        if _compiling:
+            key = _key(stage, (x, y, matches, samples), partial, history)
+            wait([program] if (program := _compiling.pop(key, None)) else [])
         settings = {**stage.settings, "partial": partial, "history": history}
         found = compiled(refine)(x, y, matches, samples=samples, **settings)
         refinements.append(found)
