@@ -27,7 +27,7 @@ from jaxsmw.transfer import (
     transfer_landmarks,
 )
 from jaxsmw.transfer.coverage import UncoveredVertices, at_slits
-from jaxsmw.transfer.landmarks import nearest_vertices
+from jaxsmw.transfer.landmarks import landmark_vertices
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 from jaxsmw.transfer.registered_mesh import _follow
 
@@ -376,9 +376,11 @@ class TestLandmarks:
             return Landmarks(tuple(names), mesh.vertices[[shared[name][column] for name in names]])
 
         landmarks = (at(self.mesh_x, "abc", 0), at(self.mesh_y, "abc", 1))
-        assert nearest_vertices(*landmarks, self.mesh_x, self.mesh_y).tolist() == [[3, 30], [3, 30], [5, 50]]
+        assert landmark_vertices(*landmarks, self.mesh_x, self.mesh_y).tolist() == [[3, 30], [3, 30], [5, 50]]
         with pytest.raises(InputError, match="'c' and 'd' have the same nearest vertex"):
-            nearest_vertices(at(self.mesh_x, "abcd", 0), at(self.mesh_y, "abcd", 1), self.mesh_x, self.mesh_y)
+            landmark_vertices(
+                at(self.mesh_x, "abcd", 0), at(self.mesh_y, "abcd", 1), self.mesh_x, self.mesh_y
+            )
 
     def test_a_far_landmark_is_noted(self):
         landmarks = self.landmarks()

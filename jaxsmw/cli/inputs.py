@@ -145,7 +145,7 @@ def read_initial_map(
 def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int64[np.ndarray, "l 2"]:
     """Read landmarks on X and on Y, and return the nearest vertices of those with a name in both files."""
     from jaxsmw.io.landmarks import match_landmarks, read_landmark_file
-    from jaxsmw.transfer.landmarks import nearest_vertices
+    from jaxsmw.transfer.landmarks import landmark_vertices
     from jaxsmw.wording import count_of
 
     both = [read_landmark_file(file) for file in files]
@@ -156,7 +156,7 @@ def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int
         if alone:
             number = count_of(len(alone), "landmark")
             say(f"note: {landmarks.name}: {number} without a partner, such as {alone[0]!a}.")
-    return nearest_vertices(both[0].select(matched.names), both[1].select(matched.names), *meshes)
+    return landmark_vertices(both[0].select(matched.names), both[1].select(matched.names), *meshes)
 
 
 def _note_index_base(file: str, index_base: IndexBase | None) -> None:

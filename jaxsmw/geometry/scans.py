@@ -47,10 +47,7 @@ def lost_vertices(
 def between_neighbors(
     position: Float64[np.ndarray, "n 3"], triangles: Int64[np.ndarray, "f 3"], lost: Bool[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Move each lost vertex to the mean of its usable neighbours.
-
-    If a lost vertex has no usable neighbours, it is moved to the mean of all usable vertices.
-    """
+    """Move each lost vertex to the mean of its usable neighbours, or of all vertices if it has none."""
     placed = position.copy()
     for vertex in np.flatnonzero(lost):
         around = np.unique(triangles[(triangles == vertex).any(axis=1)])

@@ -185,10 +185,7 @@ def _face_numbers(data: MeshData, mesh_x: Mesh) -> Int64[np.ndarray, " f"]:
 def _sampled_faces(
     registered: RegisteredMesh, faces: Int64[np.ndarray, "f 3"], numbers: Int64[np.ndarray, " g"]
 ) -> _Corners:
-    """Find the nearest face of the source for each of four points per face of the target.
-
-    The result contains rows of the source's `MeshData.faces`.
-    """
+    """Find the nearest row of the source's `MeshData.faces` for each of four points per target face."""
     samples = np.einsum("sk,fkx->fsx", _SAMPLES, registered.mesh_y.vertices[faces])
     found, _ = nearest_surface_points(samples.reshape(-1, 3), registered.mesh)
     weights = np.full(samples.shape[:2], 1 / len(_SAMPLES))
@@ -241,11 +238,7 @@ def _without(values: Mapping[str, _Value], names: Collection[str]) -> dict[str, 
 
 
 def _notes(data: MeshData, target: MeshData, registered: RegisteredMesh) -> list[str]:
-    """Return notes about the transfer, each as a sentence.
-
-    A note says that normals were not transferred, which data of the target were replaced, or how many
-    vertices of the target are far from the registered mesh.
-    """
+    """Return sentences about data that were not transferred, were replaced, or come from far away."""
     notes = []
     if NORMALS in data.vertex_data:
         notes.append("normals were not transferred, because they describe the shape of the source.")

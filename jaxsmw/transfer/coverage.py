@@ -22,26 +22,18 @@ _NEIGHBORS = 32
 
 
 class Attraction(NamedTuple):
-    """Vertices of the target (c,), each with the point of the source that the vertex attracts.
+    """Weighted vertices of the target, each with the point of the source that the vertex attracts."""
 
-    **Attributes:**
-
-    - `interpolation`: a matrix (c, m) of barycentric weights. Multiplied by the vertex positions of the
-      source, the matrix gives the positions of the points.
-    - `weights`: the weights of the vertices of the target (c,).
-    - `positions`: the positions of the vertices of the target (c, 3).
-    """
-
-    interpolation: csr_array
+    interpolation: csr_array  # (c, m): the points are this matrix times the vertex positions of the source
     weights: Float64[np.ndarray, " c"]
     positions: Float64[np.ndarray, "c 3"]
 
     def matrix(self) -> csr_array:
-        """Return the matrix (m, m) of the quadratic term of the weighted squared distances."""
+        """The quadratic term (m, m) of the weighted squared distances."""
         return csr_array(self.interpolation.T @ (diags_array(self.weights) @ self.interpolation))
 
     def right_side(self) -> Float64[np.ndarray, "m 3"]:
-        """Return the linear term of the weighted squared distances."""
+        """The linear term of the weighted squared distances."""
         return self.interpolation.T @ (self.weights[:, None] * self.positions)
 
 
@@ -50,11 +42,6 @@ class UncoveredVertices:
 
     A vertex does not count as uncovered if the nearest triangle of X touches a boundary of X. Otherwise holes
     of X would close, and boundaries of X would stretch to parts of the body that X lacks.
-
-    **Arguments:**
-
-    - `mesh_x`: the source X (m vertices).
-    - `mesh_y`: the target Y, in the coordinates of the deformation.
     """
 
     def __init__(self, mesh_x: Mesh, mesh_y: Mesh) -> None:
@@ -69,22 +56,10 @@ class UncoveredVertices:
     def attraction(
         self, positions: Float64[np.ndarray, "m 3"], strengths: Float64[np.ndarray, " m"]
     ) -> Attraction | None:
-        """Return the uncovered vertices of Y, each with the point of the deformed X that it attracts.
-
-        The first call excludes all vertices of Y whose distance from X is at most half of `_UNCOVERED`. Later
-        calls exclude the same vertices.
-
-        **Arguments:**
-
-        - `positions`: the positions of the vertices of X.
-        - `strengths`: a factor for each vertex of X. The weight of an uncovered vertex of Y is the vertex
-          area times the factor at the nearest point of X.
-
-        **Returns:** An `Attraction`, or None if no vertex is uncovered.
-        """
+        """Return the attraction of the uncovered vertices of Y, weighted by area and `strengths`, or None."""
         deformed = replace(self._mesh, vertices=positions)
         points, distances = nearest_surface_points(self._positions, deformed)
-        if self._first:
+        if self._first:  # later calls leave out the vertices that are clearly covered now
             near = np.flatnonzero(distances > 0.5 * _UNCOVERED * self._root)
             self._positions, self._areas = self._positions[near], self._areas[near]
             points, distances, self._first = points[near], distances[near], False

@@ -83,7 +83,7 @@ def transfer_landmarks(
     return TransferredLandmarks(moved, distances, errors, notes)
 
 
-def nearest_vertices(
+def landmark_vertices(
     landmarks_x: Landmarks, landmarks_y: Landmarks, mesh_x: Mesh, mesh_y: Mesh
 ) -> Int64[np.ndarray, "l 2"]:
     """Convert landmarks with equal names to pairs of vertices, which `match` accepts as the initial map.

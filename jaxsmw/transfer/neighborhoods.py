@@ -86,10 +86,7 @@ class Neighborhoods:
 
     @cached_property
     def components(self) -> tuple[csr_array, csr_array, csr_array]:
-        """The weighted x, y and z components of all edge vectors, each a matrix (n, n).
-
-        The entry (i, j) is a component of the vector from vertex j to vertex i, times the weight of the edge.
-        """
+        """The components of the weighted vectors from vertex j to vertex i, each a matrix (n, n)."""
         x, y, z = (self.weights * component for component in self.vectors.T)
         return self._matrix(x, -x), self._matrix(y, -y), self._matrix(z, -z)
 
@@ -125,16 +122,12 @@ class Neighborhoods:
         return values
 
     def differences(self, values: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "e ..."]:
-        """Return, for each edge, the value at its first vertex minus the value at its second vertex."""
+        """Return the value at the first vertex of each edge minus the value at its second vertex."""
         return values[self.edges[:, 0]] - values[self.edges[:, 1]]
 
     def similarities(self, positions: Float64[np.ndarray, "n 3"]) -> Similarities:
-        """Fit a similarity transformation to the neighbourhood of each vertex.
-
-        The transformations take the scaled mesh to the given positions. The fit is that of
-        as-rigid-as-possible deformation (Sorkine, Alexa 2007), extended by a scale. If most neighbourhoods
-        are reflected, all rotations include a reflection.
-        """
+        """Fit the transformation of each neighbourhood. If most are reflected, all rotations reflect."""
+        # The fit is that of as-rigid-as-possible deformation (Sorkine, Alexa 2007), extended by a scale.
         components = zip(self.components, self.component_sums.T, strict=True)
         columns = [total[:, None] * positions - matrix @ positions for matrix, total in components]
         moments = np.stack(columns, axis=2)
@@ -149,11 +142,7 @@ class Neighborhoods:
         return Similarities(hand * rotations, np.clip(scales, 1 / _SCALE_RANGE, _SCALE_RANGE))
 
     def divergence(self, similarities: Similarities) -> Float64[np.ndarray, "n 3"]:
-        """Return, for each vertex, the weighted sum of its transformed edge vectors.
-
-        The edge vectors point to the vertex. Each edge vector is transformed by the mean of the
-        transformations at both ends of the edge.
-        """
+        """Return the weighted sums of edge vectors to each vertex, transformed by the mean of both ends."""
         matrices = similarities.rotations * similarities.scales[:, None, None]
         sums = np.zeros((len(matrices), 3))
         for axis, (matrix, total) in enumerate(zip(self.components, self.component_sums.T, strict=True)):

@@ -34,25 +34,15 @@ _STIFFNESS_OF_MAPS = 0.01
 
 
 class _Round(NamedTuple):
-    """A sequence of deformations. After each deformation, weights are reduced where faces are flipped.
+    """A sequence of deformations. After each deformation, weights are reduced where faces are flipped."""
 
-    **Attributes:**
-
-    - `deformations`: the largest number of deformations. If no vertex is pulled or drawn to the target, the
-      round ends as soon as no face is flipped.
-    - `factor`: the factor by which weights at flipped faces and at their neighbours are multiplied.
-    - `neighbors`: the largest distance to these neighbours, in edges.
-    - `pull`: if positive, vertices with reduced weights are pulled to the target. The function `_halfway`
-      computes the goals of these vertices. At first, the weight of a goal is `pull` times the vertex area.
-    - `cover`: if positive, the round draws the source to vertices of the target that the source does not
-      reach. At first, the weight of such a vertex is `cover` times the vertex area.
-    """
-
-    deformations: int
-    factor: float
-    neighbors: int
-    pull: float = 0.0
-    cover: float = 0.0
+    deformations: int  # at most; a round that neither pulls nor covers ends as soon as no face is flipped
+    factor: float  # multiplies the weights at flipped faces and at their neighbours
+    neighbors: int  # the largest distance to these neighbours, in edges
+    pull: float = (
+        0.0  # the first weight of goals on the target for vertices of reduced weight, in vertex areas
+    )
+    cover: float = 0.0  # the first weight of vertices of the target that are not reached, in vertex areas
 
 
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
@@ -120,10 +110,7 @@ class RegisteredMesh:
 
     @cached_property
     def surface_points(self) -> SurfacePoints:
-        """The nearest point of Y for each vertex of the registered mesh: `SurfacePoints` with m entries.
-
-        Triangles of Y that face away from a vertex are left out; see `nearest_facing_points`.
-        """
+        """The nearest point of Y that faces each vertex (`nearest_facing_points`), m `SurfacePoints`."""
         return nearest_facing_points(self.vertices, self._normals, self._nearest[0], self.mesh_y)
 
     @cached_property
@@ -261,12 +248,11 @@ class RegisteredMesh:
             f"({flipped / len(self.mesh_x.faces):.3%}).",
             f"area distortion: 90 % of the triangles have {areas[0]:.2f} to {areas[1]:.2f} times their area "
             f"on the source; angle distortion: {self.angle_distortions.mean():.1f} degrees in the mean.",
-            *(
-                [f"{self.bridged:.1%} of the source lies at thin slits of the target, and bridges them."]
-                if self.bridged
-                else []
-            ),
-        )
+        ) + self._slits()
+
+    def _slits(self) -> tuple[str, ...]:
+        share = f"{self.bridged:.1%} of the source lies at thin slits of the target, and bridges them."
+        return (share,) if self.bridged else ()
 
 
 def register_mesh(
@@ -366,7 +352,7 @@ def register_mesh(
                 near = around.averaging @ near
             weights = np.where(near > 0, of_round.factor * weights, weights)
     similarities = Similarities(similarities.rotations, around.size * similarities.scales)
-    following = follow_surroundings(mesh_x, mesh_y, positions + middle, similarities)
+    positions, similarities, *_ = follow_surroundings(mesh_x, mesh_y, positions + middle, similarities)
     bridged = float(mesh_x.average(bridging))
     if bridged > _MUCH_BRIDGED:
         warnings.warn(
@@ -374,7 +360,7 @@ def register_mesh(
             "slits and moves with its surroundings, but the map is less accurate there: fill the slits.",
             stacklevel=2,
         )
-    return RegisteredMesh(mesh_x, mesh_y, following.positions, following.similarities, bridged)
+    return RegisteredMesh(mesh_x, mesh_y, positions, similarities, bridged)
 
 
 def _bridging(mesh_x: Mesh, mesh_y: Mesh, points: SurfacePoints, width: float) -> Bool[np.ndarray, " m"]:
@@ -447,13 +433,7 @@ def _follow(
     positions: Float64[np.ndarray, "m 3"],
     attraction: Attraction | None = None,
 ) -> Float64[np.ndarray, "m 3"]:
-    """Return the least-squares solution for vertex positions with given targets and edge vectors.
-
-    The targets have weights. The edge vectors are those of X, transformed by `similarities`. `attraction`
-    adds weighted squared distances from points of X to uncovered vertices of Y. The linear system is solved
-    only for the vertices whose given positions are not accurate, and for their neighbours. All other vertices
-    keep the given positions.
-    """
+    """Solve for positions with weighted targets and edge vectors, where the given positions are wrong."""
     system = csr_array(diags_array(weights) + stiffness**2 * around.laplacian)
     right = stiffness**2 * around.divergence(similarities) + weights[:, None] * targets
     if attraction is not None:
@@ -488,11 +468,8 @@ def _follow(
 def _halfway(
     nearest: SurfacePoints, mapped: Float64[np.ndarray, "p 3"], mesh_y: Mesh
 ) -> Float64[np.ndarray, "p 3"]:
-    """Move each point of Y halfway towards a given position. The point stays in the plane of its triangle.
-
-    Vertices that are pulled to the nearest points of Y can slide along the surface, away from the points of
-    the map. The halfway points hold the vertices back.
-    """
+    """Move each point of Y halfway towards a given position, in the plane of its triangle."""
+    # Vertices that are pulled to the nearest points of Y would slide along it, away from the map.
     positions = nearest.positions(mesh_y)
     normals = mesh_y.area_vectors[nearest.faces]
     squares = (normals**2).sum(axis=1, keepdims=True)
@@ -509,10 +486,7 @@ def _flipped_faces(
     positions: Float64[np.ndarray, "m 3"],
     similarities: Similarities,
 ) -> Bool[np.ndarray, " f"]:
-    """Return a mask, True for flipped faces; see `RegisteredMesh.flipped_faces`.
-
-    `normals` are the normals of the source's faces.
-    """
+    """Return the mask `RegisteredMesh.flipped_faces`, given the normals of the source's faces."""
     rotations = similarities.rotations
     hand = np.sign(np.linalg.det(rotations[0]))
     first, second, third = mesh_x.faces.T
@@ -521,7 +495,7 @@ def _flipped_faces(
 
 
 def _normals(vertices: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.ndarray, "f 3"]:
-    """Return the face normals of a mesh with the given vertex positions. The normals are not unit vectors."""
+    """Return the area vectors of a mesh with other positions, faster than a new mesh does."""
     first, second, third = mesh.faces.T
     origins = vertices[first]
     return np.cross(vertices[second] - origins, vertices[third] - origins)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -53,25 +52,9 @@ class _Components:
         return (self._weights @ columns).reshape(-1, *values.shape[1:])
 
 
-class Following(NamedTuple):
-    """The vertices of X on Y, after those without faces have followed the others.
-
-    **Attributes:**
-
-    - `positions`, `similarities`: the positions (m, 3) and the transformations of all vertices.
-    - `matches`: the matches of the vertices of small components, as vertices of Y; -1 for all others (m,).
-    - `left_out`: the share of X's area in small components that have no counterpart on Y.
-    """
-
-    positions: Float64[np.ndarray, "m 3"]
-    similarities: Similarities
-    matches: Int64[np.ndarray, " m"]
-    left_out: float
-
-
 def follow_surroundings(
     mesh_x: Mesh, mesh_y: Mesh, positions: Float64[np.ndarray, "m 3"], similarities: Similarities
-) -> Following:
+) -> tuple[Float64[np.ndarray, "m 3"], Similarities, Int64[np.ndarray, " m"], float]:
     """Move the vertices of X without faces with their surroundings.
 
     Each vertex without faces moves with the nearest vertex that has faces. A small component is rigid: all
@@ -86,12 +69,14 @@ def follow_surroundings(
     - `positions`: the positions of the vertices of X on Y (m, 3), in the unit of Y.
     - `similarities`: the transformations of the vertices that take X to these positions.
 
-    **Returns:** The `Following`. Vertices that have faces keep their positions and transformations.
+    **Returns:** The positions (m, 3) and the transformations of all vertices, where vertices that have faces
+    keep theirs; the matches (m,) of the vertices of small components, as vertices of Y, and -1 for all
+    others; and the share of X's area in small components that have no counterpart on Y.
     """
     matches, known = np.full(len(positions), -1), mesh_x.referenced_vertices
     positions, similarities = _with_nearest(known, mesh_x, positions, similarities)
     if not len(mesh_x.small_faces):
-        return Following(positions, similarities, matches, 0.0)
+        return positions, similarities, matches, 0.0
     parts, others = _Components(mesh_x), _Components(mesh_y)
     rows, of_row = parts.rows, parts.of_row
     scales = parts.mean(similarities.scales[rows])
@@ -120,7 +105,7 @@ def follow_surroundings(
     known = known | (matches >= 0)
     positions, similarities = _with_nearest(known, mesh_x, positions, similarities)
     left_out = parts.areas[~paired].sum() / (mesh_x.area + parts.areas.sum())
-    return Following(positions, similarities, matches, float(left_out))
+    return positions, similarities, matches, float(left_out)
 
 
 def match_small_components(

@@ -83,11 +83,7 @@ def _best_of_sides(
     near: Bool[np.ndarray, " f"],
     lengths: Float64[np.ndarray, " c"],
 ) -> Int64[np.ndarray, " c"]:
-    """Group the corners by vertex and by side of the seams, and choose one corner of each group.
-
-    In each group, the corner with the smallest value in `lengths` is chosen. The result (c,) contains the
-    chosen corner for each of the c = 3 f corners.
-    """
+    """For each of the c = 3 f corners, return the shortest corner at its vertex and side of the seams."""
     tail, head = np.arange(3 * len(faces)), np.roll(np.arange(3 * len(faces)).reshape(-1, 3), -1, 1).ravel()
     vertex = faces.ravel()
     turned = vertex[tail] > vertex[head]
@@ -124,10 +120,7 @@ class _CutSurface:
 
     @cached_property
     def neighbors(self) -> csr_array:
-        """The adjacency matrix (f, f) of triangles that share a texture vertex.
-
-        Each triangle is adjacent to itself.
-        """
+        """The adjacency matrix (f, f) of triangles that share a texture vertex, each also with itself."""
         f = len(self.faces)
         entries = np.ones(3 * f), self.faces.ravel(), 3 * np.arange(f + 1)
         corners = csr_array(entries, shape=(f, int(self.faces.max()) + 1))
@@ -136,12 +129,7 @@ class _CutSurface:
     def walk(
         self, goals: Float64[np.ndarray, "p 3"], start: Int64[np.ndarray, " p"]
     ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-        """Walk from triangles towards goals without crossing a seam.
-
-        Each step leads to the neighbour nearest to the goal. Return the last triangle (p,). Also return
-        the point of this triangle that is nearest to the goal, as barycentric weights (p, 3), and the
-        distance from this point to the goal (p,).
-        """
+        """Walk to goals without crossing a seam. Return the last triangles, nearest points and distances."""
         found, weights, distances = start.copy(), np.empty((len(goals), 3)), np.empty(len(goals))
         for first in range(0, len(goals), _BLOCK):
             block = np.arange(first, min(first + _BLOCK, len(goals)))
@@ -159,11 +147,7 @@ class _CutSurface:
     def _nearest_neighbor(
         self, goals: Float64[np.ndarray, "p 3"], triangles: Int64[np.ndarray, " p"]
     ) -> tuple[Int64[np.ndarray, " p"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-        """Return, for each goal and its triangle, the neighbouring triangle that is nearest to the goal.
-
-        Also return the point of this neighbour that is nearest to the goal, as barycentric weights, and the
-        distance from this point to the goal.
-        """
+        """Return the nearest neighbour of each goal's triangle, its nearest point and the distance."""
         indptr = self.neighbors.indptr.astype(np.int64)
         first, counts = indptr[triangles], indptr[triangles + 1] - indptr[triangles]
         begin = np.cumsum(counts) - counts
@@ -179,10 +163,7 @@ def _near_seams(
     cut: Int64[np.ndarray, "g 3"],
     faces: Int64[np.ndarray, "f 3"],
 ) -> Bool[np.ndarray, " f"]:
-    """Return True for faces of Y that a seam may cross.
-
-    The edge of the textured part of X counts as a seam.
-    """
+    """Return a mask of the faces of Y that a seam, or the edge of the textured part of X, may cross."""
     mesh, vertices = registered.mesh, registered.mesh_y.vertices
     pairs = np.unique(np.column_stack([mesh.faces.ravel(), cut.ravel()]), axis=0)
     several = np.bincount(pairs[:, 0], minlength=len(mesh.vertices)) > 1
