@@ -35,6 +35,7 @@ from jaxsmw.benchmark.tables import _introduction, latex_table, markdown, markdo
 from jaxsmw.cli.run import run_command
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.meshes import write_mesh
+from jaxsmw.matching.executor import SpectralPair
 from jaxsmw.runtime.provenance import measured_code
 from jaxsmw.runtime.workers import open_executor
 
@@ -534,7 +535,7 @@ def test_times_exclude_compilation(monkeypatch):
     monkeypatch.setattr(measurement, "_LONG", 0.5)
     monkeypatch.setattr(measurement, "_warm", {"short"})
     spectrum = random_spectrum(30, 5, seed=0)
-    pair = MethodInput(spectrum, spectrum, jnp.arange(30), (jnp.arange(30), jnp.arange(30)))
+    pair = MethodInput(SpectralPair(spectrum, spectrum), jnp.arange(30))
     for name, seconds, runs in (("short", 0.0, 2), ("long", 0.6, 1)):
         method = Slow(seconds)
         with measurement._CompilationClock() as compilation:

@@ -14,7 +14,7 @@ from test_shortcuts import bent_tube
 from jaxsmw import Correspondence, Mesh, creature_pair, geodesic_error, make_mesh, match, read_mesh
 from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.benchmark.measurement import FIGURES, Settings, measure_pair, measure_shape
-from jaxsmw.benchmark.opponents.baselines import Unrefined
+from jaxsmw.benchmark.opponents.baselines import _SHARED_STEPS, Unrefined
 from jaxsmw.benchmark.opponents.registry import METHODS
 from jaxsmw.evaluation import coverage
 from jaxsmw.io.meshes import write_mesh
@@ -105,6 +105,7 @@ def test_the_method_accurate_gives_the_map_of_match(case, tmp_path):
         warnings.simplefilter("ignore")
         found = match(*meshes, init=start, partial=partial)
     assert shows(found)
+    assert _SHARED_STEPS & found.seconds.keys() >= {"eigenbases", "initial map"}
     error = geodesic_error(
         meshes[1], found.pointwise_map, pair.ground_truth(*meshes), number_of_samples=300, seed=0
     )
@@ -132,7 +133,7 @@ def test_the_seconds_leave_out_steps_whose_results_all_methods_share(monkeypatch
         return SimpleNamespace(pointwise_map=np.arange(3), seconds=shared | own)
 
     monkeypatch.setattr("jaxsmw.benchmark.opponents.baselines.match", matched)
-    pair = SimpleNamespace(meshes=(None, None), init="auto", partial=False)
+    pair = SimpleNamespace(meshes=(None, None), init="auto", spectra=SimpleNamespace(partial=False))
     for _ in range(2):
         _, seconds = METHODS["accurate"].measure(pair)
         assert seconds == 15

@@ -15,6 +15,7 @@ from jaxsmw.benchmark.opponents.smooth_shells import SmoothShells
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.matching.executor import SpectralPair
 
 pytestmark = pytest.mark.study
 
@@ -26,7 +27,7 @@ def pair() -> MethodInput:
     generator = np.random.default_rng(0)
     x, y = random_spectrum(M, K, seed=1), random_spectrum(N, K, seed=2)
     samples = tuple(jnp.asarray(generator.choice(n, 80, replace=False)) for n in (M, N))
-    return MethodInput(x, y, jnp.asarray(generator.integers(0, N, M)), samples)
+    return MethodInput(SpectralPair(x, y, samples), jnp.asarray(generator.integers(0, N, M)))
 
 
 def nearest(queries, database) -> np.ndarray:
@@ -34,7 +35,7 @@ def nearest(queries, database) -> np.ndarray:
 
 
 def test_zoomout_is_iterative_upsampling(pair):
-    x, y = pair.spectrum_x, pair.spectrum_y
+    x, y = pair.spectra.both
     t = np.asarray(pair.initial_map)
     for k in (10, 15, 20, 25):
         a, b = np.asarray(x.eigenvectors[:, :k]), np.asarray(y.eigenvectors[:, :k])
@@ -45,8 +46,8 @@ def test_zoomout_is_iterative_upsampling(pair):
 
 
 def test_zoomout_on_samples_searches_all_vertices_at_the_end(pair):
-    x, y = pair.spectrum_x, pair.spectrum_y
-    s_x, s_y = (np.asarray(vertices[:60]) for vertices in pair.samples)
+    x, y = pair.spectra.both
+    s_x, s_y = (np.asarray(vertices[:60]) for vertices in pair.spectra.samples)
     phi, psi = np.asarray(x.eigenvectors), np.asarray(y.eigenvectors)
     c = (phi[:, :10] * np.asarray(x.vertex_areas)[:, None]).T @ psi[np.asarray(pair.initial_map), :10]
     t = nearest(phi[s_x, :10], psi[s_y, :10] @ c.T)
@@ -59,7 +60,7 @@ def test_zoomout_on_samples_searches_all_vertices_at_the_end(pair):
 
 def test_spectral_icp_takes_the_nearest_rotation(pair):
     icp = METHODS["icp"]
-    x, y, t = pair.spectrum_x, pair.spectrum_y, np.asarray(pair.initial_map)
+    (x, y), t = pair.spectra.both, np.asarray(pair.initial_map)
     for _ in range(4):
         c = (np.asarray(x.eigenvectors) * np.asarray(x.vertex_areas)[:, None]).T @ np.asarray(y.eigenvectors)[
             t
@@ -83,7 +84,8 @@ def test_all_methods_repair_a_noisy_initial_map():
     initial_map = np.where(generator.random(n) < 0.1, generator.integers(0, n, n), order)
     samples = generator.choice(n, 550, replace=False)
     on_both = jnp.asarray(np.argsort(order)[samples]), jnp.asarray(samples)
-    pair = MethodInput(x, y, jnp.asarray(initial_map), on_both, (mesh_x, mesh_y), init=initial_map)
+    spectra = SpectralPair(x, y, on_both)
+    pair = MethodInput(spectra, jnp.asarray(initial_map), (mesh_x, mesh_y), init=initial_map)
     for name, method in METHODS.items():
         if method.partial_only or isinstance(method, SmoothShells):
             continue  # tested in files of their own
@@ -107,7 +109,7 @@ def test_other_libraries_run_the_same_zoomout():
     x = Spectrum(y.eigenvalues, y.eigenvectors[order], y.vertex_areas[order], y.mask)
     initial_map = jnp.asarray(np.where(generator.random(300) < 0.3, generator.integers(0, 300, 300), order))
     samples = (jnp.arange(200), jnp.arange(200))
-    expected = METHODS["zoomout"](MethodInput(x, y, initial_map, samples))
+    expected = METHODS["zoomout"](MethodInput(SpectralPair(x, y, samples), initial_map))
     # These spectra have an unreferenced vertex at the beginning, and padding at the end.
     x, y = (
         Spectrum(s.eigenvalues, *(jnp.roll(a, 1, axis=0) for a in (s.eigenvectors, s.vertex_areas, s.mask)))
@@ -115,7 +117,7 @@ def test_other_libraries_run_the_same_zoomout():
     )
     shifted = jnp.roll(jnp.pad(initial_map + 1, (0, 20)), 1)
     for name, peer in peers.items():
-        found = peer(MethodInput(x, y, shifted, samples))
+        found = peer(MethodInput(SpectralPair(x, y, samples), shifted))
         found = np.asarray(found)[1:301] - 1
         assert np.mean(found != order) < 0.02
         if name == "pyfm-zoomout":

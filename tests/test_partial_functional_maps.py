@@ -25,6 +25,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import creature
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, make_mesh
+from jaxsmw.matching.executor import SpectralPair
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import describe, paired_spectra
 from jaxsmw.runtime.compilation import compiled
@@ -231,7 +232,8 @@ def test_the_method_uses_the_prepared_pair(case):
     )
     samples = jnp.arange(50), jnp.arange(50)
     meshes = case.partial, case.full
-    pair = MethodInput(case.x, case.y, jnp.asarray(case.initial_map), samples, meshes=meshes, partial=True)
+    spectra = SpectralPair(case.x, case.y, samples, partial=True, common_limit=True)
+    pair = MethodInput(spectra, jnp.asarray(case.initial_map), meshes)
     method = replace(METHODS["pfm"], number_of_eigenvectors=K, number_of_descriptors=4, iterations=1)
     mapped = method(pair)
     expected = case.matched(x, y, case.initial_map, iterations=1)

@@ -23,7 +23,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.executor import SpectralPair, padded_map
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
-from jaxsmw.matching.stages import Sizes, Stage
+from jaxsmw.matching.stages import Sizes
 from jaxsmw.matching.starts import make_start
 
 MOST_SAMPLES = 1000
@@ -42,25 +42,19 @@ class MethodInput:
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, with at least as many eigenvectors as any method
-      uses. Spectra and maps may be padded.
+    - `spectra`: the spectra and samples of X and Y, with at least as many eigenvectors as any method uses.
+      The spectra of a partial pair are comparable only in their common range of eigenvalues, to which
+      `SpectralPair.seen_by` cuts them. Spectra and maps may be padded.
     - `initial_map`: the initial map X -> Y (m,), 0-based vertices of Y.
-    - `samples`: sampled vertices of X (s_x,) and of Y (s_y,) in farthest-point order, for methods that
-      iterate on samples.
     - `meshes`: the meshes of X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
-    - `partial`: whether X and Y are a partial pair, that is, one shape is a part of the other shape. The
-      spectra of a partial pair are comparable only in their common range of eigenvalues.
     - `init`: the initial map as the argument `init` of `jaxsmw.match`, for methods that call `match`.
     """
 
-    spectrum_x: Spectrum
-    spectrum_y: Spectrum
+    spectra: SpectralPair
     initial_map: Int[Array, " m"]
-    samples: tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
     meshes: tuple[Mesh, Mesh] | None = None
     names: tuple[str, str] = ("X", "Y")
-    partial: bool = False
     init: str | Int64[np.ndarray, " vertices"] = DEFAULT_MATCH_INIT
 
     @classmethod
@@ -93,29 +87,7 @@ class MethodInput:
         start = make_start(prepared, DEFAULT_INITIAL_MAP if automatic else init)
         if number_of_descriptors:
             prepared = prepared.describe(number_of_descriptors)
-        spectra = prepared.spectra.padded
-        assert spectra.samples is not None
-        first = padded_map(start.pointwise_map)
-        return cls(*spectra.both, first, spectra.samples, pair.meshes, names, pair.partial, init)
-
-    def seen_in(self, stage: Stage) -> tuple[Spectrum, Spectrum]:
-        """Return both spectra as a stage sees them; see `SpectralPair.seen_by`.
-
-        The spectra of a partial pair are also cut to their common range of eigenvalues.
-        """
-        spectra = SpectralPair(
-            self.spectrum_x, self.spectrum_y, partial=self.partial, common_limit=self.partial
-        )
-        return spectra.seen_by(stage).both
-
-    def truncated(self, k: int) -> tuple[Spectrum, Spectrum]:
-        """Return both spectra with their first k eigenvectors; see `seen_in`."""
-        return self.seen_in(Stage(number_of_eigenvectors=k))
-
-    def sampled(self, count: int | None) -> tuple[Int[Array, " s_x"] | None, Int[Array, " s_y"] | None]:
-        """Return the first `count` samples of X and of Y; (None, None) if `count` is None."""
-        samples_x, samples_y = self.samples
-        return (None, None) if count is None else (samples_x[:count], samples_y[:count])
+        return cls(prepared.spectra.padded, padded_map(start.pointwise_map), pair.meshes, names, init)
 
 
 class Method(abc.ABC):

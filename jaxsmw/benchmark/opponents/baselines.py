@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Array, Int, Int64
+from jaxtyping import Int64
 
 from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.benchmark.opponents.base import MOST_SAMPLES, Method, MethodInput, PointwiseMap, successful
@@ -40,6 +40,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.maps import read_pointwise_map
 from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.executor import SpectralPair
 from jaxsmw.matching.match import match
 from jaxsmw.matching.stages import PRESETS, PresetName, Stage
 from jaxsmw.runtime.cache import recomputing
@@ -139,12 +140,9 @@ class Refined(Method):
             iterations=self.iterations,
             number_of_samples=self.number_of_samples,
         )
-        samples = None
-        if (number := self.number_of_samples) is not None:
-            samples = pair.samples[0][:number], pair.samples[1][:number]
-        found = compiled(refine)(
-            *pair.seen_in(stage), pair.initial_map, samples=samples, partial=pair.partial, **stage.settings
-        )
+        seen, start = pair.spectra.seen_by(stage), pair.initial_map
+        options = {"samples": seen.samples, "partial": seen.partial, **stage.settings}
+        found = compiled(refine)(*seen.both, start, **options)
         return successful(found.pointwise_map, found.result)
 
 
@@ -183,7 +181,7 @@ class Matched(Method):
         assert pair.meshes is not None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the errors are measured, so suspicions need no message
-            return match(*pair.meshes, preset=self.preset, init=pair.init, partial=pair.partial)
+            return match(*pair.meshes, preset=self.preset, init=pair.init, partial=pair.spectra.partial)
 
 
 # The steps in `Correspondence.seconds` whose results are in `MethodInput`.
@@ -217,29 +215,28 @@ class ZoomOut(Method):
 
     def __call__(self, pair: MethodInput) -> PointwiseMap:
         pointwise_map, refiner = pair.initial_map, _UNFILTERED
-        samples_x, samples_y = pair.sampled(self.number_of_samples)
-        if samples_x is not None:
-            refiner, first = _UNFILTERED_ON_SAMPLES, pair.truncated(self.first)
-            functional_map = compiled(encode)(pair.initial_map, *first)
-            pointwise_map = compiled(decode)(functional_map, *_at(first, samples_x, samples_y))
+        if self.number_of_samples is not None:
+            refiner, first = _UNFILTERED_ON_SAMPLES, self._seen(pair, self.first)
+            functional_map = compiled(encode)(pair.initial_map, *first.both)
+            pointwise_map = compiled(decode)(functional_map, *_at_samples(first))
         for k in range(self.first, self.number_of_eigenvectors + 1, self.step):
-            spectra = _at(pair.truncated(k), samples_x, samples_y)
-            refined = compiled(refine)(*spectra, pointwise_map, refiner=refiner, iterations=1)
+            seen = self._seen(pair, k)
+            refined = compiled(refine)(*_at_samples(seen), pointwise_map, refiner=refiner, iterations=1)
             pointwise_map = refined.pointwise_map
-        if samples_x is not None:
-            pointwise_map = compiled(decode)(refined.functional_map, *pair.truncated(k))
+        if self.number_of_samples is not None:
+            pointwise_map = compiled(decode)(refined.functional_map, *seen.both)
         return successful(pointwise_map, refined.result)
 
+    def _seen(self, pair: MethodInput, k: int) -> SpectralPair:
+        stage = Stage(number_of_eigenvectors=k, number_of_samples=self.number_of_samples)
+        return pair.spectra.seen_by(stage)
 
-def _at(
-    spectra: tuple[Spectrum, Spectrum],
-    samples_x: Int[Array, " s_x"] | None,
-    samples_y: Int[Array, " s_y"] | None,
-) -> tuple[Spectrum, Spectrum]:
+
+def _at_samples(pair: SpectralPair) -> tuple[Spectrum, Spectrum]:
     """Restrict both spectra to the samples. Without samples, return both spectra unchanged."""
-    if samples_x is None or samples_y is None:
-        return spectra
-    return spectra[0].sample(samples_x), spectra[1].sample(samples_y)
+    if pair.samples is None:
+        return pair.both
+    return pair.x.sample(pair.samples[0]), pair.y.sample(pair.samples[1])
 
 
 UNREFINED = Unrefined()

@@ -452,12 +452,11 @@ class PartialFunctionalMaps(Method):
 
     def __call__(self, pair: MethodInput) -> PointwiseMap:
         assert pair.meshes is not None
-        spectra = pair.seen_in(
-            Stage(
-                number_of_eigenvectors=self.number_of_eigenvectors,
-                number_of_descriptors=self.number_of_descriptors,
-            )
+        stage = Stage(
+            number_of_eigenvectors=self.number_of_eigenvectors,
+            number_of_descriptors=self.number_of_descriptors,
         )
+        spectra = pair.spectra.seen_by(stage).both
         gradient = SurfaceGradient.of(pair.meshes[1], spectra[1])
         found = compiled(partial_functional_map)(
             *spectra, gradient, pair.initial_map, iterations=self.iterations

@@ -43,7 +43,7 @@ class Peer(Method):
     package: str
 
     def __call__(self, pair: MethodInput) -> PointwiseMap:
-        x, y = (_Shape.of(spectrum) for spectrum in (pair.spectrum_x, pair.spectrum_y))
+        x, y = (_Shape.of(spectrum) for spectrum in pair.spectra.both)
         initial_map = np.searchsorted(y.vertices, np.asarray(pair.initial_map)[x.vertices])
         found = np.zeros(pair.initial_map.shape, np.int32)
         found[x.vertices] = y.vertices[self.refine(initial_map, x, y)]

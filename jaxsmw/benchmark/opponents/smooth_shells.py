@@ -443,7 +443,7 @@ class SmoothShells(Method):
     def __call__(self, pair: MethodInput) -> PointwiseMap:
         assert pair.meshes is not None
         descriptors = []
-        for mesh, spectrum in zip(pair.meshes, (pair.spectrum_x, pair.spectrum_y), strict=True):
+        for mesh, spectrum in zip(pair.meshes, pair.spectra.both, strict=True):
             assert spectrum.descriptors is not None
             descriptors.append(
                 np.asarray(spectrum.descriptors)[: len(mesh.vertices), : self.number_of_descriptors]
