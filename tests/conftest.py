@@ -66,9 +66,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if commit is None:
         return
     sampled = [item for item in items if item.get_closest_marker("sampled")]
-    kept = set(sampled[zlib.crc32(commit.encode()) % 10 :: 10])
-    left_out = [item for item in sampled if item not in kept]
-    items[:] = [item for item in items if item not in set(left_out)]
+    left_out = [item for i, item in enumerate(sampled) if (i + zlib.crc32(commit.encode())) % 10]
+    remaining = set(map(id, items)) - set(map(id, left_out))
+    items[:] = [item for item in items if id(item) in remaining]
     config.hook.pytest_deselected(items=left_out)
 
 

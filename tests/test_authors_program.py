@@ -19,7 +19,7 @@ SETTINGS = {"demo": 128, "paper": 100}
 PAIRS = {"faust_r_002_007": ("tr_reg_002", "tr_reg_007"), "faust_r_000_004": ("tr_reg_000", "tr_reg_004")}
 
 
-@pytest.fixture(params=PAIRS)
+@pytest.fixture(params=["faust_r_002_007", pytest.param("faust_r_000_004", marks=pytest.mark.sampled)])
 def name(request):
     return request.param
 

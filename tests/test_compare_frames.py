@@ -321,6 +321,7 @@ def test_tightened_gabor_is_parseval_and_gabor_is_not():
     assert variants.is_parseval(tighten(Gabor(FILTERS))) and not variants.is_parseval(Gabor(FILTERS))
 
 
+@pytest.mark.sampled
 def test_measurements_of_a_real_pair_are_consistent(shared):
     name = PairName("faust_r", "tr_reg_000", "tr_reg_004")
     settings = Settings(

@@ -97,6 +97,7 @@ def learn(network, pair, directory, *, loss="labels", prepare=None):
     )
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("loss", LOSSES)
 def test_learning_lowers_the_loss(network, pair, tmp_path, loss):
     trained = learn(network, pair, tmp_path, loss=loss)
@@ -150,6 +151,7 @@ class InterruptedPreparation:
         return self.pair
 
 
+@pytest.mark.sampled
 def test_resumed_training_gives_the_same_result(network, pair, tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "_SAVED_EVERY", 2)
     for name in ("whole", "parts"):

@@ -63,6 +63,7 @@ def train(name, pairs, steps, seed, directory, prepared):
     return trained.model, trained.losses
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", LOSSES)
 def test_learning_lowers_the_loss(pairs, tmp_path, name):
     listed, prepared = pairs
@@ -83,6 +84,7 @@ class InterruptedPairs(dict):
         return super().__getitem__(key)
 
 
+@pytest.mark.sampled
 def test_resumed_training_gives_the_same_result(pairs, tmp_path, monkeypatch):
     monkeypatch.setattr(learning, "_SAVED_EVERY", 2)
     listed, prepared = pairs

@@ -59,6 +59,7 @@ def test_smooth_shells_has_a_table_of_its_own(data):
     assert [pair.name for pair in first.pairs] == [pair.name for pair in second.pairs]
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", reproduce_paper.MESHINGS)
 def test_other_meshes_keep_the_ground_truth(data, tmp_path, name):
     data_set = open_data_set(data / "bumps")
@@ -96,6 +97,7 @@ def command(tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.sampled
 def test_one_command_gives_all_tables(command, data, tmp_path, capsys):
     assert command(data, "--output", tmp_path / "paper", "--quick", "--only", "table1", "fig7") == 0
     overview = (tmp_path / "paper" / "README.md").read_text()
@@ -105,6 +107,7 @@ def test_one_command_gives_all_tables(command, data, tmp_path, capsys):
     assert (tmp_path / "paper" / "table1" / "bumps" / "curves.png").stat().st_size > 1000
 
 
+@pytest.mark.sampled
 def test_failures_are_reported_at_the_end(command, data, tmp_path, capsys):
     for name in ("a", "b"):
         shutil.copytree(data / "bumps", tmp_path / "data" / name)

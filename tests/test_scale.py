@@ -167,6 +167,7 @@ def test_the_command_estimates_the_scale(part, body, tmp_path, run):
         assert_refused(run(*arguments, *wrong), naming=message)
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("name", ["cuts_horse_shape_2", "holes_david_shape_1", "cuts_michael_shape_3"])
 def test_the_scale_of_real_parts_is_found(shared, name):
     pairs = choose_pairs(open_data_set(shared / "data" / "shrec16_partial"), None, 0)

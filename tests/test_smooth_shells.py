@@ -123,6 +123,7 @@ def test_impossible_settings_are_refused(wrong):
         smooth_shells(mesh, mesh, no_descriptors(mesh), no_descriptors(mesh), **wrong)
 
 
+@pytest.mark.sampled
 def test_the_error_is_at_most_the_error_of_the_authors_program(shared):
     pair = open_data_set(shared / "data/faust_r").known_pairs["tr_reg_000", "tr_reg_004"]
     mesh_x, mesh_y = map(jaxsmw.read_mesh, pair.meshes)
