@@ -248,7 +248,8 @@ class RegisteredMesh:
             f"({flipped / len(self.mesh_x.faces):.3%}).",
             f"area distortion: 90 % of the triangles have {areas[0]:.2f} to {areas[1]:.2f} times their area "
             f"on the source; angle distortion: {self.angle_distortions.mean():.1f} degrees in the mean.",
-        ) + self._slits()
+            *self._slits(),
+        )
 
     def _slits(self) -> tuple[str, ...]:
         share = f"{self.bridged:.1%} of the source lies at thin slits of the target, and bridges them."
