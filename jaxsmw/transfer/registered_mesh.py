@@ -241,6 +241,7 @@ class RegisteredMesh:
         distances = self.distances[self.mesh_x.referenced_vertices] / unit
         flipped = int(self.flipped_faces.sum())
         areas = np.quantile(self.area_ratios, [0.05, 0.95])
+        slits = f"{self.bridged:.1%} of the source lies at thin slits of the target, and bridges them."
         return (
             f"distance to the target: mean {distances.mean():.3f} %, 99th percentile "
             f"{np.quantile(distances, 0.99):.3f} % of the square root of the target's area.",
@@ -248,12 +249,8 @@ class RegisteredMesh:
             f"({flipped / len(self.mesh_x.faces):.3%}).",
             f"area distortion: 90 % of the triangles have {areas[0]:.2f} to {areas[1]:.2f} times their area "
             f"on the source; angle distortion: {self.angle_distortions.mean():.1f} degrees in the mean.",
-            *self._slits(),
+            *([slits] if self.bridged else []),
         )
-
-    def _slits(self) -> tuple[str, ...]:
-        share = f"{self.bridged:.1%} of the source lies at thin slits of the target, and bridges them."
-        return (share,) if self.bridged else ()
 
 
 def register_mesh(
