@@ -42,8 +42,7 @@ def dirichlet_energy_ratio(
 
     - `pair`: the `Pair` of the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the `Spectrum` of X in `Pair.units_of_length`, with a few hundred eigenvectors. The
-      spectrum may be padded.
+    - `spectrum_x`: the `Spectrum` of X in `Pair.units_of_length`, with a few hundred eigenvectors.
     - `settings`: the settings of the scores, a `ScoreSettings`.
 
     **Returns:** The ratio, a float without unit, for positions in `Pair.units_of_length`.
@@ -61,8 +60,8 @@ def dirichlet_energy_ratio(
         centered = positions - pair.mesh_x.average(positions)
         # The eigenvectors keep their type, because a converted copy of them takes too much memory on large
         # meshes.
-        weighted = (areas[:m] * centered.T).astype(eigenvectors.dtype)
-        return float(np.sum(eigenvalues * (weighted @ eigenvectors[:m]) ** 2))
+        weighted = (areas * centered.T).astype(eigenvectors.dtype)
+        return float(np.sum(eigenvalues * (weighted @ eigenvectors) ** 2))
 
     unit_x, unit_y = pair.units_of_length
     matched = pair.mesh_y.vertices[pointwise_map]
@@ -91,8 +90,7 @@ def distortion(
 
     - `pair`: the `Pair` of the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the `Spectrum` of X in `Pair.units_of_length`, with a few hundred eigenvectors. The
-      spectrum may be padded.
+    - `spectrum_x`: the `Spectrum` of X in `Pair.units_of_length`, with a few hundred eigenvectors.
     - `settings`: the settings of the scores, a `ScoreSettings`.
 
     **Returns:** The distortion, a float without unit. For two full shapes, the distortion is at least 1.
@@ -149,7 +147,7 @@ def orientation_reversal(
 
     - `pair`: the source X (m vertices) and the target Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the spectrum of X in `Pair.units_of_length`. The spectrum may be padded.
+    - `spectrum_x`: the spectrum of X in `Pair.units_of_length`.
     - `settings`: the settings of the scores.
 
     **Returns:** A mask (m,), True for vertices around which the orientation is reversed.
@@ -169,7 +167,7 @@ def orientation_reversal(
     covered = np.clip(covered, -most, most)
     at_vertices = np.bincount(mesh_x.faces.ravel(), np.repeat(covered / 3, 3), len(mesh_x.vertices))
     eigenvectors = np.asarray(spectrum_x.eigenvectors)
-    eigenvectors = eigenvectors[: len(mesh_x.vertices), : settings.orientation_eigenvectors]
+    eigenvectors = eigenvectors[:, : settings.orientation_eigenvectors]
     return eigenvectors @ (eigenvectors.T @ at_vertices) < settings.orientation_threshold
 
 
@@ -192,7 +190,7 @@ def area_shape_difference(
 
     - `pair`: the source X (m vertices) and the target Y, two full shapes.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y. The spectra may be padded.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y.
     - `settings`: the settings of the scores.
 
     **Returns:** The root mean square difference between the eigenvalues of the operator and 1, without unit.
@@ -200,7 +198,7 @@ def area_shape_difference(
     """
     used = slice(settings.area_eigenvectors)
     pulled_back = np.asarray(spectrum_y.eigenvectors[:, used], np.float64)[pointwise_map]
-    areas = np.asarray(spectrum_x.vertex_areas, np.float64)[: len(pair.mesh_x.vertices)]
+    areas = np.asarray(spectrum_x.vertex_areas, np.float64)
     eigenvalues = np.linalg.eigvalsh((areas * pulled_back.T) @ pulled_back)
     return float(np.sqrt(np.mean((eigenvalues - 1) ** 2)))
 
