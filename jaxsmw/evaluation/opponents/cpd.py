@@ -56,8 +56,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.banks import FilterBank, Identity
+from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.pointwise_map import spectral_embeddings
-from jaxsmw.core.products import product
 from jaxsmw.core.refiner import State
 from jaxsmw.core.refiners.wavelet_preservation import PreparedWavelets, WaveletPreservation
 from jaxsmw.core.search import nearest_neighbor
