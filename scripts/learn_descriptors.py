@@ -74,7 +74,7 @@ from jaxsmw import (
     read_mesh,
 )
 from jaxsmw.benchmark.datasets import DataPair
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.signatures import wave_kernel_signature
 from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
 from jaxsmw.functional_maps import nearest_neighbor

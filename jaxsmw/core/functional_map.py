@@ -51,13 +51,17 @@ from typing import Literal, TypeVar, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
-import jax.scipy as jsp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import check_option
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import (
+    is_regular,
+    product,
+    solve_positive_definite,
+    symmetric_eigenvalues,
+)
 from jaxsmw.core.soft_maps import PointwiseMap, pull_back
 from jaxsmw.core.spectrum import Spectrum
 
@@ -102,7 +106,7 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
     gram = product(spectrum.eigenvectors.T, spectrum.eigenvectors)
-    return jsp.linalg.cho_solve(jsp.linalg.cho_factor(gram), spectrum.eigenvectors.T).T
+    return solve_positive_definite(gram, spectrum.eigenvectors.T).T
 
 
 def encode(
@@ -226,33 +230,18 @@ class QuadraticEnergy(eqx.Module):
 
         If the gram matrix is singular, the returned map is NaN or meaningless; `is_regular` detects this.
         """
-        return jsp.linalg.cho_solve((self.cholesky(), True), self.cross.T).T
-
-    def cholesky(self) -> Float[Array, "k_in k_in"]:
-        """Return the lower Cholesky factor of the gram matrix, (k_in, k_in)."""
-        return jnp.linalg.cholesky(self.gram, symmetrize_input=False)
+        return solve_positive_definite(self.gram, self.cross.T).T
 
     def is_regular(self) -> Bool[Array, ""]:
         """Return whether the gram matrix is non-singular to working precision."""
-        # If the gram matrix is singular, one of its Cholesky pivots is negative or as small as the rounding
-        # error. If a pivot is negative, the factor contains NaN, and the comparison below is False.
-        pivots = jnp.diagonal(self.cholesky()) ** 2
-        return jnp.min(pivots) > self.rounding()
-
-    def rounding(self) -> Float[Array, ""]:
-        """Return an estimate of the rounding error of the gram matrix.
-
-        The estimate is k_in times the largest diagonal entry times the machine epsilon.
-        """
-        relative = self.gram.shape[0] * jnp.finfo(self.gram.dtype).eps
-        return jnp.max(jnp.diagonal(self.gram)) * jnp.asarray(relative, self.gram.dtype)
+        return is_regular(self.gram)
 
     def condition_number(self) -> Float[Array, ""]:
         """Return the ratio of the largest to the smallest eigenvalue of the gram matrix.
 
         The ratio is infinite if the matrix is singular.
         """
-        eigenvalues = jnp.linalg.eigvalsh(self.gram)
+        eigenvalues = symmetric_eigenvalues(self.gram)
         return eigenvalues[-1] / jnp.maximum(eigenvalues[0], 0)
 
 
@@ -335,7 +324,7 @@ class WaveletProblem(eqx.Module):
         weights, inputs, outputs = self._weights_inputs_outputs(pointwise_map, norm)
         responses_out, responses_in = self.responses
         return QuadraticEnergy(
-            product((weights * inputs).T, inputs) * multiscale_kernel(responses_in, responses_in),
+            product(inputs.T, weights * inputs) * multiscale_kernel(responses_in, responses_in),
             product((weights * outputs).T, inputs) * multiscale_kernel(responses_out, responses_in),
             product(jnp.sum(weights * outputs**2, axis=0), frame_function(responses_out)),
         )

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int, Int32
 
 from jaxsmw.choices import Search
 from jaxsmw.core.functional_map import Convention, out_and_in
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.search import Patches, make_patches, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles

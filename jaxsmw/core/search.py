@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32, Shaped
 
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import orthonormal_columns, product
 
 # BLOCK is the number of queries per block, and _CHUNK is the number of database rows per chunk. Both sizes
 # were chosen by measurements with scripts/benchmark_speed.py on two CPU cores. The scores of a block must fit
@@ -325,7 +325,7 @@ def _centered(
 
 def _orthonormal(vectors: Float[Array, "p r d"]) -> Float[Array, "p r d"]:
     """Return, for each group, r orthonormal vectors whose span contains the r given vectors of the group."""
-    return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(vectors, 1, 2))[0], 1, 2)
+    return jax.vmap(lambda rows: orthonormal_columns(rows.T).T)(vectors)
 
 
 def nearest_neighbor_in_patches(

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsmw.core.banks import Meyer
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.spectrum import Spectrum
 
 

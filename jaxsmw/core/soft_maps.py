@@ -18,7 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.checks import as_parameter, check_between, check_kind
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.search import in_blocks, nearest_neighbor
 
 # The number of queries per block. The distances from all queries of a block to all database rows are stored

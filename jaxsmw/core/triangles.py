@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.search import in_blocks
 
 # The number of queries per block. The distances from all queries of a block to all triangles are stored at

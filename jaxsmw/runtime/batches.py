@@ -309,7 +309,7 @@ def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settin
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
         return refine(spectrum_x, spectrum_y, initial_map, refiner=refiner, samples=samples, **settings)
 
-    # CPUs use `lax.map`, because some programs of `jax.vmap` deadlock on CPUs.
+    # CPUs use `lax.map`, because a batch of pairs takes more time than the pairs one after another.
     each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
     if mesh.size == 1:
         return each(batch)

@@ -57,8 +57,8 @@ from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.benchmark.opponents.baselines import Refined
 from jaxsmw.core.banks import FilterBank, Identity
+from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.pointwise_map import spectral_embeddings
-from jaxsmw.core.products import product
 from jaxsmw.core.refiner import State
 from jaxsmw.core.refiners.wavelet_preservation import PreparedWavelets, WaveletPreservation
 from jaxsmw.core.search import nearest_neighbor

@@ -85,8 +85,8 @@ from jaxsmw.benchmark.opponents.base import (
 )
 from jaxsmw.core.checks import all_finite
 from jaxsmw.core.functional_map import dual_eigenvectors, encode
+from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.pointwise_map import decode
-from jaxsmw.core.products import product
 from jaxsmw.core.refinement import diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum

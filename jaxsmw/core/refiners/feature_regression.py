@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import jax.scipy as jsp
 from jaxtyping import Array, Bool, Float, Int, Int32
 
+from jaxsmw.core.linear_algebra import cholesky, product, solve_lower, solve_positive_definite
 from jaxsmw.core.pointwise_map import chosen_patches
-from jaxsmw.core.products import product
 from jaxsmw.core.refiner import Prepared, Problem
 from jaxsmw.core.refiners.coarse_to_fine import (
     CoarseToFine,
@@ -318,13 +317,13 @@ def _regress(
     gram = jnp.where(eigenvectors_y[:, None] == eigenvectors_y[None, :], yy, 0)
     gram = gram + _RIDGE * jnp.eye(yy.shape[0], dtype=yy.dtype)
     cross = jnp.where(eigenvectors_x[:, None] == eigenvectors_y[None, :], xy, 0)
-    matrix = jsp.linalg.solve(gram, cross.T, assume_a="pos").T
+    matrix = solve_positive_definite(gram, cross.T).T
     explained = product(matrix, xy.T)
     residual = xx - explained - explained.T + product(product(matrix, yy), matrix.T)
     identity = jnp.eye(residual.shape[0], dtype=residual.dtype)
-    factor = jnp.linalg.cholesky(residual + _LEAST_RESIDUAL * identity)
+    factor = cholesky(residual + _LEAST_RESIDUAL * identity)
     # The whitening is triangular, so coordinate i depends only on features 0 to i. Inactive features are set
     # to zero, because they would add only a constant and rounding errors to the distances.
-    whitening = jnp.where(keep_x[:, None], jsp.linalg.solve_triangular(factor, identity, lower=True).T, 0)
+    whitening = jnp.where(keep_x[:, None], solve_lower(factor, identity).T, 0)
     uncertainty = jnp.sum(jnp.where(keep_x, jnp.log(jnp.diagonal(factor)), 0))
     return matrix[:k_x, :k_y], Prediction(whitening, product(matrix.T, whitening), uncertainty)

@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import jax.scipy as jsp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Float64, Int, Int32
 
 from jaxsmw.core.functional_map import dual_eigenvectors
+from jaxsmw.core.linear_algebra import product, solve_positive_definite
 from jaxsmw.core.pointwise_map import chosen_patches
-from jaxsmw.core.products import product
 from jaxsmw.core.refiner import Prepared, Problem, Samples
 from jaxsmw.core.refiners.coarse_to_fine import (
     CoarseToFine,
@@ -262,7 +261,7 @@ class _Surface(NamedTuple):
         weighted = self.eigenvectors * weights[:, None]
         gram = product(self.eigenvectors.T, weighted)
         ridge = _RIDGE * jnp.trace(gram) / gram.shape[0] * jnp.eye(gram.shape[0], dtype=gram.dtype)
-        return self._replace(dual=jsp.linalg.solve(gram + ridge, weighted.T, assume_a="pos").T)
+        return self._replace(dual=solve_positive_definite(gram + ridge, weighted.T).T)
 
 
 class PreparedSurfaces(Prepared):

@@ -17,7 +17,7 @@ from jaxsmw.core.functional_map import (
     dual_eigenvectors,
     multiscale_kernel,
 )
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import nearest_orthogonal
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.solutions.base import PreparedT, Solution
@@ -125,8 +125,7 @@ class NearestOrthogonal(Solution[PreparedT]):
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """Return the polar factor (k_out, k_in) of the other solution's map, and the status code."""
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
-        left, _, right = jnp.linalg.svd(functional_map, full_matrices=False)
-        return product(left, right), result
+        return nearest_orthogonal(functional_map), result
 
 
 class LeastSquares(Solution[None]):

@@ -9,7 +9,7 @@ import jax
 from jaxtyping import Array, Float
 
 from jaxsmw.core.functional_map import PseudoInverse, dual_eigenvectors
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.spectrum import Spectrum
 
 

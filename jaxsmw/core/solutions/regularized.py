@@ -10,14 +10,13 @@ from typing import NamedTuple, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.scipy as jsp
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import as_parameter, check_between, check_option
 from jaxsmw.core.functional_map import Norm, QuadraticEnergy, WaveletProblem
-from jaxsmw.core.products import product
+from jaxsmw.core.linear_algebra import cholesky, product, rounding, solve_lower
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.solutions.base import Solution
@@ -213,7 +212,7 @@ class RegularizedLeastSquares(Solution[None]):
         )
         terms = self._terms(quadratic, eigenvalues_out, eigenvalues_in, descriptors)
         curvature = functools.reduce(operator.add, (t.curvature for t in terms if t.curvature is not None))
-        determined = curvature > quadratic.rounding()
+        determined = curvature > rounding(quadratic.gram)
         finite = jnp.all(jnp.isfinite(curvature)) & jnp.all(jnp.isfinite(quadratic.cross))
         solvable = finite & jnp.all(determined)
         # The quadratic terms have the same curvature in each entry of `C / unit`, so conjugate gradients need
@@ -308,7 +307,8 @@ class RegularizedLeastSquares(Solution[None]):
                 optx.GaussNewton(self.tolerance, self.tolerance, linear_solver=inner),
                 jax.lax.stop_gradient(initial / unit),
                 max_steps=self.max_steps,
-                adjoint=optx.ImplicitAdjoint(lx.GMRES(precision, precision, restart=50)),
+                # GMRES would call LAPACK, which can deadlock in a batch on CPUs; see `linear_algebra`.
+                adjoint=optx.ImplicitAdjoint(lx.Normal(lx.CG(precision, precision))),
                 throw=False,
             )
         converged = solution.result == optx.RESULTS.successful
@@ -337,8 +337,8 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
     is added to the diagonal, because a singular matrix has no Cholesky factor.
     """
     (k_out, k_in), dtype = energy.cross.shape, energy.gram.dtype
-    factor = jnp.linalg.cholesky(energy.gram + energy.rounding() * jnp.eye(k_in, dtype=dtype))
-    target = jsp.linalg.solve_triangular(factor, energy.cross.T, lower=True).T
+    factor = cholesky(energy.gram + rounding(energy.gram) * jnp.eye(k_in, dtype=dtype))
+    target = solve_lower(factor, energy.cross.T).T
     curvature = jnp.broadcast_to(jnp.diagonal(energy.gram)[None, :], (k_out, k_in))
     return _Term(lambda c: product(c, factor) - target, curvature)
 

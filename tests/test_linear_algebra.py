@@ -1,0 +1,199 @@
+"""Factorisations under `jit`, `vmap` and `grad`, and the refinement of batches of pairs on CPUs."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy as jsp
+import numpy as np
+import pytest
+from synthetic import random_spectrum
+
+from jaxsmw.core import linear_algebra
+from jaxsmw.core.refinement import refine
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.registration import Registration
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.results import RESULTS
+from jaxsmw.core.soft_refinement import refine_softly
+from jaxsmw.core.solutions import Filtering, LeastSquares, NearestOrthogonal, RegularizedLeastSquares
+from jaxsmw.runtime.batches import stack
+
+BATCH = 4
+SOLUTIONS = {
+    "filtering": Filtering(),
+    "least squares": LeastSquares(),
+    "regularized": RegularizedLeastSquares(),
+    "nearest orthogonal": NearestOrthogonal(LeastSquares()),
+}
+REFINERS = {name: WaveletPreservation(solution=solution) for name, solution in SOLUTIONS.items()}
+REFINERS |= {"regression": FeatureRegression(), "registration": Registration()}
+PATCHES = {
+    "wavelets in patches": WaveletPreservation(search="patches"),
+    "regression in patches": FeatureRegression(search="patches"),
+    "registration in patches": Registration(search="patches"),
+}
+
+
+def batch_of_pairs(vertices, eigenvectors, dtype=np.float32):
+    """Four pairs of shapes with positions and normals, as arrays with a leading axis, and their maps."""
+    spectra = []
+    for seed in range(2 * BATCH):
+        points = np.random.default_rng(seed).normal(size=(vertices, 3)).astype(dtype)
+        normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+        spectrum = random_spectrum(vertices, eigenvectors, seed=seed, dtype=dtype)
+        spectra.append(spectrum.with_positions(jnp.asarray(points), jnp.asarray(normals)))
+    maps = np.random.default_rng(0).integers(0, vertices, (BATCH, vertices))
+    return stack(spectra[:BATCH]), stack(spectra[BATCH:]), jnp.asarray(maps)
+
+
+def refine_batch(name, vertices, eigenvectors):
+    """Refine a batch of pairs, which must not wait for ever, and print that the maps are those of a loop."""
+    x, y, maps = batch_of_pairs(vertices, eigenvectors)
+
+    def run(x, y, t):
+        return refine(x, y, t, refiner=(REFINERS | PATCHES)[name])
+
+    for _ in range(3):
+        batch = jax.block_until_ready(jax.vmap(run)(x, y, maps))
+    loop = jax.lax.map(lambda pair: run(*pair), (x, y, maps))
+    assert (batch.result == RESULTS.successful).all() and (loop.result == RESULTS.successful).all()
+    assert np.mean(batch.pointwise_map == loop.pointwise_map) > 0.99
+    print("refined")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "regression" else pytest.mark.slow) for name in REFINERS]
+)
+def test_a_batch_of_pairs_does_not_wait_for_ever(name):
+    """Without a loop around LAPACK, the batch of `FeatureRegression` waits for ever (jaxlib 0.10)."""
+    here = Path(__file__).parent
+    paths = os.pathsep.join([str(here.parent), str(here), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, __file__, name],
+        env=os.environ | {"PYTHONPATH": paths, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": ""},
+        capture_output=True,
+        text=True,
+        timeout=900,
+    )
+    assert done.stdout.strip() == "refined", done.stderr
+
+
+def lapack_calls(function, *arguments):
+    """The numbers of batch dimensions of all calls of LAPACK in a program for CPUs."""
+    text = jax.jit(function).lower(*arguments).as_text()
+    return re.findall(r'@lapack_.*num_batch_dims = "(\d+)"', text)
+
+
+@pytest.mark.parametrize("name", [*REFINERS, *PATCHES])
+def test_batches_of_pairs_call_lapack_matrix_by_matrix(name):
+    x, y, maps = batch_of_pairs(40, 6)
+    samples = None if name in PATCHES else (jnp.arange(0, 40, 2), jnp.arange(1, 40, 2))
+
+    def run(x, y, t, partial=False):
+        refiner = (REFINERS | PATCHES)[name]
+        return refine(x, y, t, refiner=refiner, samples=samples, partial=partial, history=True)
+
+    calls = lapack_calls(jax.vmap(run), x, y, maps)
+    calls += lapack_calls(jax.vmap(jax.vmap(run)), *jax.tree.map(lambda leaf: leaf[None], (x, y, maps)))
+    if name == "registration":
+        calls += lapack_calls(jax.vmap(lambda *pair: run(*pair, partial=True)), x, y, maps)
+    assert calls and set(calls) == {"0"}
+
+
+@pytest.mark.parametrize("name", SOLUTIONS)
+def test_derivatives_of_batches_call_lapack_matrix_by_matrix(name):
+    x, y, maps = batch_of_pairs(40, 6)
+    refiner = WaveletPreservation(solution=SOLUTIONS[name])
+
+    def loss(eigenvectors, x, y, t):
+        moved = eqx.tree_at(lambda s: s.eigenvectors, x, eigenvectors)
+        return jnp.sum(refine_softly(moved, y, t, refiner=refiner, iterations=2).functional_map ** 2)
+
+    def total(eigenvectors, x, y, t):
+        return jnp.sum(jax.vmap(loss)(eigenvectors, x, y, t))
+
+    arguments = x.eigenvectors, x, y, maps
+    calls = lapack_calls(jax.vmap(jax.grad(loss)), *arguments) + lapack_calls(jax.grad(total), *arguments)
+    assert set(calls) <= {"0"} and bool(calls) == (name != "filtering")
+
+
+def symmetric(function):
+    return lambda matrix, *right: function((matrix + matrix.T) / 2, *right)
+
+
+def polar_factor(matrix):
+    left, _, right = jnp.linalg.svd(matrix, full_matrices=False)
+    return left @ right
+
+
+FACTORISATIONS = {
+    "cholesky": (linear_algebra.cholesky, jnp.linalg.cholesky, (6, 6), None),
+    "triangular": (
+        linear_algebra.solve_lower,
+        lambda factor, right: jsp.linalg.solve_triangular(factor, right, lower=True),
+        (6, 6),
+        (6, 3),
+    ),
+    "positive definite": (
+        symmetric(linear_algebra.solve_positive_definite),
+        symmetric(lambda matrix, right: jsp.linalg.solve(matrix, right, assume_a="pos")),
+        (6, 6),
+        (6, 3),
+    ),
+    "eigenvalues": (
+        symmetric(linear_algebra.symmetric_eigenvalues),
+        symmetric(jnp.linalg.eigvalsh),
+        (6, 6),
+        None,
+    ),
+    "tall": (linear_algebra.nearest_orthogonal, polar_factor, (7, 4), None),
+    "wide": (linear_algebra.nearest_orthogonal, polar_factor, (4, 7), None),
+    "square": (linear_algebra.nearest_orthogonal, polar_factor, (5, 5), None),
+}
+
+
+@pytest.mark.parametrize("name", FACTORISATIONS)
+def test_factorisations_and_their_derivatives_equal_those_of_jax(name):
+    function, expected, shape, right_shape = FACTORISATIONS[name]
+    generator = np.random.default_rng(0)
+    matrices = jnp.asarray(generator.normal(size=(BATCH, *shape)))
+    if name not in ("tall", "wide", "square"):
+        matrices = matrices @ matrices.mT + jnp.eye(shape[0])[None]
+    arguments = (matrices,)
+    if right_shape is not None:
+        arguments = (matrices, jnp.asarray(generator.normal(size=(BATCH, *right_shape))))
+
+    def loss(f):
+        return lambda *arguments: jnp.sum(jnp.sin(f(*arguments)))
+
+    def total(f):
+        return lambda *batch: jnp.sum(jax.vmap(loss(f))(*batch))
+
+    for transform in (
+        jax.vmap,
+        lambda f: lambda *batch: jax.vmap(jax.vmap(f))(*(part[None] for part in batch)),
+        lambda f: jax.vmap(jax.grad(loss(f))),
+        lambda f: jax.grad(total(f)),
+        lambda f: jax.vmap(jax.jacfwd(loss(f))),
+        *([] if name == "eigenvalues" else [lambda f: jax.vmap(jax.hessian(loss(f)))]),
+    ):
+        found, reference = (jax.jit(transform(f))(*arguments) for f in (function, expected))
+        np.testing.assert_allclose(found, reference, rtol=1e-9, atol=1e-11)
+        assert set(lapack_calls(transform(function), *arguments)) == {"0"}
+
+
+def test_orthonormal_columns_span_the_same_space():
+    vectors = jnp.asarray(np.random.default_rng(0).normal(size=(BATCH, 9, 4)))
+    bases = jax.vmap(linear_algebra.orthonormal_columns)(vectors)
+    np.testing.assert_allclose(bases.mT @ bases, jnp.broadcast_to(jnp.eye(4), (BATCH, 4, 4)), atol=1e-12)
+    np.testing.assert_allclose(bases @ (bases.mT @ vectors), vectors, atol=1e-12)
+
+
+if __name__ == "__main__":
+    refine_batch(sys.argv[1], 1500, 60)
