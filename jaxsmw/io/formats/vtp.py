@@ -7,6 +7,7 @@ import binascii
 import lzma
 import re
 import zlib
+from collections.abc import Sequence
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
@@ -49,41 +50,20 @@ def parse_vtp(data: bytes) -> Polygons:
     pieces = file.root.findall("PolyData/Piece")
     if not pieces:
         raise InputError("contains no piece of PolyData: export the mesh again.")
-    points: list[np.ndarray] = []
-    groups: dict[str, list] = {kind: [] for kind in _KINDS}
-    rows: dict[str, list[dict[str, np.ndarray]]] = {"PointData": [], "CellData": []}
-    coordinates: list[np.ndarray | None] = []
-    cell_rows: dict[str, list[tuple[int, int]]] = {kind: [] for kind in _KINDS}
-    offset = cells_before = 0
-    for piece in pieces:
-        n = _integer(piece, "NumberOfPoints", 0)
-        position = piece.find("Points/DataArray")
-        if position is None:
-            raise InputError(f"a piece has no points, {DAMAGED}")
-        points.append(file.array(position, n, 3).astype(np.float64))
-        total = 0
-        for kind in _KINDS:
-            cells = file.cells(piece, kind)
-            groups[kind].append(cells._replace(corners=cells.corners + offset))
-            cell_rows[kind].append((cells_before + total, cells_before + total + len(cells.sizes)))
-            total += len(cells.sizes)
-        data_of_points, texture = file.data(piece, "PointData", n)
-        coordinates.append(texture)
-        rows["PointData"].append(data_of_points)
-        rows["CellData"].append(file.data(piece, "CellData", total)[0])
-        offset, cells_before = offset + n, cells_before + total
-    order = np.concatenate([np.arange(*span) for kind in _KINDS for span in cell_rows[kind]])
-    known = [one for one in coordinates if one is not None]
+    points, cells, point_data, cell_data, textures = zip(*map(file.piece, pieces), strict=True)
+    first = np.cumsum([0, *map(len, points[:-1])])
+    shifted = [one._replace(corners=one.corners + at) for one, at in zip(cells, first, strict=True)]
+    known = [texture for texture in textures if texture is not None]
     return polygons_of(
         np.concatenate(points),
-        joined([cells for kind in _KINDS for cells in groups[kind]]),
-        _common(rows["PointData"]),
-        {name: values[order] for name, values in _common(rows["CellData"]).items()},
+        joined(shifted),
+        _common(point_data),
+        _common(cell_data),
         np.concatenate(known) if len(known) == len(pieces) else None,
     )
 
 
-def _common(pieces: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _common(pieces: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Concatenate each array that all pieces contain, if its number of columns is the same in all pieces."""
     return {
         name: np.concatenate([piece[name] for piece in pieces])
@@ -124,6 +104,20 @@ class _Reader:
                 "ZLib or without compression."
             )
         self.order, self.header = orders[order], np.dtype(orders[order] + headers[header])
+
+    def piece(
+        self, piece: ElementTree.Element
+    ) -> tuple[np.ndarray, Cells, dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray | None]:
+        """Return the points and cells of a piece, the arrays on both, and the texture of the points."""
+        n = _integer(piece, "NumberOfPoints", 0)
+        position = piece.find("Points/DataArray")
+        if position is None:
+            raise InputError(f"a piece has no points, {DAMAGED}")
+        points = self.array(position, n, 3).astype(np.float64)
+        cells = joined([self.cells(piece, kind) for kind in _KINDS])
+        point_data, texture = self.data(piece, "PointData", n)
+        cell_data, _ = self.data(piece, "CellData", len(cells.sizes))
+        return points, cells, point_data, cell_data, texture
 
     def data(
         self, piece: ElementTree.Element, tag: str, count: int
