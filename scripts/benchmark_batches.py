@@ -6,7 +6,7 @@
   `jax.lax.map`, `jax.vmap` with several batch sizes, and `jaxsmw.refine_pairs`. The time of `refine_pairs`
   includes the transfer of initial maps and results.
 - `accurate`: all stages of the preset `"accurate"` in float32, without repair. The candidates are several
-  batch sizes of `run`, which includes the transfer of initial maps and results. The last row is
+  batch sizes of `run_batches`, which includes the transfer of initial maps and results. The last row is
   `jaxsmw.match_pairs`, which also computes initial maps and scores, and repairs maps, on the host.
 
 The candidates of a table take turns in one process. The lower bound is the time of all matrix products of a
@@ -46,7 +46,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.meshes import read_mesh
-from jaxsmw.matching.executor import Start, padded_map, run
+from jaxsmw.matching.executor import SpectralPair, Start, padded_map, run_batches
 from jaxsmw.matching.stages import PRESETS, PresetName
 from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
 
@@ -229,11 +229,11 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
     """Yield the pairs per second of the preset `"accurate"`, and the agreement with maps of the CPU."""
     shapes = chosen_shapes(options)
     preset, count = PRESETS["accurate"], len(shapes.pairs)
-    starts = prepared_starts(shapes, "accurate")
+    tasks = prepared_tasks(shapes, "accurate")
     preset = preset.fitted(min(len(mesh.vertices) for mesh in shapes.meshes))
 
     def in_batches_of(size: int) -> Callable[[], object]:
-        return lambda: [one.pointwise_map for one in run(preset.stages, starts, batch_size=size)]
+        return lambda: [one.pointwise_map for one in run_batches(preset.stages, tasks, batch_size=size)]
 
     candidates = {f"batches of {size}": in_batches_of(size) for size in (1, *options.batch_sizes)}
     seconds = medians(candidates, options.repeats)
@@ -249,8 +249,9 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
     )
     products: Counter[MatrixProduct] = Counter()
     for stage in preset.stages:
-        seen = starts[0].spectra.padded.seen_by(stage)
-        start = padded_map(starts[0].pointwise_map)
+        spectra, first = tasks[0]
+        seen = spectra.padded.seen_by(stage)
+        start = padded_map(first.pointwise_map)
         traced = partial(refine, samples=seen.samples, **stage.settings)
         products += matrix_products(traced, *seen.both, start)
     floor = time_of_products(products, count, options.repeats)
@@ -275,9 +276,9 @@ def agreement(options: argparse.Namespace) -> Iterator[Part]:
         rows[0] += ["error x10^-3", "error of the CPU"]
     names: tuple[PresetName, ...] = ("paper", "accurate")
     for name in names:
-        starts = prepared_starts(shapes, name)
+        tasks = prepared_tasks(shapes, name)
         maps = [
-            [outcome.pointwise_map for outcome in run(PRESETS[name].stages, starts, devices=[device])]
+            [outcome.pointwise_map for outcome in run_batches(PRESETS[name].stages, tasks, devices=[device])]
             for device in (jax.devices()[0], jax.devices("cpu")[0])
         ]
         equal = [float(np.mean(ours == its)) for ours, its in zip(*maps, strict=True)]
@@ -302,10 +303,11 @@ def errors_of(data: Path, shapes: Shapes, maps: Sequence[np.ndarray]) -> list[fl
     return [truth.error(one, truth.meshes[1]) for truth, one in zip(truths, maps, strict=True)]
 
 
-def prepared_starts(shapes: Shapes, preset: PresetName) -> list[Start]:
-    """Return the starts of all pairs, with initial maps from SHOT."""
+def prepared_tasks(shapes: Shapes, preset: PresetName) -> list[tuple[SpectralPair, Start]]:
+    """Return the spectra of all pairs, with initial maps from SHOT."""
     found, _ = prepare_collection(shapes.meshes, PRESETS[preset])
-    return [prepare_task(found[i], found[j])[1][0] for i, j in shapes.pairs]
+    prepared = (prepare_task(found[i], found[j]) for i, j in shapes.pairs)
+    return [(pair.spectra, starts[0]) for pair, starts in prepared]
 
 
 PARTS = {"paper": paper, "accurate": accurate, "agreement": agreement}

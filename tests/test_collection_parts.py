@@ -30,7 +30,7 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.creature import creature
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.surface_distance import nearest_surface_points
-from jaxsmw.matching.executor import SpectralPair, Start, run
+from jaxsmw.matching.executor import SpectralPair, Start, run_batches
 from jaxsmw.matching.search.chirality import Decision
 from jaxsmw.matching.stages import PRESETS, Preset, Stage
 
@@ -374,7 +374,7 @@ def test_the_first_failure_of_a_batch_is_reported(three, monkeypatch):
     eigenvectors = shape.spectrum.eigenvectors.at[0, 0].set(jnp.nan)
     broken = SpectralPair(shape.spectrum, replace(shape.spectrum, eigenvectors=eigenvectors))
     identity = np.arange(len(three[0].vertices))
-    (outcome,) = run([Stage(), Stage()], [Start(broken, identity)], batch_size=1)
+    (outcome,) = run_batches([Stage(), Stage()], [(broken, Start(identity))], batch_size=1)
     assert [found.result == RESULTS.nonfinite_spectrum for found in outcome.refinements] == [True]
 
 

@@ -63,7 +63,7 @@ def prepared_body(body, initial_map, origin="map"):
     """Return the prepared pair of the body and itself, and the start from a map."""
     mesh, spectrum = body
     prepared = PreparedPair.of(Pair(mesh, mesh), spectrum, spectrum)
-    return prepared, Start(prepared.spectra, np.asarray(initial_map, np.int64), origin)
+    return prepared, Start(np.asarray(initial_map, np.int64), origin)
 
 
 def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), init=None, **options):
@@ -328,9 +328,9 @@ def test_final_stages_run_once_after_repair(body, swapped, identity, monkeypatch
     preset = Preset(repeated=(STAGE,), final=(final,), repair=repair)
     ran = []
 
-    def watched(stages, starts, **options):
+    def watched(stages, spectra, starts, **options):
         ran.extend(stages)
-        return run(stages, starts, **options)
+        return run(stages, spectra, starts, **options)
 
     monkeypatch.setattr("jaxsmw.matching.search.repair.run", watched)
     found = match(mesh, mesh, preset=preset, init=swapped, mirror="no", history=True)

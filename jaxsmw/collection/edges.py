@@ -25,7 +25,7 @@ class EdgeMap:
     - `forward`: the match of every vertex of X, as `SurfacePoints` on Y with m entries.
     - `backward`: the match of every vertex of Y, as `SurfacePoints` on X with n entries.
     - `expected_error`: the mean expected error, in units of the square root of the area; see
-      `jaxsmw.matching.judge`.
+      `jaxsmw.matching.judge.expected_error`.
     - `distortion`: the distortion of the map; see `jaxsmw.matching.judge.distortion`.
     - `suspicious`: whether the map looks wrong, judged without the maps of other edges.
     """

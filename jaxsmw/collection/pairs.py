@@ -16,7 +16,7 @@ from jaxsmw.collection.shapes import fitted_preset, prepare_collection, warned_a
 from jaxsmw.errors import check_whole_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.executor import Outcome, Start, run, runs_in_batches
+from jaxsmw.matching.executor import Outcome, Start, run_batches
 from jaxsmw.matching.match import match_prepared
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, PreparedShape, pair_up
@@ -118,7 +118,7 @@ def match_many(
     batch_size: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[Correspondence | ArithmeticError]:
-    """Match many prepared pairs. The stages run in batches if batches save time on the given devices.
+    """Match many prepared pairs. The stages run in batches, except on one CPU without a batch size.
 
     **Arguments:**
 
@@ -131,7 +131,7 @@ def match_many(
     numerically, its result is the `ArithmeticError`.
     """
     devices = jax.devices() if devices is None else devices
-    batched = runs_in_batches(batch_size, devices)
+    batched = batch_size is not None or len(devices) > 1 or devices[0].platform != "cpu"
 
     def fitted() -> Iterator[tuple[Preset, PreparedPair, list[Start]]]:
         for prepared, starts in tasks:
@@ -148,8 +148,8 @@ def match_many(
     for own, group in itertools.groupby(fitted(), key=lambda task: task[0]):
         while waiting := list(itertools.islice(group, _PAIRS_PER_DEVICE * len(devices))):
             release_programs()
-            flat = (one._replace(spectra=pair.spectra) for _, pair, starts in waiting for one in starts)
-            outcomes = run(own.judged, list(flat), batch_size=batch_size, devices=devices)
+            flat = [(pair.spectra, start) for _, pair, starts in waiting for start in starts]
+            outcomes = iter(run_batches(own.judged, flat, batch_size=batch_size, devices=devices))
             for _, prepared, starts in waiting:
                 of_pair = list(itertools.islice(outcomes, len(starts)))
                 yield _matched(prepared, starts, own, of_pair, alternatives)

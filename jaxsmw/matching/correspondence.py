@@ -27,7 +27,7 @@ from jaxsmw.matching.executor import SpectralPair, Start, embeddings, nearest_po
 from jaxsmw.matching.judge import Scored, estimate_error, overlap, wrong_probability
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.settings import WITHOUT_REPAIR, ExpectedErrorSettings
+from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.stages import Preset
 from jaxsmw.matching.starts import INITIAL_MAPS
 from jaxsmw.runtime.compilation import compiled
@@ -62,8 +62,7 @@ class Correspondence:
     - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
-    - `distortion`: the distortion of the map (`jaxsmw.matching.judge.distortion`), a number without unit.
-      The
+    - `distortion`: the distortion of the map (`jaxsmw.matching.judge.distortion`), a number without unit. The
       distortion is 1 for isometries and larger for worse maps. The value is None if it was not computed.
     - `suspicious`: whether the map looks wrong. If the preset has repair, the value is True if limbs still
       look swapped or the body still looks upside down after repair. If the preset has no repair, the value is
@@ -316,8 +315,8 @@ class Correspondence:
     def expected_error(self) -> Float[np.ndarray, " m"]:
         """Estimate the geodesic error of every match without ground truth.
 
-        `jaxsmw.matching.judge` explains the estimate. An unreferenced vertex of X receives the value
-        of the nearest referenced vertex.
+        See `jaxsmw.matching.judge.expected_error`. An unreferenced vertex of X receives the value of the
+        nearest referenced vertex.
 
         **Returns:** The expected geodesic distance between every match and the true match (m,), divided by
         the square root of Y's area.
@@ -329,7 +328,7 @@ class Correspondence:
     ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
         """Predict which vertices have a counterpart on the other shape, for partial shapes.
 
-        `jaxsmw.matching.judge` explains the prediction.
+        See `jaxsmw.matching.judge.overlap`.
 
         **Arguments:**
 
@@ -360,7 +359,7 @@ class Correspondence:
         """Estimate the probability that the map is wrong on a part of the body, without ground truth.
 
         A map is called wrong if at least 2 % of X's area have errors above 0.25 times the square root of Y's
-        area, for example because limbs are swapped. `jaxsmw.matching.judge` explains the estimate.
+        area, for example because limbs are swapped; see `jaxsmw.matching.judge.wrong_probability`.
 
         **Returns:** A probability, from 0 to 1; None if `distortion` is None.
         """
@@ -389,7 +388,7 @@ class Correspondence:
                 self._refiner,
                 self.refinement.state,
                 settings,
-                (self.preset.repair or WITHOUT_REPAIR).scores,
+                self.preset.criteria.scores,
             )
 
     def _embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:

@@ -10,7 +10,6 @@ from collections.abc import Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -129,7 +128,6 @@ class Start(NamedTuple):
 
     **Attributes:**
 
-    - `spectra`: the `SpectralPair` of X and Y.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
     - `origin`: where the map comes from: the name of an initial map, `"map"` for a given map, `"landmarks"`,
       or `"stages"` for the map of earlier stages.
@@ -137,7 +135,6 @@ class Start(NamedTuple):
       If the stage iterates on samples, the vertices are left out only in its first functional map.
     """
 
-    spectra: SpectralPair
     pointwise_map: Int64[np.ndarray, " m"]
     origin: str = "stages"
     excluded: Bool[np.ndarray, " m"] | None = None
@@ -173,48 +170,36 @@ class Outcome:
         """The refinement of the last stage that has run."""
         return self.refinements[-1]
 
+    @property
+    def uncertainty(self) -> float:
+        """The uncertainty of the last stage whose refiner computes one; 0 if there is none."""
+        known = [u for found in self.refinements if (u := found.state.uncertainty) is not None]
+        return float(known[-1]) if known else 0.0
+
     def followed_by(self, later: Outcome) -> Outcome:
         """Return the outcome of these stages and later ones, which started from their map."""
         return Outcome(self.initial_map, self.refinements + later.refinements)
 
 
 def run(
-    stages: Sequence[Stage],
-    starts: Iterable[Start],
-    *,
-    history: bool = False,
-    batch_size: int | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    stages: Sequence[Stage], spectra: SpectralPair, starts: Iterable[Start], *, history: bool = False
 ) -> Iterator[Outcome]:
-    """Run stages from each start.
+    """Run stages on one pair from each start.
 
-    Without `batch_size` and `devices`, each start runs by itself. The function does not wait for the last
-    stage of a start, so that the device refines further starts while the host looks at a finished one.
+    The function does not wait for the last stage of a start, so that the device refines further starts while
+    the host looks at a finished one.
 
     **Arguments:**
 
     - `stages`: the stages, in the order in which they run. A start runs no stage after its first failure.
+    - `spectra`: the spectra and samples of the pair.
     - `starts`: the starts.
     - `history`: whether to record a `History` of each stage; see `jaxsmw.refine`.
-    - `batch_size`, `devices`: see `jaxsmw.refine_pairs`. Batches contain full shapes only. Starts with the
-      same spectrum object share it on the devices.
 
     **Returns:** An iterator over one `Outcome` per start, in the order of the starts.
     """
-    if runs_in_batches(batch_size, devices):
-        yield from _run_batch(stages, list(starts), history, batch_size, devices)
-        return
-    for spectra, group in groupby(starts, key=lambda start: start.spectra):
-        seen = [spectra.padded.seen_by(stage) for stage in stages]
-        yield from (_run_one(stages, seen, start, history) for start in group)
-
-
-def runs_in_batches(batch_size: int | None, devices: Sequence[jax.Device] | None) -> bool:
-    """Return whether `run` refines starts in batches: not on one CPU, unless a batch size is given."""
-    if devices is None and batch_size is None:
-        return False
-    used = jax.devices() if devices is None else devices
-    return batch_size is not None or len(used) > 1 or used[0].platform != "cpu"
+    seen = [spectra.padded.seen_by(stage) for stage in stages]
+    return (_run_one(stages, seen, start, history) for start in starts)
 
 
 def _run_one(stages: Sequence[Stage], seen: Sequence[SpectralPair], start: Start, history: bool) -> Outcome:
@@ -237,25 +222,33 @@ def _run_one(stages: Sequence[Stage], seen: Sequence[SpectralPair], start: Start
     return Outcome(start.pointwise_map, tuple(refinements))
 
 
-def _run_batch(
+def run_batches(
     stages: Sequence[Stage],
-    starts: Sequence[Start],
-    history: bool,
-    batch_size: int | None,
-    devices: Sequence[jax.Device] | None,
+    tasks: Sequence[tuple[SpectralPair, Start]],
+    *,
+    batch_size: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
 ) -> list[Outcome]:
-    """Run each stage from all starts before the next stage begins. All shapes must be full shapes."""
+    """Run stages on many pairs of full shapes in batches, each stage for all pairs before the next stage.
+
+    **Arguments:**
+
+    - `stages`: the stages, in the order in which they run.
+    - `tasks`: each pair with its start. Pairs with the same spectrum object share it on the devices.
+    - `batch_size`, `devices`: see `jaxsmw.refine_pairs`.
+
+    **Returns:** One `Outcome` per task.
+    """
     spectra: dict[int, Spectrum] = {}
     samples: dict[int, Int[Array, " s"] | None] = {}
-    for start in starts:
-        pair = start.spectra
+    for pair, _ in tasks:
         for spectrum, of_side in zip((pair.x, pair.y), pair.samples or (None, None), strict=True):
             spectra.setdefault(id(spectrum), spectrum)
             samples.setdefault(id(spectrum), of_side)
     row = {key: number for number, key in enumerate(spectra)}
-    pairs = [(row[id(start.spectra.x)], row[id(start.spectra.y)]) for start in starts]
-    maps = [np.asarray(start.pointwise_map) for start in starts]
-    outcomes = [Outcome(start.pointwise_map) for start in starts]
+    pairs = [(row[id(pair.x)], row[id(pair.y)]) for pair, _ in tasks]
+    maps = [np.asarray(start.pointwise_map) for _, start in tasks]
+    outcomes = [Outcome(start.pointwise_map) for _, start in tasks]
     for stage in stages:
         alone = [SpectralPair(spectrum, spectrum).seen_by(stage).x for spectrum in spectra.values()]
         chosen = None
@@ -270,7 +263,6 @@ def _run_batch(
             samples=chosen,
             batch_size=batch_size,
             devices=devices,
-            history=history,
             **stage.settings,
         )
         for number, found in refined:

@@ -344,8 +344,7 @@ def wrong_probability(
     **Arguments:**
 
     - `distortion`: the distortion of the map (`jaxsmw.matching.judge.distortion`), at least 0.
-    - `mean_expected_error`: the mean of `jaxsmw.matching.judge`, in units of the square root of the
-      area.
+    - `mean_expected_error`: the mean of `expected_error`, in units of the square root of the area.
     - `settings`: the coefficients of the regression.
 
     **Returns:** A probability, from 0 to 1. `docs/accuracy.md` shows the calibration.
@@ -390,27 +389,6 @@ class Scored:
         return self.outcome.pointwise_map
 
 
-def score(scored: Scored, settings: RepairSettings = RepairSettings()) -> float:  # noqa: B008 (immutable)
-    """Return the score of a map, for comparison with other maps of the same pair; lower is better.
-
-    The score is the logarithm of the distortion plus the weighted uncertainty and the weighted deformation.
-    The uncertainty comes from the last stage whose refiner computes an uncertainty. If no refiner computes an
-    uncertainty, the uncertainty is zero.
-
-    **Returns:** The score, without unit. The score is infinite if a stage failed.
-    """
-    if not scored.successful:
-        return np.inf
-    uncertainties = [found.state.uncertainty for found in scored.outcome.refinements]
-    known = [uncertainty for uncertainty in uncertainties if uncertainty is not None]
-    uncertainty = float(known[-1]) if known else 0.0
-    return (
-        float(np.log(scored.distortion))
-        + settings.uncertainty_weight * uncertainty
-        + settings.deformation_weight * scored.deformation
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Judge:
     """The criteria by which maps of one pair are judged without ground truth.
@@ -443,14 +421,32 @@ class Judge:
         """Compute what determines the `score` of an outcome."""
         if not outcome.successful:
             return Scored(outcome, np.inf, suspicious=suspicious)
-        found = outcome.pointwise_map
-        deformation = 0.0 if self.measure_deformation is None else self.measure_deformation(found)
-        distorted = distortion(self.pair, found, self.spectra.x, self.settings.scores)
-        return Scored(outcome, distorted, deformation, suspicious)
+        return Scored(outcome, *self._measures(outcome.pointwise_map), suspicious)
 
     def score(self, scored: Scored) -> float:
-        """Return the `score` of a map with the weights of the settings; lower is better."""
-        return score(scored, self.settings)
+        """Return the score of a map, for comparison with other maps of the pair; infinite after a failure."""
+        if not scored.successful:
+            return np.inf
+        return self._weighted(scored.distortion, scored.outcome.uncertainty, scored.deformation)
+
+    def score_map(self, pointwise_map: Int64[np.ndarray, " m"], uncertainty: float) -> float:
+        """Return the score of a map (m,) with a known uncertainty; see `score`."""
+        distorted, deformation = self._measures(pointwise_map)
+        return self._weighted(distorted, uncertainty, deformation)
+
+    def _measures(self, pointwise_map: Int64[np.ndarray, " m"]) -> tuple[float, float]:
+        """Return the distortion and the deformation of a map (m,)."""
+        deformation = 0.0 if self.measure_deformation is None else self.measure_deformation(pointwise_map)
+        return distortion(self.pair, pointwise_map, self.spectra.x, self.settings.scores), deformation
+
+    def _weighted(self, distorted: float, uncertainty: float, deformation: float) -> float:
+        """Return the logarithm of the distortion plus the weighted other measures; lower is better."""
+        weights = self.settings
+        return (
+            float(np.log(distorted))
+            + weights.uncertainty_weight * uncertainty
+            + weights.deformation_weight * deformation
+        )
 
     def faults(self, pointwise_map: Int64[np.ndarray, " m"]) -> list[Bool[np.ndarray, " m"]]:
         """Return the faults that repair can remove from a map, each as a mask of X's vertices (m,).

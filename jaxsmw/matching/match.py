@@ -34,9 +34,9 @@ from jaxsmw.matching.judge import Scored, discontinuous_parts, estimate_error, o
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, prepare
 from jaxsmw.matching.search.chirality import Decision, Hands
-from jaxsmw.matching.search.repair import refine_and_repair
-from jaxsmw.matching.search.trimming import complete, trimmed_stage
-from jaxsmw.matching.settings import WITHOUT_REPAIR, ExpectedErrorSettings
+from jaxsmw.matching.search.repair import finish, refine_and_repair
+from jaxsmw.matching.search.trimming import match_trimmed, trimmed_stage
+from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
 from jaxsmw.matching.starts import check_initial_map, make_start
 from jaxsmw.runtime.memory import return_free_memory
@@ -225,7 +225,6 @@ def match_prepared(
     """
     if prepared.x.spectrum.descriptors is None:
         preset = preset.without_descriptors()
-    starts = [start._replace(spectra=prepared.spectra) for start in starts]
     return_free_memory()
     with step("refinement"), one_blas_thread():
         repaired = [
@@ -247,7 +246,10 @@ def match_prepared(
         start, scored = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
     last = step("final stages") if preset.final or preset.repair else nullcontext()
     with last, one_blas_thread():
-        prepared, scored = complete(prepared, start.origin, preset, scored, history=history)
+        if found := match_trimmed(prepared, preset, scored, history=history):
+            prepared, scored = found
+        else:
+            scored = finish(prepared, start.origin, preset, scored, history=history)
         jax.block_until_ready(scored.outcome.last)
     return Correspondence.of(prepared, start, preset, scored)
 
@@ -258,7 +260,7 @@ def _inconsistency(prepared: PreparedPair, preset: Preset, scored: Scored) -> fl
     With a positive `area_weight`, the expected error would contain a factor that depends on the shapes, not
     on the quality of the map. (Entry R24 of docs/research_log.md)
     """
-    stage, repair = preset.judged[-1], preset.repair or WITHOUT_REPAIR
+    stage = preset.judged[-1]
     expected = estimate_error(
         prepared.given.mirrored() if prepared.mirrored else prepared.given,
         scored.pointwise_map,
@@ -266,7 +268,7 @@ def _inconsistency(prepared: PreparedPair, preset: Preset, scored: Scored) -> fl
         stage.refiner,
         scored.outcome.last.state,
         ExpectedErrorSettings(area_weight=0.0),
-        repair.scores,
+        preset.criteria.scores,
     )
     return float(prepared.given.mesh_x.average(expected))
 
@@ -316,7 +318,7 @@ _MOSTLY = 0.5
 def _warning(found: Correspondence, *, landmarks: bool) -> str:
     """Return the text of the warning that a map looks wrong. `landmarks` is True if landmarks were given."""
     pair, repair = found.pair, found.preset.repair
-    settings = repair or WITHOUT_REPAIR
+    settings = found.preset.criteria
     matched = pair.mirrored() if found.mirrored else pair
     reversed_ = orientation_reversal(matched, found.pointwise_map, found.spectrum_x, settings.scores)
     cut_off = discontinuous_parts(matched, found.pointwise_map, settings.scores)

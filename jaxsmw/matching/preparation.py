@@ -496,8 +496,7 @@ def pair_up(pair: Pair, x: PreparedShape, y: PreparedShape, *, trimmed: bool = F
     - `pair`: the meshes X (m vertices) and Y (n vertices).
     - `x`, `y`: the shapes, each a `PreparedShape` in units in which its area is 1.
     - `trimmed`: whether the larger shape of a partial pair was trimmed. Both shapes then cover nearly the
-      same
-      region, so they have about as many eigenvalues below any limit, and need no common limit.
+      same region, so they have about as many eigenvalues below any limit, and need no common limit.
     """
     if pair.partial:
         area_x, area_y = pair.areas

@@ -9,9 +9,10 @@ from jaxsmw.errors import InputError, check_number, check_whole_number
 
 @dataclass(frozen=True)
 class ScoreSettings:
-    """The settings of `jaxsmw.matching.judge`. Lengths are in units of the square root of the area.
+    """The settings of the distortion and of the faults of a map.
 
-    The tables with numbers R1, R2, … are in `docs/research_log.md`.
+    Lengths are in units of the square root of the area. The tables with numbers R1, R2, … are in
+    `docs/research_log.md`.
 
     **Attributes:**
 
@@ -42,9 +43,10 @@ class ScoreSettings:
 
 @dataclass(frozen=True)
 class ExpectedErrorSettings:
-    """The settings of `jaxsmw.matching.judge`. Lengths are in units of the square root of the area.
+    """The settings of `jaxsmw.matching.judge.expected_error`.
 
-    The tables with numbers R1, R2, … are in `docs/research_log.md`.
+    Lengths are in units of the square root of the area. The tables with numbers R1, R2, … are in
+    `docs/research_log.md`.
 
     **Attributes:**
 
@@ -72,7 +74,7 @@ class ExpectedErrorSettings:
 
 @dataclass(frozen=True)
 class WrongProbabilitySettings:
-    """The coefficients of `jaxsmw.matching.judge`, a logistic regression. (Table R31)
+    """The coefficients of `jaxsmw.matching.judge.wrong_probability`, a logistic regression. (Table R31)
 
     **Attributes:**
 

@@ -16,7 +16,7 @@ from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.shot import SHOT_DIMENSION
-from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.settings import WITHOUT_REPAIR, RepairSettings
 
 
 @dataclass(frozen=True, init=False)
@@ -301,7 +301,7 @@ class Preset:
         """
         if self.large is not None and number_of_vertices >= _LARGE_FROM:
             return self.large.fitted(number_of_vertices)
-        return self._with_stages(lambda stage: stage.fitted(number_of_vertices))
+        return replace(self, large=None)._with_stages(lambda stage: stage.fitted(number_of_vertices))
 
     def without_descriptors(self) -> Preset:
         """Return the preset with stages that use no descriptors."""
@@ -309,7 +309,13 @@ class Preset:
 
     def _with_stages(self, change: Callable[[Stage], Stage]) -> Preset:
         first, repeated, final = (tuple(map(change, s)) for s in (self.first, self.repeated, self.final))
-        return Preset(first, repeated, final, self.repair)
+        large = None if self.large is None else self.large._with_stages(change)
+        return Preset(first, repeated, final, self.repair, large)
+
+    @property
+    def criteria(self) -> RepairSettings:
+        """The settings by which maps are judged. Without repair, only grossly distorted maps look wrong."""
+        return self.repair or WITHOUT_REPAIR
 
     @property
     def cuts_shortcuts(self) -> bool:

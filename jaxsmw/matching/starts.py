@@ -80,12 +80,12 @@ def make_start(prepared: PreparedPair, init: InitialMap | ArrayLike | SurfacePoi
     given, mesh_x = check_initial_map(prepared.pair, init), prepared.pair.mesh_x
     if isinstance(given, str):
         found = nearest_map(prepared, _finite(prepared, given, FEATURES[given](prepared)))
-        return Start(prepared.spectra, extend_to_unreferenced(mesh_x, found), given)
+        return Start(extend_to_unreferenced(mesh_x, found), given)
     if given.ndim == 1:
-        return Start(prepared.spectra, extend_to_unreferenced(mesh_x, given), "map")
+        return Start(extend_to_unreferenced(mesh_x, given), "map")
     found = nearest_map(prepared, _finite(prepared, "landmark", _landmark_features(prepared, given)))
     found[given[:, 0]] = given[:, 1]
-    return Start(prepared.spectra, extend_to_unreferenced(mesh_x, found), "landmarks")
+    return Start(extend_to_unreferenced(mesh_x, found), "landmarks")
 
 
 def check_initial_map(

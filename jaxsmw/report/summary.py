@@ -28,7 +28,6 @@ from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import paired_spectra
-from jaxsmw.matching.settings import WITHOUT_REPAIR
 from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
@@ -393,7 +392,7 @@ def summarize(
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
     if correspondence.distortion is not None:
-        limit, suspicion = (correspondence.preset.repair or WITHOUT_REPAIR).suspicious, ""
+        limit, suspicion = correspondence.preset.criteria.suspicious, ""
         if correspondence.suspicious and correspondence.distortion >= limit:
             suspicion = f"; above {limit} limbs may be swapped"
         facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"

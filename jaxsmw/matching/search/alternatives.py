@@ -7,8 +7,6 @@ from dataclasses import replace
 from itertools import chain, count, islice, repeat
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
@@ -16,7 +14,7 @@ from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
-from jaxsmw.matching.executor import Outcome, SpectralPair, Start, run
+from jaxsmw.matching.executor import SpectralPair, Start, run
 from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.preparation import PreparedPair, PreparedShape
 from jaxsmw.matching.search.proxies import Proxy, deformation, extremities, map_difference, plausible_pairings
@@ -31,7 +29,7 @@ _HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
 class _Candidate(NamedTuple):
-    """A refined map of samples, and its score; see `jaxsmw.matching.judge.score`."""
+    """A refined map of samples, and its score; see `Judge.score`."""
 
     score: float
     found: SampleMap
@@ -255,20 +253,14 @@ class Alternatives:
         With `faults`, map number i is refined without the samples of X in the mask `faults[i]`.
         """
         fitted = stage.fitted(min(len(self.x.areas), len(self.y.areas)))
-        starts = (
-            Start(self._spectra, start, excluded=fault) for start, fault in zip(initial, faults, strict=False)
-        )
+        starts = (Start(start, excluded=fault) for start, fault in zip(initial, faults, strict=False))
         candidates = []
         # All refinements are started first. The host scores a finished refinement while the others run.
-        for outcome in list(run([fitted], starts)):
+        for outcome in list(run([fitted], self._spectra, starts)):
             if outcome.successful:
                 found = outcome.pointwise_map
-                everywhere = self._extended(found)  # scores are computed at all vertices
-                refined = eqx.tree_at(
-                    lambda tree: tree.pointwise_map, outcome.last, jax.device_put(everywhere)
-                )
-                scored = self._judge.measured(Outcome(everywhere, (refined,)))
-                candidates.append(_Candidate(self._judge.score(scored), found))
+                score = self._judge.score_map(self._extended(found), outcome.uncertainty)
+                candidates.append(_Candidate(score, found))
         return sorted(candidates, key=lambda candidate: candidate.score)
 
     def _reduced(self, pointwise_map: Int64[np.ndarray, " m"]) -> SampleMap:

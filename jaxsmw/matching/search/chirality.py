@@ -165,7 +165,7 @@ class Hands:
         **Returns:** The refined map (s,) and its reverse map (t,).
         """
         spectra = SpectralPair(x.shape.sampled_spectrum(x.components), y.shape.sampled_spectrum(y.components))
-        (found,) = run([_STAGE], [Start(spectra, _nearest(x.shot, y.shot))])
+        (found,) = run([_STAGE], spectra, [Start(_nearest(x.shot, y.shot))])
         seen = spectra.seen_by(_STAGE)
         return found.pointwise_map, reverse_map(_STAGE.refiner, seen, found.last.state)
 

@@ -16,7 +16,6 @@ from jaxsmw.matching.executor import Outcome, SpectralPair, Start, run
 from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.alternatives import Alternatives
-from jaxsmw.matching.settings import WITHOUT_REPAIR
 from jaxsmw.matching.stages import Preset, Stage
 
 logger = logging.getLogger("jaxsmw")
@@ -73,7 +72,7 @@ def refine_and_repair(
     """
     judge, repair = _judge(prepared, preset.judged, preset), preset.repair
     if outcome is None:
-        (outcome,) = run(preset.judged, [start], history=history)
+        (outcome,) = run(preset.judged, prepared.spectra, [start], history=history)
     best = judge.judged(outcome)
     if repair is None or not best.successful:
         return best
@@ -181,8 +180,8 @@ def finish(
     scored = refine_further(prepared, origin, preset, scored, history=history)
     if not (preset.final and scored.successful):
         return scored
-    start = Start(prepared.spectra, scored.pointwise_map)
-    (after,) = run(preset.final, [start], history=history)
+    start = Start(scored.pointwise_map)
+    (after,) = run(preset.final, prepared.spectra, [start], history=history)
     outcome = scored.outcome.followed_by(after)
     return _judge(prepared, preset.final, preset).measured(outcome, suspicious=scored.suspicious)
 
@@ -191,7 +190,7 @@ def _judge(prepared: PreparedPair, stages: Sequence[Stage], preset: Preset) -> J
     """Return a judge that sees the spectra of the stage with the most eigenvectors."""
     seen = (prepared.spectra.seen_by(stage) for stage in stages)
     finest = max(seen, key=lambda spectra: spectra.x.eigenvalues.shape[0])
-    return Judge(prepared.pair, finest, preset.repair or WITHOUT_REPAIR)
+    return Judge(prepared.pair, finest, preset.criteria)
 
 
 def _without_creases(spectra: SpectralPair) -> SpectralPair:
@@ -220,8 +219,8 @@ class _Repeater:
 
     def repeated(self, outcome: Outcome, excluded: Bool[np.ndarray, " m"] | None = None) -> Outcome:
         """Run the repeated stages from the map of an outcome, without a mask of vertices of X (m,)."""
-        start = Start(self.spectra, outcome.pointwise_map, excluded=excluded)
-        (again,) = run(self.stages, [start], history=self.history)
+        start = Start(outcome.pointwise_map, excluded=excluded)
+        (again,) = run(self.stages, self.spectra, [start], history=self.history)
         first = max(0, len(outcome.refinements) - len(self.stages))
         return Outcome(outcome.initial_map, outcome.refinements[:first]).followed_by(again)
 

@@ -17,8 +17,6 @@ from jaxsmw.matching.executor import Start, reverse_map, run
 from jaxsmw.matching.judge import Judge, Scored, detours
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, pair_up, prepare_shapes
-from jaxsmw.matching.search.repair import finish
-from jaxsmw.matching.settings import WITHOUT_REPAIR
 from jaxsmw.matching.stages import Preset, Sizes, Stage
 
 logger = logging.getLogger("jaxsmw")
@@ -80,34 +78,38 @@ def trimmed_stage(pair: Pair, preset: Preset) -> Stage | None:
     return preset.stages[-1].coarsened(repair.trimmed_levels)
 
 
-def complete(
-    prepared: PreparedPair, origin: str, preset: Preset, scored: Scored, *, history: bool = False
-) -> tuple[PreparedPair, Scored]:
-    """Finish the refinement of a pair, and match a partial pair again after trimming its larger shape.
+def match_trimmed(
+    prepared: PreparedPair, preset: Preset, scored: Scored, *, history: bool = False
+) -> tuple[PreparedPair, Scored] | None:
+    """Trim the larger shape of a partial pair, and match the pair again by the last stage.
 
     The eigenfunctions of a part differ from those of the full shape. After trimming, both shapes cover nearly
-    the same region of the body, so their eigenfunctions are similar. The last of all stages then runs on the
-    trimmed pair, with `trimmed_levels`. The final stages run only if nothing was trimmed. (Table R46)
+    the same region of the body, so their eigenfunctions are similar. The last stage of the preset then runs
+    on the trimmed pair, with `trimmed_levels`. (Table R46)
 
-    **Arguments:** see `jaxsmw.matching.search.repair.finish`.
+    **Arguments:**
 
-    **Returns:** The prepared pair on which the last stage ran, and its map. The prepared pair is `prepared`
-    itself if nothing was trimmed. The attribute `suspicious` is copied from the given map.
+    - `prepared`: the prepared pair.
+    - `preset`: the stages and the repair.
+    - `scored`: the map of `preset.judged`, after repair.
+    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
+
+    **Returns:** The trimmed pair and its map, or None if the pair is not trimmed. The attribute `suspicious`
+    is copied from the given map.
     """
-    following, start = trimmed_stage(prepared.pair, preset), prepared
-    if preset.repair is not None and following is not None and scored.successful:
-        last = preset.judged[-1]
-        for _ in range(preset.repair.trims):
-            reverse = _reverse_map(prepared, last, scored)
-            area = preset.repair.trimmed_area
-            pair = trimmed(start.pair, _everywhere(prepared, scored), reverse, area)
-            again = _matched_again(prepared, pair, following, scored, history)
-            if again is None:
-                break
-            (prepared, scored), last = again, following
-    if prepared is start:
-        scored = finish(prepared, origin, preset, scored, history=history)
-    return prepared, scored
+    following = trimmed_stage(prepared.pair, preset)
+    if following is None or not scored.successful:
+        return None
+    trimmed_match, last, given = None, preset.judged[-1], prepared.pair
+    for _ in range(preset.criteria.trims):
+        reverse = _reverse_map(prepared, last, scored)
+        pair = trimmed(given, _everywhere(prepared, scored), reverse, preset.criteria.trimmed_area)
+        again = _matched_again(prepared, pair, following, preset, scored, history)
+        if again is None:
+            break
+        (prepared, scored), last = again, following
+        trimmed_match = again
+    return trimmed_match
 
 
 def _everywhere(prepared: PreparedPair, scored: Scored) -> Int64[np.ndarray, " m"]:
@@ -121,7 +123,7 @@ def _reverse_map(prepared: PreparedPair, last: Stage, scored: Scored) -> Int64[n
 
 
 def _matched_again(
-    prepared: PreparedPair, pair: Pair, stage: Stage, scored: Scored, history: bool
+    prepared: PreparedPair, pair: Pair, stage: Stage, preset: Preset, scored: Scored, history: bool
 ) -> tuple[PreparedPair, Scored] | None:
     """Run a stage on a trimmed pair from a map. Return None after a failure."""
     logger.info("the larger shape is trimmed and matched again ...")
@@ -132,11 +134,11 @@ def _matched_again(
         logger.info("the map is kept as it was before trimming: %s", error)
         return None
     nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
-    start = Start(trimmed_pair.spectra, nearest[_everywhere(prepared, scored)])
-    (again,) = run([stage], [start], history=history)
+    start = Start(nearest[_everywhere(prepared, scored)])
+    (again,) = run([stage], trimmed_pair.spectra, [start], history=history)
     if not again.successful:
         return None
-    judge = Judge(pair, trimmed_pair.spectra.seen_by(stage), WITHOUT_REPAIR)
+    judge = Judge(pair, trimmed_pair.spectra.seen_by(stage), preset.criteria)
     outcome = scored.outcome.followed_by(again)
     return trimmed_pair, judge.measured(outcome, suspicious=scored.suspicious)
 
