@@ -99,11 +99,9 @@ def _slide(
     tree: KDTree,
     motion: Alignment,
 ) -> Alignment:
-    """Minimise the distances of x to the tangent planes at the nearest points of y.
-
-    If the shapes do not fit each other, the iterations slide x too far. The mean distance then decreases only
-    slightly, and the given motion is returned.
-    """
+    """Minimise the distances of x to the tangent planes at the nearest points of y."""
+    # If the shapes do not fit each other, the iterations slide x too far. The mean distance then decreases
+    # only slightly, and the given motion is returned.
 
     def to_planes(
         motion: Alignment,
