@@ -53,11 +53,7 @@ class CreaturePair:
 
     @cached_property
     def true_map(self) -> Int64[np.ndarray, " m"]:
-        """The ground truth as a pointwise map from the source to the target (m,), 0-based target vertices.
-
-        Each true point lies in a triangle of the target, and is replaced by the nearest corner of this
-        triangle.
-        """
+        """The ground truth as a pointwise map (m,), int64; see `CreaturePair`."""
         return self.truth.nearest_corners(self.target)
 
 
@@ -66,10 +62,7 @@ class CreaturePair:
 
 @dataclass(frozen=True)
 class _Tube:
-    """A chain of tapered capsules. A tapered capsule is the convex hull of two balls.
-
-    If `normal` is given, the chain is a flat plate of limited thickness.
-    """
+    """A chain of tapered capsules (convex hulls of two balls); with a `normal`, a flat plate."""
 
     centers: np.ndarray  # (p, 3)
     radii: np.ndarray  # (p,)
@@ -110,12 +103,11 @@ def _smooth_minimum(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 
 
 class _Body:
-    """The body of one individual in the rest pose, as an implicit surface around a skeleton.
+    """The body of one individual in the rest pose, as an implicit surface around a skeleton."""
 
-    The x axis points to the body's left, the y axis up and the z axis forward. Parts away from the plane
-    x = 0 are added on both sides, and their joints are called left_… and right_…. A smooth random function of
-    position warps all proportions.
-    """
+    # The x axis points to the body's left, the y axis up and the z axis forward. Parts away from the plane
+    # x = 0 are added on both sides, and their joints are called left_… and right_…. A smooth random function
+    # of position warps all proportions.
 
     def __init__(self, random: np.random.Generator) -> None:
         self.joints: dict[str, int] = {}
@@ -150,11 +142,7 @@ class _Body:
         thickness: float = 0.0,
         joint: str = "",
     ) -> None:
-        """Add a tube or a plate to the body, or carve a tube out of the body.
-
-        `balls` lists the balls of the tube's chain. `joint` is the name of the joint that moves the tube.
-        Only a tube that projects far from the body needs a joint.
-        """
+        """Add a tube or plate, or carve a tube out. A part that projects far needs the name of its joint."""
         chain = self._individual(balls)
         if joint:
             for prefix, side in self._sides(chain):
@@ -185,11 +173,7 @@ class _Body:
         return [("", chain)]
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the values (p,) of the implicit function at points (p, 3).
-
-        The implicit function is 0 on the skin and negative inside the body. Values up to `_REACH` are
-        approximate distances to the skin. A larger value only shows that a point is outside the body.
-        """
+        """Return values (p,) that are negative inside the body, and distances to the skin up to `_REACH`."""
         folded = np.stack([np.abs(points[:, 0]), points[:, 1], points[:, 2]])
         result = np.full(len(points), 2 * _REACH)
         for tube in self._tubes:
@@ -225,13 +209,11 @@ class _Body:
         return points - np.clip(value / length, -0.03, 0.03)[:, None] * normals, normals
 
     def angles(self, pose: str, random: np.random.Generator) -> np.ndarray:
-        """Return the rotation vectors (j, 3) of the joints in radians, with small random changes.
-
-        `pose` lists joints with up to three angles in degrees, for rotations about the x, y and z axes. At
-        the head, positive angles turn the nose down (x), turn the nose to the left (y), and raise the left
-        side (z). The name of a paired joint without `left_` or `right_` stands for both joints. The rotation
-        of the right joint is then mirrored.
-        """
+        """Return the rotation vectors (j, 3) of the joints in radians, with small random changes."""
+        # `pose` lists joints with up to three angles in degrees, for rotations about the x, y and z axes. At
+        # the head, positive angles turn the nose down (x), turn the nose to the left (y), and raise the left
+        # side (z). The name of a paired joint without `left_` or `right_` stands for both joints. The
+        # rotation of the right joint is then mirrored.
         angles = np.zeros((len(self.parents), 3))
         for name, *turn in (entry.split() for entry in pose.split(";")):
             degrees = np.array([*turn, 0, 0][:3], dtype=float)
@@ -242,12 +224,9 @@ class _Body:
         return np.radians(angles + 2 * random.normal(size=angles.shape))
 
     def posed(self, points: np.ndarray, angles: np.ndarray) -> np.ndarray:
-        """Return the positions of points (p, 3) after the rotations of the joints.
-
-        Each joint rotates each point by a fraction of the joint's angle. The fraction depends on the
-        distances from the point to the limbs. Averaging rotation matrices instead of angles would shrink the
-        skin around a flexed joint and collapse it around a twisted joint.
-        """
+        """Return the positions of points (p, 3) after the rotations of the joints."""
+        # Each joint rotates each point by a share of its angle. Averaging rotation matrices instead of angles
+        # would shrink the skin around a flexed joint and collapse it around a twisted joint.
         shares = np.zeros((len(points), len(angles)))
         for joint, hull in self._guides:
             center, axis = hull[0], hull[1] - hull[0]
@@ -273,10 +252,7 @@ def _hulls(chain: np.ndarray) -> np.ndarray:
 
 
 def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Triangulate the skin by marching cubes on a randomly rotated and shifted grid.
-
-    The grid is refined only near the skin.
-    """
+    """Triangulate the skin by marching cubes on a random grid, which is refined only near the skin."""
     turn, shift = Rotation.from_quat(random.normal(size=4)).as_matrix(), random.uniform(size=3)
     square = [(0, 0), (1, 0), (1, 1), (0, 1)]
     corners = np.array([(*corner, top) for top in (0, 1) for corner in square])
@@ -334,10 +310,7 @@ def _unit_normals(corners: np.ndarray) -> np.ndarray:
 
 
 def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Make a mesh of the body in the rest pose, with exactly `count` vertices and well-shaped triangles.
-
-    **Returns:** Vertices (count, 3) and faces (f, 3).
-    """
+    """Make well-shaped triangles (f, 3) of the body in the rest pose, with `count` vertices (count, 3)."""
     vertices, faces = _isosurface(body, 0.05, random)
     area = igl.doublearea(vertices, faces).sum() / 2
     # Marching cubes give 1.5 vertices per spacing² of surface area. A spacing of `sqrt(1.5 area / (4 count))`
@@ -634,10 +607,7 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     - `seed`: a random seed, an integer of at least 0. The seed determines the individual, the poses and the
       triangulations.
 
-    **Returns:** A `CreaturePair` with the attributes `source` and `target` (each a `Mesh`), `truth` and
-    `true_map`. `truth` is a `SurfacePoints` with m points on the target. `true_map` (m,), int64, contains
-    0-based target vertices: for each point of `truth`, the nearest corner of its triangle. Both bodies are
-    about 1.5 units high. The x axis points to the creature's left, the y axis up and the z axis forward.
+    **Returns:** A `CreaturePair`. Its bodies have the size and the axes of those of `creature`.
 
     **Raises:** `InputError` for an unknown kind, fewer than 500 vertices, a negative seed, or (rarely) a seed
     whose body intersects itself.

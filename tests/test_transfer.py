@@ -11,7 +11,7 @@ from synthetic import bumpy_mesh, grid_mesh, sphere_mesh
 from jaxsmw import Mesh, creature_pair, make_mesh, read_ground_truth, read_mesh
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import SurfacePoints
-from jaxsmw.geometry.rotations import nearest_rotations
+from jaxsmw.geometry.alignment import nearest_rotations
 from jaxsmw.geometry.surface_distance import (
     distances_to_surface,
     nearest_facing_points,

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float64, Real
 from scipy.spatial.distance import cdist
 
 from jaxsmw.errors import InputError, check_whole_number
+from jaxsmw.geometry.alignment import nearest_rotations
 from jaxsmw.geometry.mesh import numeric_rows
-from jaxsmw.geometry.rotations import nearest_rotations
 from jaxsmw.runtime.threads import one_blas_thread
 
 # The alignment ends when the mean changes by less than this multiple of its size, or after `_MOST_ROUNDS`.

@@ -17,52 +17,32 @@ Matrix = TypeVar("Matrix", np.ndarray, sp.csr_matrix)
 
 
 class Coarsening(NamedTuple):
-    """A generalized eigenproblem projected onto a subspace.
+    """A generalized eigenproblem, projected onto a subspace of smooth functions; see `coarsen`."""
 
-    **Attributes:**
-
-    - `prolongation`: the matrix P (n, c), which takes c coefficients to values at n vertices. Each row of P
-      sums to one.
-    - `stiffness`, `mass`: the projected matrices P^T W P and P^T A P, each (c, c). W and A are the matrices
-      of the original eigenproblem.
-    - `smooth`: a function that applies a low-pass filter to values at vertices (n, j). The filter passes
-      frequencies up to slightly above the highest frequency that the subspace can represent.
-
-    Prolongation and smoothing use single precision, whose rounding errors are far smaller than the projection
-    errors.
-    """
-
-    prolongation: sp.csr_matrix
+    prolongation: sp.csr_matrix  # from coefficients to values at vertices; each row sums to one
     stiffness: sp.csc_matrix
     mass: sp.csc_matrix
+    # A low-pass filter for values at vertices (n, j). It passes frequencies up to slightly above the highest
+    # frequency that the subspace can represent.
     smooth: Callable[[np.ndarray], np.ndarray]
 
 
 def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> Coarsening:
-    """Coarsen an eigenproblem by smoothed aggregation of vertices into cells.
+    """Coarsen an eigenproblem by smoothed aggregation of vertices into cells around evenly spread seeds.
 
-    The cells surround evenly spread seeds. The smoothed indicator functions of the cells span the subspace.
-    The method follows Vaněk, Mandel, Brezina, "Algebraic multigrid by smoothed aggregation for second and
-    fourth order elliptic problems", Computing 1996.
-
-    Unlike the method of Vaněk et al., this function needs only one coarsening step for cells of any size. The
-    indicator functions are smoothed by a Chebyshev polynomial. The degree of the polynomial is 1.5 times the
-    radius of the cells, counted in edges. With a degree equal to the radius, coarsening would take 20 % less
-    time, but the errors of the eigenvalues would be ten times as large.
+    The smoothed indicator functions of the cells span the subspace (Vaněk, Mandel, Brezina, "Algebraic
+    multigrid by smoothed aggregation for second and fourth order elliptic problems", Computing 1996). Here,
+    one step makes cells of any size, because a Chebyshev polynomial smooths the indicator functions.
 
     **Arguments:**
 
-    - `stiffness`: the stiffness matrix W (n, n) of one connected component, symmetric. The off-diagonal
-      entries of W correspond to the edges of the mesh.
-    - `mass`: the mass matrix A (n, n).
+    - `stiffness`: the symmetric stiffness matrix (n, n) of one connected component, with an entry for each
+      edge.
+    - `mass`: the mass matrix (n, n).
     - `dimensions`: the approximate dimension of the subspace, at most about n / 4.
 
-    **Returns:** The projected eigenproblem as a `Coarsening`.
-
-    **Raises:** `RuntimeError` if the diagonal of W is not positive. `RuntimeError` is also raised if a vertex
-    has 100 or more neighbours, because the smoothed indicator functions would then overlap everywhere.
-    `RuntimeError` is also raised if cells larger than four times the mean cell area cover more than 10 % of
-    the surface.
+    **Raises:** `RuntimeError` if the diagonal of the stiffness matrix is not positive, a vertex has 100 or
+    more neighbours, or cells larger than four times the mean cell cover more than 10 % of the surface.
     """
     n = stiffness.shape[0]
     if (most := int(np.diff(stiffness.indptr).max())) > _MOST_NEIGHBORS:
@@ -79,9 +59,12 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
     if share > _MOST_IN_LARGE:
         raise RuntimeError(f"{share:.0%} of the area is in triangles that are much larger than the rest")
     smoother = _Smoother(stiffness, cells.shape[0] / cells.shape[1])
+    # The degree is 1.5 times the radius of the cells. With a degree equal to the radius, coarsening takes
+    # 20 % less time, but the errors of the eigenvalues are ten times as large.
     degree = (3 * (radius + 1) + 1) // 2
     prolongation = smoother(cells, degree)
     rough = smoother.single()
+    # Rounding errors in single precision are far smaller than the projection errors.
     return Coarsening(
         prolongation.astype(np.float32),
         (prolongation.T @ (stiffness @ prolongation)).tocsc(),
@@ -97,10 +80,7 @@ _LARGE, _MOST_IN_LARGE = 4, 0.1
 
 
 def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
-    """Return the indicator functions (n, c) of the cells. Each cell has one seed.
-
-    Each vertex joins the cell of the nearest seed. Distances are counted in edges.
-    """
+    """Return the indicator functions (n, c) of the cells: a vertex joins its nearest seed along edges."""
     n = graph.shape[0]
     seeds = maximal_independent_set(graph, radius)
     _, _, nearest = dijkstra(graph, indices=seeds, unweighted=True, min_only=True, return_predecessors=True)
@@ -109,13 +89,7 @@ def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:
 
 
 class _Smoother:
-    """A low-pass filter for functions on a mesh. Constant functions pass unchanged.
-
-    The filter is a Chebyshev polynomial of D^-1 W, where W is the stiffness matrix and D is the diagonal of
-    W. Let `largest` be the largest eigenvalue of D^-1 W. The filter damps the eigenvectors with eigenvalues
-    above `1.5 * largest / size`. Cells of `size` vertices cannot represent these eigenvectors. (On meshes
-    of bodies, factors from 1 to 3 instead of 1.5 give about the same accuracy.)
-    """
+    """A low-pass filter, a Chebyshev polynomial of D^-1 W, which passes constant functions unchanged."""
 
     def __init__(self, stiffness: sp.csr_matrix, size: float):
         diagonal = stiffness.diagonal()
@@ -125,6 +99,8 @@ class _Smoother:
         start = np.random.default_rng(0).standard_normal(len(diagonal))
         found = eigsh(root @ stiffness @ root, 1, v0=start, tol=1e-2, return_eigenvectors=False)
         highest = 1.05 * float(found[0])
+        # The filter damps eigenvectors above `lowest`, which cells of `size` vertices cannot represent. (On
+        # meshes of bodies, factors from 1 to 3 instead of 1.5 give about the same accuracy.)
         lowest = highest * min(1.5 / size, 0.5)
         self.center, self.half = (highest + lowest) / 2, (highest - lowest) / 2
         self.operator = sp.diags(1 / diagonal) @ stiffness

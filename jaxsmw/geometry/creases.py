@@ -56,10 +56,7 @@ def crease_eigenvectors(mesh: Mesh, number: int) -> Float64[np.ndarray, "n c"]:
 
 
 def _assemble(mesh: Mesh) -> tuple[sp.csc_matrix, Float64[np.ndarray, " n"]]:
-    """Assemble the stiffness matrix (n, n) and the vertex areas (n,) of the metric with normals.
-
-    The areas sum to 1.
-    """
+    """Assemble the stiffness matrix (n, n) and vertex areas (n,), of sum 1, of the metric with normals."""
     places = np.hstack([mesh.vertices / np.sqrt(mesh.area), _NORMAL_WEIGHT * mesh.vertex_normals])
     corners = places[mesh.faces]
     # Row i of `lengths` contains, for each corner of triangle i, the length of the opposite edge.

@@ -22,8 +22,7 @@ import igl
 import numpy as np
 from jaxtyping import Bool, Complex128, Float64, Int, Int64
 from numpy.typing import ArrayLike
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse import csgraph, csr_array
 
 from jaxsmw.choices import GeodesicMethod
 from jaxsmw.errors import InputError, check_choice
@@ -51,12 +50,8 @@ _EXACT_HEIGHT = 1e-6
 class SurfacePoints:
     """Points on the faces of a mesh, given by barycentric weights.
 
-    `len(points)` is the number p of points. `points[rows]` selects points by an array `rows` of 0-based
-    indices. The method `positions(mesh)` returns the positions (p, 3) of the points. The method
-    `interpolate(values, mesh)` receives values (n, x) at the vertices, and returns values (p, x) at the
-    points. The method `nearest_corners(mesh)` returns for each point the nearest corner of its face, as
-    0-based vertex indices (p,). The constructor checks nothing. Functions that receive `SurfacePoints` check
-    them.
+    `len(points)` is the number p of points, and `points[rows]` selects points by 0-based indices. The
+    constructor checks nothing. Functions that receive `SurfacePoints` check them.
 
     **Attributes:**
 
@@ -90,13 +85,10 @@ class SurfacePoints:
 
 
 class _Sides(NamedTuple):
-    """The sides of the f faces of a mesh and of their mirror images, 6 f sides in total.
+    """The sides of the f faces and of their mirror images: side 3 t + k starts at corner k of triangle t."""
 
-    Side 3 t + k leads from corner k to corner k + 1 of triangle t. Triangles f … 2 f - 1 are the mirror
-    images: the faces 0 … f - 1 with reversed order of corners. A line leaves a triangle by one side. It
-    enters the next triangle by a side that joins the same two vertices in the opposite direction. If the next
-    face has no such side, the line enters the mirror image of the face.
-    """
+    # Triangles f … 2 f - 1 are the faces with reversed order of corners. A line enters the next triangle by a
+    # side in the opposite direction. If the next face has no such side, the line enters its mirror image.
 
     tail: Int64[np.ndarray, " s"]
     head: Int64[np.ndarray, " s"]
@@ -141,12 +133,9 @@ def _ranges(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 class _Beams(NamedTuple):
-    """Beams: cones of straight lines from a point through a strip of unfolded triangles.
+    """Cones of lines from 0 through unfolded triangles of the complex plane, between two directions."""
 
-    The triangles are unfolded into the complex plane, and each beam starts at 0. The beam crosses the side
-    `side`, whose ends are `right` and `left`. The lines of the beam have directions between `rightmost` and
-    `leftmost`.
-    """
+    # A beam crosses the side `side`, whose ends are `right` and `left`.
 
     origin: Int64[np.ndarray, " b"]
     side: Int64[np.ndarray, " b"]
@@ -176,19 +165,8 @@ def _unfold(
     position: Complex128[np.ndarray, " b"],
     depth: int,
 ) -> Iterator[tuple[_Beams, Complex128[np.ndarray, " _"]]]:
-    """Follow all straight lines from points through successive triangles.
-
-    **Arguments:**
-
-    - `origin`: the index of the point from which each initial beam starts (b,).
-    - `side`: the side by which each beam leaves its first triangle (b,).
-    - `position`: the complex coordinate of the point, in the frame in which `side` leads from 0 to 1 (b,).
-    - `depth`: the number of sides to cross.
-
-    **Returns:** An iterator with `depth` pairs (beams, corners). The beams of pair i have crossed i + 1
-    sides. Each beam is then in a triangle. `corners` contains the position of one corner of the triangle: the
-    corner opposite the last crossed side.
-    """
+    """Yield, for 1 … `depth` crossed sides, the beams and the corners opposite these sides."""
+    # `position` is that of each beam's first point, in the frame in which `side` leads from 0 to 1.
     right, left = -position * sides.length[side], (1 - position) * sides.length[side]
     beams = _Beams(origin, side, right, left, right, left)
     for _ in range(depth):
@@ -233,10 +211,7 @@ def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.nda
 
 
 def _shortest(lines: Sequence[_Lines], size: int) -> csr_array:
-    """Return a square sparse matrix with the length of the line between each pair of connected nodes.
-
-    If several lines connect the same nodes, the matrix contains the length of the shortest line.
-    """
+    """Return a square sparse matrix with the length of the shortest line between each pair of nodes."""
     origins, ends, lengths = (np.concatenate(part) for part in zip(*lines, strict=True))
     key = origins.astype(np.int64) * size + ends
     order = np.lexsort([lengths, key])
@@ -329,7 +304,7 @@ def geodesic_distances(
         distances[distances > limit] = np.inf
         return distances
     graph, nodes = _network(mesh, points)
-    return dijkstra(graph, indices=nodes, limit=limit)[:, : len(mesh.vertices)]
+    return csgraph.dijkstra(graph, indices=nodes, limit=limit)[:, : len(mesh.vertices)]
 
 
 def geodesic_distances_between(
@@ -386,7 +361,7 @@ def geodesic_distances_between(
     for radius in [*(np.sqrt(mesh.area) * np.array(_RADII)), np.inf]:
         sources, row = np.unique(nodes[pending], return_inverse=True)
         for start in range(0, len(sources), at_once):
-            rows = dijkstra(graph, indices=sources[start : start + at_once], limit=radius)
+            rows = csgraph.dijkstra(graph, indices=sources[start : start + at_once], limit=radius)
             first, last = np.searchsorted(row, [start, start + at_once])
             pairs = pending[first:last]
             found = arrivals.distances(rows, row[first:last] - start, pairs)
@@ -400,10 +375,7 @@ def _number_of_different(points: Int64[np.ndarray, " p"] | SurfacePoints) -> int
 
 
 def _exits(sides: _Sides, points: SurfacePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the origins, sides and positions of the beams that start at the given points.
-
-    Three beams start at each point: one beam through each side of the face that contains the point.
-    """
+    """Return the origins, sides and positions of three beams per point, one through each side of its face."""
     side = (3 * points.faces[:, None] + np.arange(3)).ravel()
     of_head, of_apex = (np.roll(points.weights, -k, axis=1).ravel() for k in (1, 2))
     return np.repeat(np.arange(len(points)), 3), side, of_head + of_apex * sides.shape[side]
@@ -433,13 +405,9 @@ def _straight_distances(
 def _network(
     mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints
 ) -> tuple[csr_array, Int64[np.ndarray, " p"]]:
-    """Add surface points to the geodesic graph as nodes.
-
-    The added lines are directed from the points to vertices. Therefore no path leads through an added node,
-    and a distance does not depend on the other added points.
-
-    **Returns:** The graph, and the nodes of the points.
-    """
+    """Add surface points to the geodesic graph as nodes; return the graph and these nodes."""
+    # The added lines are directed from the points to vertices. Therefore no path leads through an added node,
+    # and a distance does not depend on the other added points.
     graph, size = geodesic_graph(mesh), len(mesh.vertices)
     if not isinstance(points, SurfacePoints):
         return graph, points
@@ -453,7 +421,7 @@ def _network(
 
 
 def _lines_from_points(mesh: Mesh, points: SurfacePoints) -> _Lines:
-    """Return straight lines from points on faces to vertices. The origins are the numbers of the points."""
+    """Return straight lines from points on faces to vertices; an origin is the number of a point."""
     corners, sides = mesh.faces[points.faces], _sides(mesh)
     offsets = mesh.vertices[corners] - points.positions(mesh)[:, None]
     number = np.repeat(np.arange(len(points)), 3)
@@ -463,11 +431,7 @@ def _lines_from_points(mesh: Mesh, points: SurfacePoints) -> _Lines:
 
 
 class _Arrivals(NamedTuple):
-    """The last lines of the paths that end at given points.
-
-    A path ends at point i with one of the lines `first[i]` to `first[i + 1] - 1`. Line l leads from the
-    vertex `vertices[l]` to the point, and has the length `lengths[l]`.
-    """
+    """The last lines of paths to points: those of point i are numbered `first[i]` to `first[i + 1] - 1`."""
 
     first: Int64[np.ndarray, " p1"]
     vertices: Int64[np.ndarray, " l"]
@@ -479,10 +443,7 @@ class _Arrivals(NamedTuple):
         sources: Int64[np.ndarray, " q"],
         points: Int64[np.ndarray, " q"],
     ) -> Float64[np.ndarray, " q"]:
-        """Return the distances from `sources[i]` to `points[i]` (q,).
-
-        `to_vertices` contains the distances from each source to all vertices (s, n).
-        """
+        """Return the distances from `sources[i]` to `points[i]`, given those to all vertices (s, n)."""
         counts = self.first[points + 1] - self.first[points]
         pair, line = _ranges(self.first[points], counts)
         lengths = to_vertices[sources[pair], self.vertices[line]] + self.lengths[line]
@@ -490,10 +451,7 @@ class _Arrivals(NamedTuple):
 
 
 def _arrivals(mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints) -> _Arrivals:
-    """Return the last lines of the paths that end at vertices or at points on faces.
-
-    A path to a vertex ends with a line of length zero from the vertex to itself.
-    """
+    """Return the last lines of the paths to points; a vertex is reached from itself by a line of length 0."""
     if not isinstance(points, SurfacePoints):
         return _Arrivals(np.arange(len(points) + 1), points, np.zeros(len(points)))
     number, vertices, lengths = _lines_from_points(mesh, points)
@@ -503,12 +461,9 @@ def _arrivals(mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints) -> _A
 
 
 def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
-    """Return a function that computes exact distances from a source vertex to target vertices.
-
-    **Raises:** `InputError` for meshes that libigl cannot handle. libigl crashes at edges with three faces,
-    stops early at vertices that join several fans of faces, and does not terminate on slivers. (libigl also
-    does not terminate on meshes in very small units, so the mesh is scaled to area 1 first.)
-    """
+    """Return a function that computes exact distances from a source vertex to target vertices."""
+    # libigl crashes at edges with three faces, stops early at vertices that join several fans of faces, and
+    # does not terminate on slivers or in very small units. Such meshes are refused, and the unit is changed.
     corners = mesh.vertices[mesh.faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     faults = {
@@ -522,7 +477,7 @@ def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
                 f"{mesh.name}: exact geodesic distances cannot be computed because the mesh has {fault} "
                 f"({count}): use method='strips'."
             )
-    _, component = connected_components(geodesic_graph(mesh), directed=False)
+    _, component = csgraph.connected_components(geodesic_graph(mesh), directed=False)
     scale = np.sqrt(mesh.area)
     vertices = mesh.vertices / scale
 
@@ -564,10 +519,7 @@ def check_points(
 
 
 def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> SurfacePoints:
-    """Check that `SurfacePoints` belong to a mesh.
-
-    The arguments, the result and the errors are those of `check_points`.
-    """
+    """Check that `SurfacePoints` belong to a mesh; see `check_points`."""
     faces = check_indices(points.faces, len(mesh.faces), f"{name} on {mesh.name}: face")
     with np.errstate(invalid="ignore"):  # comparisons with NaN are false
         good = (points.weights >= 0).all(axis=1) & (np.abs(points.weights.sum(axis=1) - 1) < 1e-6)

@@ -16,11 +16,7 @@ from jaxsmw.geometry.mesh import Mesh
 
 
 def choose_laplacian(mesh: Mesh) -> Literal["cotangent", "robust"]:
-    """Choose the Laplacian of a mesh for the setting `"auto"`.
-
-    **Returns:** `"robust"` if a triangle is degenerate or an edge has more than two faces, else
-    `"cotangent"`.
-    """
+    """Choose the Laplacian that `"auto"` stands for; see `jaxsmw.geometry.compute_spectrum`."""
     return "robust" if mesh.degenerate_faces.any() or len(mesh.nonmanifold_edges) else "cotangent"
 
 
@@ -32,16 +28,12 @@ def assemble_laplacian(
     **Arguments:**
 
     - `mesh`: the surface with n vertices.
-    - `laplacian`: `"cotangent"` for linear finite elements with barycentric areas, `"robust"` for the tufted
-      intrinsic Delaunay Laplacian (Sharp and Crane 2020), or `"auto"` for the Laplacian that
-      `choose_laplacian` returns. The robust Laplacian also handles non-manifold and badly shaped meshes.
+    - `laplacian`: the discretization; see `jaxsmw.geometry.compute_spectrum`.
 
     **Returns:** The dimensionless matrix W (n, n), which is symmetric and positive semi-definite, and the
-    areas A (n,), in the squared unit of the mesh. The rows of W and the entries of A are zero for
-    unreferenced vertices.
+    areas A (n,), in the squared unit of the mesh. Both are zero at unreferenced vertices.
 
-    **Raises:** `InputError` if the Laplacian contains NaN or a vertex has no positive area, for example
-    because faces without area make the cotangent Laplacian undefined.
+    **Raises:** `InputError` if the Laplacian contains NaN or a referenced vertex has no positive area.
     """
     if laplacian == "auto":
         laplacian = choose_laplacian(mesh)

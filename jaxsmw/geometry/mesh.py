@@ -194,11 +194,7 @@ class Mesh:
 
     @cached_property
     def _edge_table(self) -> _EdgeTable:
-        """A table of all edges, with the number of faces and the orientation balance of each edge.
-
-        The orientation balance of an edge is the number of faces that traverse it in one direction, minus the
-        number of faces that traverse it in the opposite direction.
-        """
+        """The edges, their numbers of faces, and how many more faces traverse them one way than the other."""
         n = len(self.vertices)
         tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
         key = np.minimum(tail, head) * n + np.maximum(tail, head)
@@ -334,12 +330,7 @@ def diagnose(mesh: Mesh) -> Diagnosis:
 
     - `mesh`: a `Mesh` from `read_mesh` or `make_mesh`.
 
-    **Returns:**
-
-    A `Diagnosis`, whose attributes count elements: `vertices`, `faces`, `components` (connected components),
-    `unreferenced_vertices`, `boundary_edges`, `boundary_loops`, `nonmanifold_edges`, `nonmanifold_vertices`,
-    `misoriented_edges` and `degenerate_faces`. `str` of the `Diagnosis` explains the counts in sentences, one
-    per line.
+    **Returns:** A `Diagnosis`, whose `str` explains the counts in sentences, one per line.
     """
     unreferenced = int((~mesh.referenced_vertices).sum())
     boundary_chain = connected_components(mesh.boundary_edges, len(mesh.vertices))[1]
@@ -358,45 +349,20 @@ def diagnose(mesh: Mesh) -> Diagnosis:
 
 
 def connected_components(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
-    """Compute the connected components of a graph with n vertices.
-
-    **Arguments:**
-
-    - `edges`: pairs of vertices (e, 2).
-    - `n`: the number of vertices.
-
-    **Returns:** The number of components, and the 0-based index of each vertex's component (n,).
-    """
+    """Return the number of components of a graph with n vertices, and each vertex's component (n,)."""
     graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return csgraph.connected_components(graph, directed=False)
 
 
 def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shaped[np.ndarray, "m ..."]:
-    """For each unreferenced vertex, copy the match of the nearest referenced vertex.
-
-    **Arguments:**
-
-    - `mesh_x`: X with m vertices.
-    - `matches`: an array (m, ...) with one row of values per vertex of X, such as matches or points.
-
-    **Returns:** One row per vertex of X (m, ...). The rows of referenced vertices are unchanged.
-    """
+    """Copy to each unreferenced vertex of X the row of the nearest referenced vertex."""
     return extend_from(mesh_x.referenced_vertices, mesh_x, matches)
 
 
 def extend_from(
     known: Bool[np.ndarray, " n"], mesh: Mesh, values: Shaped[np.ndarray, "n ..."]
 ) -> Shaped[np.ndarray, "n ..."]:
-    """For each vertex with an unknown value, copy the value of the nearest vertex with a known value.
-
-    **Arguments:**
-
-    - `known`: a mask (n,) of the vertices with known values, True for at least one vertex.
-    - `mesh`: a mesh with n vertices.
-    - `values`: an array (n, ...) with one row of values per vertex.
-
-    **Returns:** One row per vertex (n, ...). The known rows are unchanged.
-    """
+    """Copy to each vertex outside the mask `known` (n,) the row of the nearest vertex inside it."""
     if known.all():
         return values
     _, nearest = KDTree(mesh.vertices[known]).query(mesh.vertices[~known])
@@ -526,10 +492,7 @@ def as_mesh(mesh: Mesh | MeshLike, name: str) -> Mesh:
 
 
 def _distinct_faces(triangles: Int64[np.ndarray, "f 3"]) -> tuple[Int64[np.ndarray, " g"], list[str]]:
-    """Return the indices of the faces to keep (g,), and notes about the dropped faces.
-
-    Faces that repeat a vertex, and faces with the same three vertices as an earlier face, are dropped.
-    """
+    """Return the indices of faces (g,) without repeated vertices or faces, and notes about the others."""
     notes = []
     ordered = np.sort(triangles, axis=1)
     repeating = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
@@ -664,10 +627,7 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
 def coincident_vertices(
     position: Float64[np.ndarray, "n 3"], triangles: Int64[np.ndarray, "f 3"]
 ) -> Int64[np.ndarray, " n"]:
-    """For each vertex, return the lowest-numbered vertex at the same position, as an array (n,).
-
-    The position of two boundary vertices is the same if it differs only by rounding.
-    """
+    """Return the lowest-numbered vertex at each vertex's position (n,), up to rounding at boundaries."""
     n = len(position)
     lowest = first_equal_rows(position)
     while True:

@@ -147,18 +147,14 @@ def _surface(
 
 
 class _Tetrahedra(NamedTuple):
-    """The Delaunay triangulation of the given points (scaled to extent 1) and of points added far away.
-
-    `neighbors[t, i]` is the tetrahedron across the triangle opposite to corner i of tetrahedron t, or -1.
-    `outer` is True for a tetrahedron if at least one of its corners is an added point.
-    """
+    """The Delaunay triangulation of the points, scaled to extent 1, and of points added far away."""
 
     points: Float64[np.ndarray, "p 3"]
     corners: Int64[np.ndarray, "t 4"]
-    neighbors: Int64[np.ndarray, "t 4"]
+    neighbors: Int64[np.ndarray, "t 4"]  # across the triangle opposite to each corner, or -1
     centers: Float64[np.ndarray, "t 3"]
     radii: Float64[np.ndarray, " t"]
-    outer: Bool[np.ndarray, " t"]
+    outer: Bool[np.ndarray, " t"]  # whether a corner is an added point
 
     def overlap(self, i: Int64[np.ndarray, " k"], j: Int64[np.ndarray, " k"]) -> Float64[np.ndarray, " k"]:
         """Return the cosines of the angles at which circumspheres intersect. Equal spheres have cosine 1."""
@@ -194,11 +190,7 @@ def _tetrahedra(points: Float64[np.ndarray, "n 3"]) -> _Tetrahedra | None:
 def _circumspheres(
     corners: Float64[np.ndarray, "t 4 3"],
 ) -> tuple[Float64[np.ndarray, "t 3"], Float64[np.ndarray, " t"]]:
-    """Return the centres and radii of circumspheres.
-
-    For a tetrahedron that is almost flat, the centroid replaces the centre, and `_LARGEST_RADIUS` replaces
-    the radius.
-    """
+    """Return the centres and radii of circumspheres; flat tetrahedra get centroids and `_LARGEST_RADIUS`."""
     a, b, c = (corners[:, k] - corners[:, 0] for k in (1, 2, 3))
     volume = np.einsum("ti,ti->t", a, np.cross(b, c))
     squares = ((v**2).sum(axis=1)[:, None] for v in (a, b, c))
@@ -214,12 +206,10 @@ def _circumspheres(
 def _poles(
     tetrahedra: _Tetrahedra, n: int, normals: Float64[np.ndarray, "n 3"] | None
 ) -> tuple[Int64[np.ndarray, " k"], Int64[np.ndarray, " k"]]:
-    """Return, for each point with poles on both sides, the tetrahedra of its two poles.
-
-    Poles are circumcentres of tetrahedra around a point. Without normals, the first pole is the farthest
-    circumcentre, and the second pole is the farthest circumcentre in the opposite half-space. With normals,
-    the poles are the farthest circumcentre on each side of the tangent plane.
-    """
+    """Return, for each point with poles on both sides, the tetrahedra of its two poles."""
+    # Without normals, the first pole is the farthest circumcentre around the point, and the second pole is
+    # the farthest circumcentre in the opposite half-space. With normals, the tangent plane separates the
+    # sides.
     point, tetrahedron = tetrahedra.corners.ravel(), np.repeat(np.arange(len(tetrahedra.corners)), 4)
     given = point < n
     point, tetrahedron = point[given], tetrahedron[given]
@@ -249,12 +239,10 @@ def _poles(
 def _inside(
     tetrahedra: _Tetrahedra, first: Int64[np.ndarray, " k"], second: Int64[np.ndarray, " k"]
 ) -> Bool[np.ndarray, " t"]:
-    """Label the tetrahedra: True for inside.
-
-    The labels x are real numbers, negative for inside. These labels minimise the sum of w (x_i - x_j)^2 over
-    adjacent tetrahedra i, j plus the sum of w (x_i + x_j)^2 over the two poles i, j of each point. The label
-    of every outer tetrahedron is fixed at 1.
-    """
+    """Label the tetrahedra: True for inside."""
+    # The labels x are real numbers, negative for inside. They minimise the sum of w (x_i - x_j)^2 over
+    # adjacent tetrahedra i, j plus the sum of w (x_i + x_j)^2 over the two poles i, j of each point. The
+    # label of every outer tetrahedron is fixed at 1.
     count = int((~tetrahedra.outer).sum())
     unknown = np.full(len(tetrahedra.outer), count)  # all outer tetrahedra have the index `count`
     unknown[~tetrahedra.outer] = np.arange(count)

@@ -130,14 +130,10 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
 
 @lru_cache(maxsize=2)
 def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, " n"]]:
-    """Return the edges of a coarse graph of the surface.
+    """Return the edges (e, 2) of a coarse graph of the surface, and each vertex's nearest node (n,).
 
-    If the mesh has at most 15 000 vertices, its edges are returned. Otherwise the nodes of the graph are
-    about 5000 evenly spread samples. Each vertex belongs to its nearest sample. Two samples are connected if
-    an edge of the mesh joins two vertices that belong to these samples.
-
-    **Returns:** The edges (e, 2) of the graph, and for each vertex of the mesh the nearest node (n,). Nodes
-    are given as vertex indices of the mesh.
+    The nodes are vertices of the mesh. A mesh of at most 15 000 vertices is its own graph. On a larger mesh,
+    the nodes are about 5000 evenly spread samples, joined where an edge joins the vertices nearest to them.
     """
     n = len(mesh.vertices)
     if n <= _DENSE:
@@ -153,17 +149,11 @@ _DENSE, _SPREAD = 15_000, 5000
 
 
 def maximal_independent_set(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarray, " s"]:
-    """Choose a maximal set of vertices of a graph that are more than `radius` edges apart.
+    """Choose a maximal set of vertices of a graph that are more than `radius` edges apart, ascending.
 
-    The algorithm is described in Luby, "A simple parallel algorithm for the maximal independent set problem",
-    SIAM J. Comput. 1986. The random numbers come from a fixed seed.
-
-    **Arguments:**
-
-    - `graph`: the adjacency matrix (n, n), symmetric, with a stored diagonal.
-    - `radius`: a number of edges, at least 1.
-
-    **Returns:** The vertices (s,), ascending.
+    `graph` is a symmetric adjacency matrix (n, n) with a stored diagonal. The algorithm is that of Luby, "A
+    simple parallel algorithm for the maximal independent set problem", SIAM J. Comput. 1986, with a fixed
+    seed.
     """
     n = graph.shape[0]
     rank = np.random.default_rng(0).permutation(n)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -87,25 +88,25 @@ def estimate_scale(mesh_x: Mesh, mesh_y: Mesh) -> ScaleEstimate:
     part, full = (mesh_x, mesh_y) if x_is_part else (mesh_y, mesh_x)
     sampled = _sample(full, 1.0)
 
-    def vote(share: float) -> _Vote:
+    def vote(share: float) -> tuple[float, float]:
         try:
             return _vote(_sample(part, share), sampled, share)
         except InputError:  # the samples are too sparse for SHOT
-            return _Vote(share, 0.0)
+            return share, 0.0
 
     with one_blas_thread():
-        best = max(map(vote, _SHARES), key=lambda found: found.support)
+        best = max(map(vote, _SHARES), key=itemgetter(1))
         # The corrected share is tested too. SHOT then has the same radius on both shapes, so more
         # descriptors match.
-        best = max(best, vote(best.share), key=lambda found: found.support)
-    if best.support == 0:
+        share, support = max(best, vote(best[0]), key=itemgetter(1))
+    if support == 0:
         raise InputError(
             f"{names}: no scale can be estimated, because the meshes have too few similar points: give the "
             "scale as a number, or finer meshes."
         )
-    from_part = float(np.sqrt(best.share * full.area / part.area))
+    from_part = float(np.sqrt(share * full.area / part.area))
     scale = from_part if x_is_part else 1 / from_part
-    return ScaleEstimate(scale, best.support, best.support < _UNCERTAIN_BELOW)
+    return ScaleEstimate(scale, support, support < _UNCERTAIN_BELOW)
 
 
 class _Samples(NamedTuple):
@@ -114,13 +115,6 @@ class _Samples(NamedTuple):
     positions: Float[np.ndarray, "s 3"]
     normals: Float[np.ndarray, "s 3"]
     descriptors: Float[np.ndarray, "s d"]
-
-
-class _Vote(NamedTuple):
-    """An estimated share of the full shape's area, and its support (see `ScaleEstimate`)."""
-
-    share: float
-    support: float
 
 
 def relative_boundary(mesh: Mesh) -> float:
@@ -144,7 +138,7 @@ def _sample(mesh: Mesh, share: float) -> _Samples:
     return _Samples(mesh.vertices[vertices] / unit, mesh.vertex_normals[vertices], np.hstack(shot))
 
 
-def _vote(part: _Samples, full: _Samples, share: float) -> _Vote:
+def _vote(part: _Samples, full: _Samples, share: float) -> tuple[float, float]:
     """Return the corrected share and the support for a tested share (see `estimate_scale`)."""
     rows, matches = _mutually_nearest(part.descriptors, full.descriptors)
     before, angles_before = _pair_features(part, rows)
@@ -154,13 +148,13 @@ def _vote(part: _Samples, full: _Samples, share: float) -> _Vote:
     compared &= np.all(np.abs(angles_before - angles_after) < _ANGLE_TOLERANCE, axis=1)
     ratios = np.sort(np.log(after[compared] / before[compared]))
     if len(ratios) < _FEWEST:
-        return _Vote(share, 0.0)
+        return share, 0.0
     # Two ratios agree if their logarithms differ by at most the tolerance. `counts` contains the number of
     # ratios that agree with each ratio. The ratio with the largest count is called the most frequent ratio.
     counts = np.searchsorted(ratios, ratios + _TOLERANCE) - np.searchsorted(ratios, ratios - _TOLERANCE)
     counts = np.where(np.abs(ratios) < _FARTHEST, counts, 0)
     near = ratios[np.abs(ratios - ratios[np.argmax(counts)]) < _TOLERANCE]
-    return _Vote(share * float(np.exp(2 * np.mean(near))), 2 * float(counts.max()) / len(rows))
+    return share * float(np.exp(2 * np.mean(near))), 2 * float(counts.max()) / len(rows)
 
 
 def _pair_features(

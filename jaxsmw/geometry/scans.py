@@ -33,11 +33,8 @@ def usable_positions(position: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, "
 def lost_vertices(
     position: Float64[np.ndarray, "n 3"], triangles: Int64[np.ndarray, "f 3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the vertices without a usable position.
-
-    Nothing needs the position of a vertex without faces, so any number of these may be not finite. If too
-    many of the other vertices are lost, the mask does not contain them.
-    """
+    """Return a mask of the vertices to move: those without a usable position, unless they are too many."""
+    # Nothing needs the position of a vertex without faces, so any number of these may be not finite.
     idle = ~np.isfinite(position).all(axis=1)
     idle[triangles] = False
     lost = ~usable_positions(position) & ~idle
@@ -63,12 +60,8 @@ def in_small_components(
 ) -> tuple[Bool[np.ndarray, " f"], int]:
     """Return a mask of the triangles in small components, and the number of small components.
 
-    **Arguments:**
-
-    - `component`: the 0-based index of each triangle's component (f,).
-    - `face_areas`: the area of each triangle (f,).
-    - `at_boundary`: a mask of the triangles with a vertex on the boundary of the mesh (f,). A component
-      without such triangles is closed.
+    `component` numbers the component of each triangle (f,). A component is closed if none of its triangles is
+    in the mask `at_boundary` (f,).
     """
     areas = np.bincount(component, weights=face_areas)
     has_faces = np.bincount(component) > 0

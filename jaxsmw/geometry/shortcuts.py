@@ -58,7 +58,7 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
     surface = Mesh(mesh.vertices[origin], manifold)
     cut, opened, chosen = np.zeros(manifold.shape, bool), manifold, []
     # Loops that follow valleys best come first. Shorter loops can cross a limb beside the contact.
-    loops = {loop.edges: loop for loop in _loops(surface, genus) if loop.relative_length <= _CONTACT}
+    loops = {loop.edges: loop for loop in _handle_loops(surface, genus) if loop.relative_length <= _CONTACT}
     for loop in sorted(loops.values(), key=lambda loop: loop.relative_length):
         trial = cut.copy()
         trial.flat[np.concatenate([loop.left, loop.right])] = True
@@ -78,7 +78,7 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
         removed |= min(strips, key=lambda strip: float(mesh.face_areas[strip].sum()))
     # A gap can isolate a few faces, whose eigenfunctions would be useless.
     kept = np.flatnonzero(~removed)
-    _, component = _components(mesh.faces[kept], len(mesh.vertices))
+    _, component = _components_of_faces(mesh.faces[kept], len(mesh.vertices))
     at_gap = np.isin(component[mesh.faces[kept, 0]], component[mesh.faces[removed]])
     small, _ = in_small_components(component[mesh.faces[kept, 0]], mesh.face_areas[kept], at_gap)
     removed[kept] = small & at_gap
@@ -92,18 +92,15 @@ def points_on_uncut(points: SurfacePoints, cut: Mesh, mesh: Mesh) -> SurfacePoin
 
 
 def _genus(manifold: Int64[np.ndarray, "f 3"]) -> int:
-    """Return the number of handles of a manifold surface, which may have boundaries and several components.
-
-    The number of handles follows from Euler's formula. With c components and b boundary loops, the formula is
-    V - E + F = 2 (c - genus) - b.
-    """
-    components, _ = _components(manifold, int(manifold.max()) + 1)
+    """Return the number of handles of a manifold surface, with any boundaries and components."""
+    # With c components and b boundary loops, Euler's formula is V - E + F = 2 (c - genus) - b.
+    components, _ = _components_of_faces(manifold, int(manifold.max()) + 1)
     boundaries = len(igl.boundary_loop_all(manifold))
     return components - (igl.euler_characteristic(manifold) + boundaries) // 2
 
 
-def _components(faces: Int64[np.ndarray, "f 3"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
-    """Compute the connected components of n vertices; see `connected_components`."""
+def _components_of_faces(faces: Int64[np.ndarray, "f 3"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
+    """Return what `connected_components` returns, for the edges of faces."""
     return connected_components(np.concatenate([faces[:, :2], faces[:, 1:]]), n)
 
 
@@ -115,11 +112,8 @@ def _faces_along(opened: Int64[np.ndarray, "f 3"], sides: Int64[np.ndarray, " l"
     return np.asarray(touched[opened].any(axis=1))
 
 
-class _Loop(NamedTuple):
-    """A closed path along interior edges, with the sides of faces to its left and to its right.
-
-    Side i of face f leads from corner i to the next corner, and has the number 3 f + i.
-    """
+class _HandleLoop(NamedTuple):
+    """A closed path along interior edges, with the sides 3 f + i of faces f to its left and to its right."""
 
     weighted_length: float
     length: float
@@ -150,7 +144,7 @@ class _Edges(NamedTuple):
 
     @classmethod
     def of(cls, surface: Mesh, twin: Int64[np.ndarray, " s"]) -> _Edges:
-        """Return the interior edges. `twin` is the number of the same side in the other face, or -1."""
+        """Return the interior edges; `twin` is the number of the same side in the other face, or -1."""
         left = np.flatnonzero(np.arange(len(twin)) < twin)
         right = twin[left]
         tail, head = surface.faces.ravel()[left], np.roll(surface.faces, -1, axis=1).ravel()[left]
@@ -173,7 +167,7 @@ class _Edges(NamedTuple):
         return cls(tail, head, left, right, length, weight * length, depth >= _VALLEY)
 
 
-def _loops(surface: Mesh, genus: int) -> Iterator[_Loop]:
+def _handle_loops(surface: Mesh, genus: int) -> Iterator[_HandleLoop]:
     """Return short loops around the handles of a manifold surface with the given number of handles."""
     n = len(surface.vertices)
     adjacent, side = igl.triangle_triangle_adjacency(surface.faces)
@@ -202,7 +196,7 @@ def _loops(surface: Mesh, genus: int) -> Iterator[_Loop]:
             edge_numbers = along % len(edges.tail)
             forward = along == edge_numbers
             left = np.where(forward, edges.left[edge_numbers], edges.right[edge_numbers])
-            yield _Loop(
+            yield _HandleLoop(
                 float(edges.weighted_length[edge_numbers].sum()),
                 float(edges.length[edge_numbers].sum()),
                 left,
@@ -228,10 +222,7 @@ def _closed_path(predecessor: Int32[np.ndarray, " n"], tail: int, head: int) -> 
 def _dual_arcs(
     surface: Mesh, edges: _Edges, twin: Int64[np.ndarray, " s"]
 ) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, "b 2"]]:
-    """Return the arcs of the dual graph that cross the interior edges and the boundary edges.
-
-    The nodes of the dual graph are the faces, and then the boundary loops.
-    """
+    """Return the dual arcs across interior and boundary edges; nodes are faces, and then boundary loops."""
     boundary = np.flatnonzero(twin < 0)
     ends = np.stack([np.roll(surface.faces, -i, axis=1).ravel()[boundary] for i in range(2)], axis=1)
     loop = connected_components(ends, len(surface.vertices))[1][ends[:, 0]]
@@ -242,18 +233,10 @@ def _dual_arcs(
 def _generators(
     interior: Int64[np.ndarray, "e 2"], boundary: Int64[np.ndarray, "b 2"], length: Float64[np.ndarray, " e"]
 ) -> Int64[np.ndarray, " g"]:
-    """Return the edges whose loops generate all loops of a component, two edges for each handle.
-
-    A dual tree crosses all boundary edges and the edges with the longest loops. The generators are the edges
-    that are neither in the tree of shortest paths nor crossed by the dual tree.
-
-    **Arguments:**
-
-    - `interior`, `boundary`: the arcs of the dual graph; see `_dual_arcs`.
-    - `length`: for each interior edge, the length of the loop through this edge and the shortest paths of
-      its ends. The length is infinite for edges in the tree of shortest paths, and for edges of components
-      without the base point.
-    """
+    """Return the edges whose loops generate all loops of a component, two edges for each handle."""
+    # A dual tree crosses all boundary edges and the edges with the longest loops. The generators are the
+    # edges that are neither in the tree of shortest paths nor crossed by the dual tree. `length` is that of
+    # the loop through each interior edge, and infinite in the tree and in components without the base point.
     usable = np.flatnonzero(np.isfinite(length))
     if not usable.size:
         return usable

@@ -14,7 +14,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.runtime.cache import cached
 
-_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_describe` assumes `_ELEVATION == _RADIAL == 2`
+_AZIMUTH, _ELEVATION, _RADIAL, _COSINE = 8, 2, 2, 11  # `_histograms` assumes `_ELEVATION == _RADIAL == 2`
 SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
@@ -99,7 +99,7 @@ def shot_descriptors(
             # Pairs of vertices at the same position are left out, because they define no direction.
             apart = pairs["v"] > 0
             center, neighbor, distance = (pairs[column][apart] for column in "ijv")
-            descriptors[rows[block]] = _describe(
+            descriptors[rows[block]] = _histograms(
                 positions, normals, block, center, neighbor, distance, radius
             )
         return {"descriptors": descriptors, "lonely": np.asarray(lonely)}
@@ -112,14 +112,8 @@ def shot_descriptors(
 
 
 def mirrored_descriptors(descriptors: Float32[np.ndarray, "n 352"]) -> Float32[np.ndarray, "n 352"]:
-    """Return the SHOT descriptors of the mirror image of a surface.
-
-    A reflection reverses the order of the ranges of azimuth and changes nothing else.
-
-    **Arguments:**
-
-    - `descriptors`: the descriptors of the surface (n, 352), as `shot_descriptors` returns them.
-    """
+    """Return the SHOT descriptors (n, 352) of the mirror image of a surface, given those of the surface."""
+    # A reflection reverses the order of the ranges of azimuth and changes nothing else.
     sectors = descriptors.reshape(len(descriptors), _AZIMUTH, -1)
     return np.ascontiguousarray(sectors[:, ::-1]).reshape(descriptors.shape)
 
@@ -133,7 +127,7 @@ def _too_coarse(mesh: Mesh, lonely: float, radius: float, required: bool) -> str
     )
 
 
-def _describe(
+def _histograms(
     positions: np.ndarray,
     normals: np.ndarray,
     block: Int64[np.ndarray, " b"],
@@ -142,18 +136,8 @@ def _describe(
     distance: Float64[np.ndarray, " p"],
     radius: float,
 ) -> Float64[np.ndarray, "b 352"]:
-    """Return the descriptors of a block of vertices.
-
-    **Arguments:**
-
-    - `positions`: the positions of all vertices, in units of the square root of the area.
-    - `normals`: the unit normals of all vertices.
-    - `block`: the vertices to describe.
-    - `center`, `neighbor`, `distance`: arrays with one entry for each pair of a vertex in the block and one
-      of its neighbours. `center` contains indices into `block`, `neighbor` contains vertices, and `distance`
-      contains the distance between the two vertices of each pair.
-    - `radius`: the radius of the neighbourhoods, in the unit of the positions.
-    """
+    """Return the descriptors of a block from pairs of a `center` in the block and a `neighbor`."""
+    # `center` counts within the block. Lengths are in units of the square root of the area.
     offsets = positions.take(neighbor, axis=0) - positions[block].take(center, axis=0)
     frames = _local_frames(offsets, center, radius - distance, len(block)).take(center, axis=0)
     x, y, z = np.einsum("pad,pd->ap", frames, offsets)
@@ -195,10 +179,7 @@ def _local_frames(
     weight: Float64[np.ndarray, " p"],
     size: int,
 ) -> Float64[np.ndarray, "b 3 3"]:
-    """Return one right-handed frame per described vertex, with the axes x, y and z as rows.
-
-    The neighbours are scattered most along the x axis, and least along the z axis.
-    """
+    """Return a right-handed frame per vertex; its rows x to z are axes of decreasing scatter."""
     scatter = np.zeros((size, 3, 3))
     for row in range(3):
         for column in range(row, 3):

@@ -33,12 +33,7 @@ def nearest_surface_points(
 
 
 class SurfaceTree:
-    """A tree of a mesh's triangles, for several searches for nearest points.
-
-    **Arguments:**
-
-    - `mesh`: a `Mesh`. Unreferenced vertices have no influence.
-    """
+    """A tree of a mesh's triangles, for several searches for nearest points."""
 
     def __init__(self, mesh: Mesh) -> None:
         self._faces = mesh.faces
@@ -134,11 +129,6 @@ def nearest_points_of_triangles(
     points: Float64[np.ndarray, "p 3"], triangles: Float64[np.ndarray, "p 3 3"]
 ) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
     """Find the nearest point on a triangle for each point in space; each point has its own triangle.
-
-    **Arguments:**
-
-    - `points`: positions (p, 3).
-    - `triangles`: the positions of the three corners of each point's triangle (p, 3, 3).
 
     **Returns:** The barycentric weights of the nearest points (p, 3), and the distances to them (p,).
     """

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.sparse import csr_array, diags_array
 
+from jaxsmw.geometry.alignment import nearest_rotations
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.rotations import nearest_rotations
 
 # Values at vertices are averaged over neighbouring vertices _AVERAGINGS times. More averagings enlarge the
 # neighbourhood of each vertex. With fewer averagings, the similarity transformations follow the noise of

@@ -11,8 +11,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 from scipy.spatial import KDTree
 
+from jaxsmw.geometry.alignment import nearest_rotations
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_from
-from jaxsmw.geometry.rotations import nearest_rotations
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 
 # A component of Y can be the counterpart of a moved component of X if they differ by at most the diameter of

@@ -51,10 +51,10 @@ from scipy.spatial.transform import Rotation
 from jaxsmw.benchmark.opponents.base import Method, MethodInput, PointwiseMap
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.alignment import nearest_rotations
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced, make_mesh
-from jaxsmw.geometry.rotations import nearest_rotations
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.runtime.compilation import compiled

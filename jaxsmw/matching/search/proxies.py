@@ -14,8 +14,8 @@ from scipy.sparse import coo_array, csgraph
 from scipy.spatial.distance import cdist
 
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.geometry.alignment import nearest_rotations
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.rotations import nearest_rotations
 from jaxsmw.geometry.sampling import SurfaceSamples
 
 
