@@ -1,5 +1,7 @@
 """The formulas of functional maps agree with explicit sums over scales and vertices."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,6 +59,23 @@ def test_dual_eigenvectors_invert(pair, pseudo_inverse):
     for spectrum in pair:
         dual = dual_eigenvectors(spectrum, pseudo_inverse)
         np.testing.assert_allclose(dual.T @ spectrum.eigenvectors, np.eye(dual.shape[1]), atol=1e-12)
+
+
+def test_an_eigenvector_that_vanishes_at_all_samples_leaves_the_others_unchanged():
+    """On a scan with slivers, an eigenvector can live on a strip of surface that contains no sample."""
+    spectrum = random_spectrum(M, K_X, seed=4)
+    others = np.delete(np.arange(K_X), 5)
+    lacking = replace(spectrum, eigenvectors=spectrum.eigenvectors.at[:, 5].set(0))
+    without = replace(
+        spectrum, eigenvalues=spectrum.eigenvalues[others], eigenvectors=spectrum.eigenvectors[:, others]
+    )
+    dual = dual_eigenvectors(lacking, "least_squares")
+    np.testing.assert_array_equal(dual[:, 5], 0)
+    expected = dual_eigenvectors(without, "least_squares")
+    np.testing.assert_allclose(dual[:, others], expected, rtol=1e-10, atol=1e-12)
+    # Fewer samples than eigenvectors remain an error, which refinement reports.
+    few = lacking.sample(jnp.arange(K_X - 1))
+    assert not np.isfinite(dual_eigenvectors(few, "least_squares")).all()
 
 
 def test_kernel_is_the_sum_over_scales(pair):

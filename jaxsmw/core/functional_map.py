@@ -59,6 +59,7 @@ from jaxsmw.core.checks import check_option
 from jaxsmw.core.linear_algebra import (
     is_regular,
     product,
+    regularized,
     solve_positive_definite,
     symmetric_eigenvalues,
 )
@@ -106,6 +107,10 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
     gram = product(spectrum.eigenvectors.T, spectrum.eigenvectors)
+    if spectrum.mask.shape[0] >= gram.shape[0]:
+        # An eigenvector of a sliver can vanish at all samples. Its coefficients are then nearly zero. Fewer
+        # samples than eigenvectors remain an error.
+        gram = regularized(gram)
     return solve_positive_definite(gram, spectrum.eigenvectors.T).T
 
 

@@ -110,6 +110,12 @@ def is_regular(matrix: Float[Array, "k k"]) -> Bool[Array, ""]:
     return jnp.min(pivots) > rounding(matrix)
 
 
+def regularized(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    """Add the rounding error to the diagonal of a singular Gram matrix; return a regular one unchanged."""
+    error = jnp.where(is_regular(matrix), 0, lax.stop_gradient(rounding(matrix)))
+    return matrix + error * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
+
+
 @jax.custom_jvp
 def symmetric_eigenvalues(matrix: Float[Array, "k k"]) -> Float[Array, " k"]:
     """Return the eigenvalues of a symmetric matrix in ascending order."""

@@ -29,7 +29,7 @@ class RESULTS(eqx.Enumeration):
         "The functional map became NaN or infinite. Check the responses of the filter bank, the weights, the "
         "descriptors, and the temperature of soft maps, which must be positive. Numbers can overflow in "
         "float32: scale the surfaces to area 1, or use float64. With samples, use at least as many samples "
-        "as eigenvectors, and spread the samples so that the eigenvectors are linearly independent on them."
+        "as eigenvectors."
     )
     undetermined_functional_map = (
         "A part of the functional map is undetermined to working precision. If the solution uses wavelets, "
