@@ -193,7 +193,7 @@ def test_greater_depth_never_makes_distances_longer():
     previous = np.full((len(mesh.vertices),) * 2, np.inf)
     for depth in (1, 2, 4, 8):
         graph = geodesic_graph(mesh, depth=depth)
-        distances = geodesics.dijkstra(graph)
+        distances = geodesics.csgraph.dijkstra(graph)
         assert (distances <= previous + 1e-12).all()
         previous = distances
         totals.append(distances.sum())
