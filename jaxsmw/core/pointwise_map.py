@@ -145,10 +145,7 @@ def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches,
 
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X and of target Y, in any unit of length.
 
-    **Returns:** A pair of `Patches`: the patches of X (the queries) and the patches of Y (the database). Each
-    `Patches` contains three arrays for p patches of s vertices. `rows` (p, s) contains 0-based vertices, and
-    `mask` (p, s) is False for padding. `variations` (p, r, s) describes the directions along which
-    the points of each patch differ most.
+    **Returns:** A pair of `Patches`: the patches of X (the queries) and the patches of Y (the database).
     """
     n = spectrum_y.mask.shape[0]
     size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** (1 / 3))

@@ -429,7 +429,7 @@ def make_mesh(
     if faces is None:
         vertices, faces = _parts(vertices, name)
     position = numeric_rows(vertices, "vertices", name)
-    with np.errstate(over="ignore"):  # wider float types can overflow; `_check_extent` reports infinities
+    with np.errstate(over="ignore"):  # wider float types can overflow; `check_extent` reports infinities
         position = np.array(position, dtype=np.float64, order="C")
     triangles = _indices(numeric_rows(faces, "faces", name), len(position), name)
     notes = list(notes)

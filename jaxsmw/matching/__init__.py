@@ -1,4 +1,4 @@
-"""What a match is made of, in the order in which it runs.
+"""What a match is made of, in the order in which it runs. (`preparation` imports `stages` and `executor`.)
 
 - `pair`: two meshes, and the units in which they are compared.
 - `preparation`: spectra, samples and descriptors of both shapes.

@@ -35,8 +35,7 @@ class Pair:
     **Attributes:**
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), each a `Mesh`.
-    - `partial`: False for two full shapes. True if one mesh is a partial shape and the other mesh the full
-      shape.
+    - `partial`: False for two full shapes. True if one mesh or both meshes are partial shapes.
     - `scale`: for a partial pair, the factor by which lengths on X are multiplied to become lengths in the
       unit of Y. The factor is 1 if both meshes have the same unit. Full shapes ignore the scale.
     """
@@ -61,8 +60,7 @@ class Pair:
 
         - `mesh_x`, `mesh_y`: the source X and the target Y, each as a `Mesh` or as any mesh that
           `jaxsmw.make_mesh` accepts.
-        - `partial`: False for two full shapes. True if one mesh is a partial shape and the other mesh the
-          full shape.
+        - `partial`: see the attribute.
         - `scale`: for a partial pair, the factor by which lengths on X are multiplied to become lengths in
           the unit of Y. With `"unknown"`, the factor is estimated; see `jaxsmw.geometry.estimate_scale`.
 
