@@ -71,7 +71,7 @@ def test_changed_results_do_not_hold(scape, results, tmp_path, capsys):  # noqa:
 
 @pytest.mark.slow
 def test_other_pairs_are_drawn_with_another_seed(scape, results):  # noqa: F811
-    stored, data_set = StoredResults(results, "shot"), open_data_set(scape)
+    stored, data_set = StoredResults(results), open_data_set(scape)
     drawn = {tuple(pair.names for pair in stored.draw(data_set, seed)) for seed in range(30)}
     assert all(len(pairs) == 1 for pairs in drawn) and len(drawn) == 6
     assert stored.settings.evaluated_points == 200 and stored.settings.seed == 3

@@ -9,11 +9,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import TypeVar
 from urllib.parse import urlsplit
@@ -131,12 +132,23 @@ _warnings: list[Warning] = []
 
 def _run_in_worker(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[Warning]]:
     """Return the result of a task, and the worker's warnings since the last task."""
-    # Pairs of different sizes need different programs, which would fill the memory of a worker.
-    release_programs()
+    # Pairs of different sizes need different programs, which would fill the memory of a worker. An executor
+    # that runs tasks in the calling process must not release the programs of the caller.
+    if multiprocessing.parent_process() is not None or _runs_in_dask():
+        release_programs()
     result = function(task)
     issued = _warnings.copy()
     _warnings.clear()
     return result, issued
+
+
+def _runs_in_dask() -> bool:
+    """Return whether this call is a task of a Dask worker, which need not be a child process."""
+    if (distributed := sys.modules.get("distributed")) is None:
+        return False
+    with suppress(ValueError):
+        return distributed.get_worker() is not None
+    return False
 
 
 @contextmanager
