@@ -74,11 +74,7 @@ Side = TypeVar("Side")
 
 
 def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-    """Return the two arguments in the order (out, in).
-
-    "Out" is the shape that C maps to, and "in" is the shape that C maps from. So the order is (X, Y) in the
-    pullback convention and (Y, X) in the pushforward convention. The function is its own inverse: it also
-    converts the order (out, in) to the order (X, Y).
+    """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y).
 
     **Raises:** `ValueError` for an unknown convention.
     """
@@ -158,10 +154,7 @@ def _encode(
     eigenvectors_in: Float[Array, "n_in k_in"],
     convention: Convention,
 ) -> Float[Array, "k_out k_in"]:
-    """Compute the result of `encode` from dual eigenvectors that the caller provides.
-
-    Padded vertices of X do not contribute, because their eigenvectors and dual eigenvectors are zero.
-    """
+    """Compute the result of `encode` from dual eigenvectors."""
     of_x, of_y = out_and_in(convention, dual_out, eigenvectors_in)
     dual_out, eigenvectors_in = out_and_in(convention, of_x, pull_back(pointwise_map, of_y))
     return product(dual_out.T, eigenvectors_in)
@@ -276,7 +269,10 @@ class WaveletProblem(eqx.Module):
     sampled: bool = eqx.field(static=True, default=False)
 
     def out_and_in(self, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-        """Return the two arguments in the order (out, in)."""
+        """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y).
+
+        **Raises:** `ValueError` for an unknown convention.
+        """
         return out_and_in(self.convention, of_x, of_y)
 
     @property
@@ -296,8 +292,7 @@ class WaveletProblem(eqx.Module):
 
         **Arguments:**
 
-        - `pointwise_map`: the map T, as an integer array (m,) with one 0-based vertex of Y per vertex of X. T
-          can also be a `SoftMap` or a `SparseSoftMap` from X to Y.
+        - `pointwise_map`: the map T, as in the function `encode`.
         - `dual_out`: the `dual_eigenvectors` (n_out, k_out) of the shape that C maps to.
         """
         _, spectrum_in = self.spectra
@@ -318,8 +313,7 @@ class WaveletProblem(eqx.Module):
 
         **Arguments:**
 
-        - `pointwise_map`: the map T, as an integer array (m,) with one 0-based vertex of Y per vertex of X. T
-          can also be a `SoftMap` or a `SparseSoftMap` from X to Y.
+        - `pointwise_map`: the map T, as in the function `encode`.
         - `norm`: `"area"` (the default) weights each vertex of X by its area. `"frobenius"` gives all
           vertices the same weight, as in equation (5) of the MWP paper.
 

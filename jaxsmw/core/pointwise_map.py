@@ -34,12 +34,7 @@ def spectral_embeddings(
 
     **Arguments:**
 
-    - `functional_map`: C, without unit, of shape (k_X, k_Y) in the pullback convention and of shape
-      (k_Y, k_X) in the pushforward convention.
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
-      vertices, k_Y eigenvectors), in the same scale; see `decode`.
-    - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
-      X. With `"pushforward"`, C maps functions on X to functions on Y.
+    - `functional_map`, `spectrum_x`, `spectrum_y`, `convention`: as in `decode`.
 
     **Returns:** Two point sets: the queries (m, d) with one point per vertex of X, and the database (n, d)
     with one point per vertex of Y. The dimension d is the number of rows of C. The coordinates have the unit
@@ -62,10 +57,8 @@ def decode(
     """Recover the pointwise map T: X -> Y from a functional map C by nearest-neighbour search.
 
     This computation is step 3 of Algorithm 1 of the MWP paper. T maps each vertex of X to the unmasked vertex
-    of Y that is nearest in spectral space. Phi_X and Phi_Y contain the eigenvectors as columns. In the
-    pullback convention, the queries are the rows of `Phi_X` and the targets are the rows of `Phi_Y C^T`. In
-    the pushforward convention, the queries are the rows of `Phi_X C^T` and the targets are the rows of
-    `Phi_Y`. The search is exact up to rounding errors, with and without patches.
+    of Y that is nearest in the `spectral_embeddings`. The search is exact up to rounding errors, with and
+    without patches.
 
     **Arguments:**
 
@@ -100,10 +93,8 @@ def decode_to_triangles(
     """Convert a functional map C to a map from the vertices of X to points on the triangles of Y.
 
     The method is that of Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The
-    vertices of both shapes become points in spectral space. The matrices Phi_X and Phi_Y contain the
-    eigenvectors as columns. In the pullback convention, the points are the rows of `Phi_X` and `Phi_Y C^T`.
-    In the pushforward convention, the points are the rows of `Phi_X C^T` and `Phi_Y`. The triangles of Y span
-    a surface in this space. Each vertex of X is mapped to the nearest point of this surface.
+    triangles of Y span a surface in the space of the `spectral_embeddings`. Each vertex of X is mapped to the
+    nearest point of this surface.
 
     If X is finer than Y, `decode` maps several neighbouring vertices of X to the same vertex of Y.
     `decode_to_triangles` can map neighbouring vertices to different points. Textures and other functions on Y
@@ -113,12 +104,7 @@ def decode_to_triangles(
 
     **Arguments:**
 
-    - `functional_map`: C, without unit, of shape (k_X, k_Y) in the pullback convention and of shape
-      (k_Y, k_X) in the pushforward convention.
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
-      vertices, k_Y eigenvectors), in the same scale; see `decode`.
-    - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
-      X. With `"pushforward"`, C maps functions on X to functions on Y.
+    - `functional_map`, `spectrum_x`, `spectrum_y`, `convention`: as in `decode`.
     - `faces_y`: (f, 3), the triangles of Y, as vertex indices from 0 to n - 1.
 
     **Returns:** Two arrays with one row per vertex of X. The first array (m,), int32, contains triangles of Y

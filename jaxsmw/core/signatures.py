@@ -93,11 +93,7 @@ def _signature(spectrum: Spectrum, weights: Float[Array, "dimensions k"]) -> Flo
 
 
 def _positive_range(spectrum: Spectrum) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the smallest positive and the largest eigenvalue.
-
-    Each connected component has an eigenvalue zero, which rounding can make slightly positive. Eigenvalues up
-    to 1e-6 times the largest eigenvalue are therefore treated as zero.
-    """
+    """Return the smallest positive and the largest eigenvalue."""
     largest = spectrum.eigenvalues[-1]
     positive = spectrum.eigenvalues > 1e-6 * largest
     return jnp.min(jnp.where(positive, spectrum.eigenvalues, largest)), largest

@@ -127,19 +127,7 @@ class SparseSoftMap(eqx.Module):
     shares: Float[Array, "m t"]
 
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Pull functions on Y, such as colours, back to the queries.
-
-        A query receives a weighted mean of the values at the database rows. The weights are the shares of the
-        query.
-
-        **Arguments:**
-
-        - `functions_on_y`: the values of p functions at the database rows (n, p), in any unit.
-
-        **Returns:** The values of the p functions at the queries (m, p), in the same unit.
-
-        **Raises:** `ValueError` if the values do not have two dimensions.
-        """
+        """Pull functions on Y (n, p) back to the queries (m, p), as `SoftMap.pull_back` does."""
         functions = jnp.asarray(functions_on_y, self.shares.dtype)
         if functions.ndim != 2:
             raise ValueError(
@@ -194,9 +182,7 @@ class Recovery(eqx.Module):
     Ready subclasses are `Softmax`, `NearestFew` and `Sinkhorn`.
 
     A subclass is an equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
-    The arguments are query points (m, d), database points (n, d), query areas (m,) and database areas (n,).
-    The areas are in any unit. Padded vertices have area zero and must receive share zero. The result is a
-    `SoftMap` or a `SparseSoftMap` from the queries to the database.
+    Padded vertices have area zero and must receive share zero.
     """
 
     @abc.abstractmethod
@@ -219,10 +205,6 @@ class Recovery(eqx.Module):
 
 class Softmax(Recovery):
     """A recovery in which each query gives shares to all database rows, and larger shares to nearer rows.
-
-    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    `refine_softly` passes the spectral embeddings of X and Y to the recovery. The m points of X are then the
-    queries, and the n points of Y are the database rows.
 
     The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
     `distance` is the distance between the query and the row. The result is a `SoftMap`, whose `pull_back`
@@ -258,10 +240,6 @@ class Softmax(Recovery):
 
 class NearestFew(Recovery):
     """A recovery in which each query gives shares only to its nearest database rows.
-
-    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    `refine_softly` passes the spectral embeddings of X and Y to the recovery. The m points of X are then the
-    queries, and the n points of Y are the database rows.
 
     The share of each of the nearest rows is proportional to its area times `exp(-distance² / temperature)`,
     where `distance` is the distance between the query and the row. The shares are differentiable, but
@@ -316,10 +294,6 @@ class NearestFew(Recovery):
 
 class Sinkhorn(Recovery):
     """A recovery by entropy-regularised optimal transport, which preserves the areas of database rows.
-
-    Pass the object to the argument `recovery` of `refine_softly` or `WaveletPreservationLayer`.
-    `refine_softly` passes the spectral embeddings of X and Y to the recovery. The m points of X are then the
-    queries, and the n points of Y are the database rows.
 
     The function `sinkhorn` computes the shares. The area that all queries together send to a database row
     equals the area of the row, up to the tolerance. The result is a `SoftMap`, whose `pull_back` transfers
@@ -427,11 +401,7 @@ def sinkhorn(
 
 
 class _SinkhornState(NamedTuple):
-    """The variables of Sinkhorn's iterations.
-
-    `residual` is the residual of `potentials`, `following` contains the potentials of the next iteration, and
-    `iterations` is the number of iterations so far.
-    """
+    """The variables of Sinkhorn's iterations. The residual is that of `potentials`, not of `following`."""
 
     potentials: Float[Array, " n"]
     following: Float[Array, " n"]
@@ -479,30 +449,21 @@ def _sinkhorn_potentials(
 
 
 def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return the logarithms of areas.
-
-    The logarithm of a zero area is -inf, and its derivative is zero instead of infinity.
-    """
+    """Return the logarithms of areas: -inf for zero, with the derivative 0 instead of infinity."""
     return jnp.where(areas > 0, jnp.log(jnp.where(areas > 0, areas, 1)), -jnp.inf)
 
 
 def _log_kernel(
     database: Float[Array, "n d"], block: Float[Array, "block d"], temperature: Float[Array, ""]
 ) -> Float[Array, "n block"]:
-    """Return `-distance² / temperature`, up to a constant that depends only on the query.
-
-    The queries are on the last axis, so XLA computes sums over the database for several neighbouring queries
-    at once. This layout halves the run time.
-    """
+    """Return `-distance² / temperature`, up to a constant that depends only on the query."""
+    # The queries are on the last axis, so XLA sums over the database for several queries at once.
+    # This layout halves the run time.
     return (2 * product(database, block.T) - jnp.sum(database**2, axis=1)[:, None]) / temperature
 
 
 class _Transport(NamedTuple):
-    """The scaled inputs of a recovery: two point sets with areas, and a temperature.
-
-    The origin is the centre of the database. The areas of each point set sum to 1. The temperature is in
-    squared units of the points.
-    """
+    """The scaled inputs of a recovery: the temperature is in squared units of the points."""
 
     queries: Float[Array, "m d"]
     database: Float[Array, "n d"]
@@ -529,14 +490,9 @@ def _normalized(
     database_areas: Float[Array, " n"],
     temperature: Float[Array, ""],
 ) -> _Transport:
-    """Scale the inputs of a recovery. The temperature is given in the unit that `sinkhorn` describes.
-
-    The centre of the database becomes the origin, because distances between points far from the origin have
-    large rounding errors. A temperature that is not positive is replaced by NaN, so all results are NaN. A
-    temperature below the rounding error of squared distances is raised to this error. At lower temperatures,
-    `distance² / temperature` would have large rounding errors, and derivatives would overflow.
-    """
+    """Scale the inputs of a recovery; `sinkhorn` describes the unit of the temperature."""
     a, b = query_areas / jnp.sum(query_areas), database_areas / jnp.sum(database_areas)
+    # Distances between points far from the origin have large rounding errors.
     center = lax.stop_gradient(product(b[None, :], database))
     queries, database = queries - center, database - center
     found = nearest_neighbor(*lax.stop_gradient((queries, database)), database_mask=b > 0)
@@ -546,5 +502,6 @@ def _normalized(
     unit = jnp.maximum(unit, eps**0.5 * spread)
     unit = jnp.where(unit > 0, unit, 1)  # The unit is 0 if all queries coincide with one database row.
     relative = temperature.astype(queries.dtype)
+    # At temperatures below the rounding error of squared distances, derivatives would overflow.
     absolute = jnp.maximum(relative * unit, eps * spread)
     return _Transport(queries, database, a, b, jnp.where(relative > 0, absolute, jnp.nan))

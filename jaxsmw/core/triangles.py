@@ -121,16 +121,9 @@ def _closest(
     uv: Float[Array, "*#n"],
     vv: Float[Array, "*#n"],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
-    """Return squared distances from points q to triangles, and the coordinates s, t of the nearest points.
+    """Return squared distances from points q to triangles `a + s u + t v`, and s and t of the nearest points.
 
-    The nearest point of a triangle is `a + s u + t v`, where u and v are the edges from the corner a.
-
-    **Arguments:**
-
-    - `squared`: `|q - a|²`, or `|q - a|²` plus a constant. In the second case, the returned squared distance
-      is also increased by this constant.
-    - `along_u`, `along_v`: `(q - a)·u` and `(q - a)·v`.
-    - `uu`, `uv`, `vv`: the products `u·u`, `u·v` and `v·v`.
+    `squared` is `|q - a|²` up to a constant, and `along_u` is `(q - a)·u`.
     """
 
     def at(s: Array, t: Array) -> Array:

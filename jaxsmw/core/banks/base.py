@@ -16,13 +16,9 @@ class FilterBank(eqx.Module):
     `jaxsmw.banks` contains ready subclasses, such as `Meyer` (the default of `WaveletPreservation`) and
     `CubicSpline`.
 
-    A subclass must define `__call__(points, eigenvalues)`, which returns the dimensionless responses
-    (filters, p) at `points` (p,) in [0, lambda_max]. By convention, row 0 of the responses is the scaling
-    function. `eigenvalues` (k,) are the shape's eigenvalues in ascending order; the last one is lambda_max.
-    The unit of the eigenvalues is arbitrary, but the points have the same unit.
-
-    A bank is an Equinox module, and therefore a pytree. The continuous parameters of a bank are arrays, which
-    JAX can trace and differentiate. The sizes of a bank, such as the number of filters, are static fields.
+    A subclass must define `__call__(points, eigenvalues)`. A bank is an Equinox module, and therefore a
+    pytree. The continuous parameters of a bank are arrays, which JAX can trace and differentiate. The sizes
+    of a bank, such as the number of filters, are static fields.
     """
 
     @abc.abstractmethod

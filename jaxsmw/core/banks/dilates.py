@@ -55,10 +55,6 @@ class CubicSpline(_LogSpacedDilates):
     log-spaced from `2 ratio / lambda_max` to `1 / lambda_max`. The scaling function passes the eigenvalues
     below `lambda_max / ratio`.
 
-    `bank(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points` (p,) in
-    [0, lambda_max]. Row 0 is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in
-    ascending order, in the same (arbitrary) unit as `points`; the last one is lambda_max.
-
     The wavelet, also known as "abspline", is from Hammond, Vandergheynst and Gribonval, "Wavelets on graphs
     via spectral graph theory", 2011. The MWP paper compares this filter bank with the Meyer frame. With the
     default parameters, the frame bounds over [0, lambda_max] are 1.28 and 2.12.
@@ -94,10 +90,6 @@ class MexicanHat(_LogSpacedDilates):
     derivative of a Gaussian. The `filters - 1` scales are log-spaced from `2 ratio / lambda_max` to
     `1 / lambda_max`. The scaling function passes the eigenvalues below `lambda_max / ratio`.
 
-    `bank(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points` (p,) in
-    [0, lambda_max]. Row 0 is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in
-    ascending order, in the same (arbitrary) unit as `points`; the last one is lambda_max.
-
     The wavelet is that of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014. The
     scales are those of Hammond, Vandergheynst and Gribonval 2011. With the default parameters, the frame
     bounds over [0, lambda_max] are 0.177 and 0.270.
@@ -125,10 +117,6 @@ class Heat(FilterBank):
     """A filter bank of heat kernels `exp(-t lambda / lambda_max)`, with several diffusion times t.
 
     The bank is not tight. All filters of this bank are low-pass filters.
-
-    `bank(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points` (p,) in
-    [0, lambda_max], one row per diffusion time. `eigenvalues` (k,) are the shape's eigenvalues in ascending
-    order, in the same (arbitrary) unit as `points`; the last one is lambda_max.
 
     The kernels are those of Sun, Ovsjanikov and Guibas, "A concise and provably informative multi-scale
     signature based on heat diffusion", 2009.

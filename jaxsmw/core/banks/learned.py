@@ -18,10 +18,6 @@ class SoftmaxFrame(FilterBank):
     a piecewise linear function of the eigenvalue lambda, with evenly spaced knots from 0 to lambda_max. With
     enough knots, the softmax can approximate any Parseval frame of positive continuous filters.
 
-    `bank(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points` (p,) in
-    [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
-    (arbitrary) unit as `points`; the last one is lambda_max.
-
     To learn a frame, start from `SoftmaxFrame.like(bank)` for a known bank and optimise the logits by
     gradient descent. If the smallest eigenvalues matter most, use `Warped(SoftmaxFrame(…), Power())`. The
     knots are then evenly spaced in frequency, the square root of the eigenvalue.

@@ -20,10 +20,6 @@ class ExponentialWindow(FilterBank):
     `e(u) = exp(-slope / u)` and `u = 1 - lambda / edge`. The filter is from Perraudin et al., "GSPBOX: A
     toolbox for signal processing on graphs", 2014.
 
-    `bank(points, eigenvalues)` returns the dimensionless responses (1, p) at `points` (p,) in
-    [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
-    (arbitrary) unit as `points`; the last one is lambda_max.
-
     **Arguments:**
 
     - `edge`: the eigenvalue above which the filter is zero, as a fraction of lambda_max, by default 0.2. The
@@ -57,10 +53,6 @@ class LowPass(FilterBank):
 
     The filter is the scaling function of `Meyer` with an adjustable edge. The filter is 1 up to the edge, and
     then falls smoothly to 0 at twice the edge.
-
-    `bank(points, eigenvalues)` returns the dimensionless responses (1, p) at `points` (p,) in
-    [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
-    (arbitrary) unit as `points`; the last one is lambda_max.
 
     **Arguments:**
 

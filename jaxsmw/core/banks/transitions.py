@@ -75,10 +75,6 @@ class Meyer(_DyadicBands):
     scaling function then falls to 0 over the next octave, while the first wavelet rises. The last wavelet
     rises from `lambda_max / 2` to lambda_max.
 
-    `bank(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points` (p,) in
-    [0, lambda_max]. Row 0 is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in
-    ascending order, in the same (arbitrary) unit as `points`; the last one is lambda_max.
-
     The frame is that of Leonardi and Van De Ville, "Tight wavelet frames on multislice graphs", 2013. Section
     4.2 of the MWP paper uses this frame. The scaling function passes the lowest eigenvalues, which correspond
     to the largest spatial scale.
@@ -98,10 +94,6 @@ class SimpleTight(_DyadicBands):
     """The simple tight frame: a filter bank of octave bands that is a Parseval frame.
 
     The bands are those of `Meyer`, but each filter rises like sin² over an octave.
-
-    `bank(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points` (p,) in
-    [0, lambda_max]. Row 0 is the scaling function. `eigenvalues` (k,) are the shape's eigenvalues in
-    ascending order, in the same (arbitrary) unit as `points`; the last one is lambda_max.
 
     The frame is that of Göbel, Blanchard and von Luxburg, "Construction of tight frames on graphs and
     application to denoising", 2018. Their construction is based on Coulhon, Kerkyacharian and Petrushev 2012.
@@ -145,10 +137,6 @@ class Held(_TwoBands):
     The low-pass filter falls from 1 to 0 between the edge and twice the edge, while the high-pass filter
     rises.
 
-    `bank(points, eigenvalues)` returns the dimensionless responses (2, p) at `points` (p,) in
-    [0, lambda_max]. Row 0 is the low-pass filter. `eigenvalues` (k,) are the shape's eigenvalues in ascending
-    order, in the same (arbitrary) unit as `points`; the last one is lambda_max.
-
     The filters are those of Held, Storath, Massopust and Forster, "Steerable wavelet frames based on the
     Riesz transform", 2010.
 
@@ -173,10 +161,6 @@ class Simoncelli(_TwoBands):
     rises. The filters are the cosine and the sine of an angle that is linear in the logarithm of the
     eigenvalue.
 
-    `bank(points, eigenvalues)` returns the dimensionless responses (2, p) at `points` (p,) in
-    [0, lambda_max]. Row 0 is the low-pass filter. `eigenvalues` (k,) are the shape's eigenvalues in ascending
-    order, in the same (arbitrary) unit as `points`; the last one is lambda_max.
-
     The filters are those of Portilla and Simoncelli, "A parametric texture model based on joint statistics of
     complex wavelet coefficients", 2000.
 
@@ -198,10 +182,6 @@ class Papadakis(_TwoBands):
 
     The low-pass filter falls from 1 to 0 between the edge and 5/3 times the edge, while the high-pass filter
     rises. The filters are the cosine and the sine of an angle that is linear in the eigenvalue.
-
-    `bank(points, eigenvalues)` returns the dimensionless responses (2, p) at `points` (p,) in
-    [0, lambda_max]. Row 0 is the low-pass filter. `eigenvalues` (k,) are the shape's eigenvalues in ascending
-    order, in the same (arbitrary) unit as `points`; the last one is lambda_max.
 
     The filters are those of Romero, Alexander, Baid, Jain and Papadakis, "The geometry and the analytic
     properties of isotropic multiresolution analysis", 2009.
@@ -227,10 +207,6 @@ class Regular(_Transitions):
     The filters are the cosine and the sine of the angle `pi/4 (1 + s)`. To compute s, the function
     `sin(pi/2 x)` is applied `degree` times to `x = 2 lambda / lambda_max - 1`. The filters are from Perraudin
     et al., "GSPBOX: A toolbox for signal processing on graphs", 2014.
-
-    `bank(points, eigenvalues)` returns the dimensionless responses (2, p) at `points` (p,) in
-    [0, lambda_max]. Row 0 is the low-pass filter. `eigenvalues` (k,) are the shape's eigenvalues in ascending
-    order, in the same (arbitrary) unit as `points`; the last one is lambda_max.
 
     **Arguments:**
 

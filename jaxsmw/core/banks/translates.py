@@ -45,10 +45,6 @@ class Itersine(_UniformTranslates):
     Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
     width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
 
-    `bank(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points` (p,) in
-    [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
-    (arbitrary) unit as `points`; the last one is lambda_max.
-
     The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on
     graphs", 2014. The squared windows sum to a constant because `overlap` is even.
 
@@ -75,10 +71,6 @@ class HalfCosine(_UniformTranslates):
 
     Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
     width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
-
-    `bank(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points` (p,) in
-    [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
-    (arbitrary) unit as `points`; the last one is lambda_max.
 
     The filters are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
     tight graph wavelet and vertex-frequency frames", 2015. The squared filters of that paper sum to
@@ -109,10 +101,6 @@ class Gabor(FilterBank):
     The filters correspond to the windows of a short-time Fourier transform. In Shuman, Ricaud and
     Vandergheynst, "Vertex-frequency analysis on graphs", 2016, every eigenvalue is the centre of a window.
     This bank has only `filters` centres. Each Gaussian is 1 at its centre.
-
-    `bank(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points` (p,) in
-    [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
-    (arbitrary) unit as `points`; the last one is lambda_max.
 
     **Arguments:**
 

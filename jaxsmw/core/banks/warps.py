@@ -17,10 +17,8 @@ class Warp(eqx.Module):
 
     A `Warped` bank evaluates another filter bank on the warped eigenvalue axis. Ready subclasses of `Warp`
     are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
-    `__call__(points, eigenvalues)`, which returns the warped points (p,), in any unit. The warped points must
-    be non-negative and increase with the points, but these conditions are not checked. `points` (p,) are in
-    [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order; the last one is
-    lambda_max. The points and the eigenvalues have the same unit.
+    `__call__(points, eigenvalues)`. The warped points must be non-negative and increase with the points, but
+    these conditions are not checked.
 
     A constant factor in a warp has no effect on the banks of `jaxsmw.banks`, because these banks depend only
     on ratios of eigenvalues.
@@ -45,10 +43,6 @@ class Warped(FilterBank):
     Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and vertex-frequency
     frames", 2015.
 
-    `Warped(bank, warp)(points, eigenvalues)` returns the dimensionless responses (filters, p) at `points`
-    (p,) in [0, lambda_max]. `eigenvalues` (k,) are the shape's eigenvalues in ascending order, in the same
-    (arbitrary) unit as `points`; the last one is lambda_max.
-
     **Arguments:**
 
     - `bank`: any `FilterBank` with filters g_l.
@@ -72,9 +66,6 @@ class Logarithm(Warp):
     The warp is nearly linear for eigenvalues below `lambda_max / strength` and nearly logarithmic for larger
     eigenvalues.
 
-    A call takes points (p,) and a shape's eigenvalues (k,), as for every `Warp`. The call returns the warped
-    points (p,), which have no unit. The last eigenvalue is lambda_max.
-
     **Arguments:**
 
     - `strength`: a single positive number, or an array of shape (). The default is 10.
@@ -94,13 +85,10 @@ class Logarithm(Warp):
 class Power(Warp):
     """The warp `(lambda / lambda_max)^exponent` of the eigenvalue axis, for use in `Warped(bank, Power())`.
 
-    A call takes points (p,) and a shape's eigenvalues (k,), as for every `Warp`. The call returns the warped
-    points (p,) in [0, 1]. The last eigenvalue is lambda_max. The default exponent 0.5 (the square root) turns
-    eigenvalues into frequencies.
-
     **Arguments:**
 
-    - `exponent`: a single positive number, or an array of shape (). The default is 0.5.
+    - `exponent`: a single positive number, or an array of shape (). The default is 0.5: the square root turns
+      eigenvalues into frequencies.
 
     **Raises:** `ValueError` if the exponent is not a single positive, finite number.
     """
@@ -124,9 +112,6 @@ class SpectralDistribution(Warp):
     equal numbers of eigenvalues. Only the windows at both ends of the spectrum pass fewer eigenvalues. The
     warp is that of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and
     vertex-frequency frames", 2015. It has no parameters.
-
-    A call takes points (p,) and a shape's eigenvalues (k,), as for every `Warp`. The call returns the warped
-    points (p,), which are numbers from 0 to k - 1 without unit.
 
     An eigenvalue that occurs once is mapped to its index, counted from 0. A repeated eigenvalue is mapped to
     the mean of its indices, so a bank treats all functions of an eigenspace equally. If no eigenvalue is

@@ -53,17 +53,10 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
     **Arguments:**
 
-    - `levels`: the number of eigenvectors (the level) of each iteration. Any iterable of integers of at least
-      1, such as a tuple, a list or a range, is accepted and stored as a tuple. If a level exceeds the number
-      of available eigenvectors, the iteration uses all eigenvectors. If X and Y have different numbers of
-      eigenvectors, a level applies to the shape with more eigenvectors, and the other shape uses a
-      proportional number. Iterations after the last level use all eigenvectors. If `levels` is empty (the
-      default), all iterations use all eigenvectors.
-    - `search`: the nearest-neighbour search that matches all vertices. Samples are always matched by
-      exhaustive search. `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` skips
-      patches of Y that are too far away. The search in patches compares only eigenvectors and ignores
-      descriptors, so its matches can differ from those of `"exhaustive"`. `"auto"` chooses `"patches"` on
-      CPUs if the geometric mean of the numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
+    - `levels`: the number of eigenvectors of each iteration, which `CoarseToFine` describes.
+    - `search`: the nearest-neighbour search that matches all vertices, which `CoarseToFine` describes. The
+      search in patches compares only eigenvectors and ignores descriptors, so its matches can differ from
+      those of `"exhaustive"`.
 
     **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
     `search` is unknown.
@@ -168,23 +161,14 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def _eigenvector_embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """Return the first k_x coordinates of the `embeddings`, which depend only on eigenvectors.
-
-        In these coordinates, the vertices of a patch are close together. The search in patches therefore uses
-        only these coordinates.
-        """
+        """Return the first k_x coordinates, in which the vertices of a patch are close together."""
         k = prepared.spectrum_x.eigenvalues.shape[0]
         queries, database = self.embeddings(prepared, state)
         return queries[:, :k], database[:, :k]
 
 
 class _Features(NamedTuple):
-    """The features, weights and mask of the vertices of one shape.
-
-    Each row of `values` contains the values of the eigenvectors at a vertex, and then the descriptors and the
-    crease eigenvectors if the spectrum has them. The weights are the vertex areas, scaled so that they sum
-    to 1.
-    """
+    """The eigenvectors, descriptors and crease eigenvectors of a shape, and vertex weights with sum 1."""
 
     values: Float[Array, "n d"]
     weights: Float[Array, " n"]
@@ -302,10 +286,7 @@ class _Moments(NamedTuple):
 def _regress(
     moments: _Moments, active_x: Bool[Array, " k_x"], active_y: Bool[Array, " k_y"]
 ) -> tuple[Float[Array, "k_x k_y"], Prediction]:
-    """Return the functional map, and the prediction of the features of X from the features of Y.
-
-    The functional map and the prediction use only the active eigenvectors.
-    """
+    """Return the functional map and the prediction of X from Y, which use only active eigenvectors."""
     k_x, k_y = active_x.shape[0], active_y.shape[0]
     descriptors = moments.xx.shape[0] - k_x
     keep_x, keep_y = (jnp.pad(k, (0, descriptors), constant_values=True) for k in (active_x, active_y))

@@ -21,18 +21,11 @@ class Solution(eqx.Module, Generic[PreparedT]):
     The refiner `WaveletPreservation` takes a solution as its argument `solution`. Ready subclasses are
     `Filtering` (the default), `LeastSquares`, `RegularizedLeastSquares` and `NearestOrthogonal`.
 
-    A subclass must define `solve(problem, prepared, pointwise_map, previous)`, which returns C (k_out, k_in)
-    and a status code (`RESULTS`). The argument `problem` is the `WaveletProblem` of both shapes, and
-    `prepared` contains the values that `prepare` returned. The argument `pointwise_map` is the map T: X -> Y.
-    T is an integer array (m,) with one 0-based vertex of Y per vertex of X, or a `SoftMap` or
-    `SparseSoftMap`. The argument `previous` is the functional map (k_out, k_in) of the previous iteration
-    (None in the first iteration). C has no unit. In the pullback convention (the default), C maps functions
-    on Y ("in") to functions on X ("out"), so C has shape (k_X, k_Y). In the pushforward convention, C maps
-    functions on X ("in") to functions on Y ("out"), so C has shape (k_Y, k_X).
-
-    A subclass may also define `prepare(problem)`. This method computes, once per refinement, values that
-    `solve` needs in every iteration. The class is generic: if these values have the type `Values`, the
-    subclass derives from `Solution[Values]`.
+    A subclass must define `solve`, and may define `prepare`, which computes values that `solve` needs in
+    every iteration. The class is generic: if these values have the type `Values`, the subclass derives from
+    `Solution[Values]`. In the pullback convention (the default), C maps functions on Y ("in") to functions on
+    X ("out"), so C has shape (k_X, k_Y). In the pushforward convention, C maps functions on X ("in") to
+    functions on Y ("out"), so C has shape (k_Y, k_X).
     """
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:

@@ -43,20 +43,11 @@ class Filtering(Solution[PreparedFiltering]):
     are the filters of the bank. The diagonal matrix Lambda_out contains the eigenvalues of the shape that C
     maps to. The diagonal matrix Lambda_in contains the eigenvalues of the shape that C maps from. The sum
     equals the elementwise product of C_0 and the `multiscale_kernel` of the bank, so no linear system is
-    solved. Pass a `Filtering` object to `WaveletPreservation` as the argument `solution`.
+    solved.
 
     If the bank is a Parseval frame, C minimises the wavelet-preservation energy in the area norm. In the
     default pullback convention, C is the exact minimiser only if T preserves area; otherwise C is only close
     to the minimiser. If the bank is not a Parseval frame, C does not minimise this energy.
-
-    `solve(problem, prepared, pointwise_map, previous)` returns C (k_out, k_in) and `RESULTS.successful`. C
-    and C_0 have the same shape and no unit. `problem` is the `WaveletProblem` of both shapes, and `prepared`
-    is the result of `prepare`. `pointwise_map` is the map T: X -> Y. T is an integer array (m,) with one
-    0-based vertex of Y per vertex of X, or a `SoftMap` or `SparseSoftMap`. `previous` is ignored.
-
-    In the pullback convention (the default), C maps functions on Y ("in") to functions on X ("out"), so C has
-    shape (k_X, k_Y). In the pushforward convention, C maps functions on X ("in") to functions on Y ("out"),
-    so C has shape (k_Y, k_X).
 
     **Arguments:**
 
@@ -98,12 +89,8 @@ class NearestOrthogonal(Solution[PreparedT]):
 
     The new map (k_out, k_in) has no unit. It has orthonormal columns, or orthonormal rows if k_out is below
     k_in. With `solution=Filtering()` and the bank `Identity()`, this solution is the update of spectral ICP
-    (Ovsjanikov et al. 2012). Pass a `NearestOrthogonal` object to `WaveletPreservation` as the argument
-    `solution`.
-
-    `solve(problem, prepared, pointwise_map, previous)` has the arguments and the shapes that `Solution.solve`
-    describes. The status code is that of the other solution. If the other solution's map contains NaN, all
-    entries of the new map are NaN.
+    (Ovsjanikov et al. 2012). The status code is that of the other solution. If the other solution's map
+    contains NaN, all entries of the new map are NaN.
 
     **Arguments:**
 
@@ -132,17 +119,7 @@ class LeastSquares(Solution[None]):
     """The solution that minimises the wavelet-preservation energy exactly, for any frame.
 
     Equation (5) of the MWP paper defines the energy. One Cholesky factorisation of the energy's gram matrix
-    (k_in, k_in) gives the minimiser C (k_out, k_in). Pass a `LeastSquares` object to `WaveletPreservation` as
-    the argument `solution`.
-
-    `solve(problem, prepared, pointwise_map, previous)` returns C (k_out, k_in), without unit, and a status
-    code. `problem` is the `WaveletProblem` of both shapes. `pointwise_map` is the map T: X -> Y. T is an
-    integer array (m,) with one 0-based vertex of Y per vertex of X, or a `SoftMap` or `SparseSoftMap`.
-    `prepared` and `previous` are ignored.
-
-    In the pullback convention (the default), C maps functions on Y ("in") to functions on X ("out"), so C has
-    shape (k_X, k_Y). In the pushforward convention, C maps functions on X ("in") to functions on Y ("out"),
-    so C has shape (k_Y, k_X).
+    (k_in, k_in) gives the minimiser C (k_out, k_in).
 
     The status code is `RESULTS.successful`, `RESULTS.undetermined_functional_map` or
     `RESULTS.singular_system`. The functional map is undetermined if all filters are zero at an eigenvalue of

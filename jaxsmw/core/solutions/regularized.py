@@ -40,8 +40,7 @@ def _as_weight(value: ArrayLike | None) -> Array | None:
 class RegularizedLeastSquares(Solution[None]):
     """An iterative solution that minimises a sum of the wavelet-preservation energy and other terms.
 
-    Pass a `RegularizedLeastSquares` object to `WaveletPreservation` as the argument `solution`. The
-    functional map C (k_out, k_in) minimises a weighted sum of five terms:
+    The functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
     - Wavelet preservation is the energy of equation (5) of the MWP paper.
     - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrix Lambda_out contains
@@ -66,13 +65,6 @@ class RegularizedLeastSquares(Solution[None]):
     The solver starts from the functional map of the previous iteration; in the first iteration, it starts
     from an estimate. C is differentiable: its derivatives are computed by implicit differentiation at the
     minimum.
-
-    `solve(problem, prepared, pointwise_map, previous)` returns C (k_out, k_in), without unit, and a status
-    code. `problem` is the `WaveletProblem` of both shapes, and `prepared` is ignored. `pointwise_map` is the
-    map T: X -> Y. T is an integer array (m,) with one 0-based vertex of Y per vertex of X, or a `SoftMap` or
-    `SparseSoftMap`. `previous` is the functional map of the previous iteration, or None. In the pullback
-    convention (the default), "in" is Y and "out" is X. In the pushforward convention, "in" is X and "out" is
-    Y.
 
     The status code is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
     `RESULTS.singular_system`, `RESULTS.nonfinite_functional_map` and `RESULTS.solver_not_converged`.
@@ -203,10 +195,7 @@ class RegularizedLeastSquares(Solution[None]):
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
         initial: Float[Array, "k_out k_in"] | None,
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Implement `solve` and `minimize`.
-
-        `descriptors` contains the descriptors of the shape that C maps to, and then those of the other shape.
-        """
+        """Implement `solve` and `minimize`; `descriptors` are in the order (out, in)."""
         quadratic = self._quadratic_energy(
             energy, descriptors, (eigenvalues_out.size, eigenvalues_in.size), eigenvalues_in.dtype
         )
@@ -286,12 +275,7 @@ class RegularizedLeastSquares(Solution[None]):
         initial: Float[Array, "k_out k_in"],
         solvable: Bool[Array, ""],
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Minimise the sum of the squared residuals. The variable of the solver is `C / unit`, elementwise.
-
-        Return the functional map and `RESULTS.successful` or `RESULTS.solver_not_converged`.
-
-        If `solvable` is False, the residuals are replaced by zeros, so the solver stops immediately.
-        """
+        """Minimise over `C / unit`. Unless `solvable`, all residuals are zero and the solver stops."""
         # The imports are inside the method because importing both packages takes as long as computing an
         # eigenbasis.
         import lineax as lx
@@ -318,11 +302,7 @@ class RegularizedLeastSquares(Solution[None]):
 class _Term(NamedTuple):
     """One term of the objective: the squared norm of a residual.
 
-    **Attributes:**
-
-    - `residual`: the residual as a function of C.
-    - `curvature`: half the second derivative of the term with respect to each entry of C; None if the term is
-      not quadratic.
+    `curvature` is half the second derivative with respect to each entry of C, or None if it is not constant.
     """
 
     residual: Callable[[Float[Array, "k_out k_in"]], Array]
@@ -330,12 +310,9 @@ class _Term(NamedTuple):
 
 
 def _energy_term(energy: QuadraticEnergy) -> _Term:
-    """Return the energy, up to a constant, as the squared norm of a residual (k_out, k_in).
-
-    The energy is a sum of squares over many columns. The columns can be replaced by the Cholesky factor of
-    the gram matrix, because the factor has the same inner products as the columns. The rounding error
-    is added to the diagonal, because a singular matrix has no Cholesky factor.
-    """
+    """Return the energy, up to a constant, as the squared norm of a residual (k_out, k_in)."""
+    # The energy is a sum of squares over many columns. The Cholesky factor of the gram matrix has the same
+    # inner products as these columns. A singular matrix has no factor, so the rounding error is added.
     (k_out, k_in), dtype = energy.cross.shape, energy.gram.dtype
     factor = cholesky(energy.gram + rounding(energy.gram) * jnp.eye(k_in, dtype=dtype))
     target = solve_lower(factor, energy.cross.T).T
