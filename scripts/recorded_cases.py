@@ -92,7 +92,7 @@ woman-gorilla: tosca_nonisometric/off/8_woman_01.off | coarse 1500
 glued: shrec16_topology/kid01.off | coarse 1500 -> shrec16_topology/kid15.off | coarse 1500: accurate paper
 molars: primate_molars/U05_sas.off | coarse 1500 -> primate_molars/H10_sas.off | coarse 1500:
     accurate aligned not-mirrored
-opposite-molars: primate_molars/U05_sas.off | coarse 1500 -> primate_molars/J12_sas.off | coarse 1500:
+opposite-molars: primate_molars/U05_sas.off | coarse 1500 -> primate_molars/K08_sas.off | coarse 1500:
     accurate mirrored not-mirrored paper
 shells: open_shells/mask.off -> open_shells/head.off: unknown-scale accurate
 parts: partial_smal/shapes/cuts_0_dog_01.off -> partial_smal/shapes/cuts_9_lion_01.off: partial
@@ -118,7 +118,7 @@ skulls: mouse_skulls/CAST_EIJ.ply -> mouse_skulls/PWK.ply: paper fast
 """
 FOUR = [f"quadruped {vertices} 0 {side}" for vertices in (700, 720) for side in ("source", "target")]
 MIRRORED = [FOUR[0], f"{FOUR[1]} | mirrored", *FOUR[2:]]
-TEETH = [f"primate_molars/{name}_sas.off | coarse 1500" for name in ("B03", "K03", "H10", "J12")]
+TEETH = [f"primate_molars/{name}_sas.off | coarse 1500" for name in ("B03", "K03", "H10", "P31")]
 PEOPLE = [f"faust_r/off/tr_reg_0{number}.off | coarse 1500" for number in ("00", "11", "23", "35")]
 # The commands run in a directory with the files that `command` writes.
 COMMANDS = {
