@@ -141,9 +141,9 @@ def test_memory_determines_the_batch_size(monkeypatch):
     sizes = []
     original = batch.compiled(batch._refine_batch)
 
-    def spy(refiner, pairs, *rest):
+    def spy(pairs, *rest):
         sizes.append(len(pairs[-1]))
-        return original(refiner, pairs, *rest)
+        return original(pairs, *rest)
 
     monkeypatch.setattr(batch, "compiled", lambda function: spy)
     monkeypatch.setattr(batch, "_one_at_a_time", lambda device: False)

@@ -89,7 +89,7 @@ def test_impossible_numbers_are_refused(number):
 
 
 def test_stages_refuse_a_negative_number():
-    with pytest.raises(InputError, match="-1 crease eigenvectors were requested: give 0 or more"):
+    with pytest.raises(InputError, match="number_of_crease_eigenvectors is -1"):
         Stage(FeatureRegression((5,)), number_of_crease_eigenvectors=-1)
 
 

@@ -552,7 +552,7 @@ def test_arguments_of_wrong_types_are_named():
         "the levels are (3.5,), but they must be integers",
         "the levels are 35, but they must be integers",
         "(35, 60) 2",
-        "iterations is True: give a whole number.",
+        "iterations is True: give a whole number of at least 1.",
         "repair is 'accurate': give RepairSettings or None.",
         "the samples of X is list, but an array is needed",
         "the mesh is 'mesh.off', but a Mesh is needed",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
 import equinox as eqx
 import jax
@@ -19,6 +19,7 @@ from jaxsmw.core.refiner import Prepared, Problem, Refiner, Samples, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
 
 
 class History(eqx.Module):
@@ -94,6 +95,18 @@ class Refinement(eqx.Module):
             history = dataclasses.replace(history, pointwise_maps=maps)
         kept = self.pointwise_map[:number_of_vertices]
         return dataclasses.replace(self, pointwise_map=kept, history=history)
+
+
+class RefineSettings(TypedDict, total=False):
+    """The arguments of `refine` that are the same for all pairs of a batch."""
+
+    refiner: Refiner
+    iterations: int
+    starts_on_samples: bool
+    ends_on_samples: bool
+    partial: bool
+    stop_when_unchanged: bool
+    history: bool
 
 
 @counts_iterations
@@ -373,19 +386,19 @@ def _check_arguments(
 def check_samples_use(refiner: Refiner, sampled: bool, starts: bool, ends: bool) -> None:
     """Check the arguments `starts_on_samples` and `ends_on_samples` of `refine`.
 
-    **Raises:** `ValueError` if one of the two arguments is True, but there are no samples, or
+    **Raises:** `InputError` if one of the two arguments is True, but there are no samples, or
     `refiner.matches_samples_with_all` is False.
     """
     if not (starts or ends):
         return
     if not sampled:
-        raise ValueError(
-            "refinement cannot start or end on samples, because there are no samples: give samples"
+        raise InputError(
+            "refinement cannot start or end on samples, because there are no samples: give samples."
         )
     if not refiner.matches_samples_with_all:
-        raise ValueError(
+        raise InputError(
             f"{type(refiner).__name__} matches samples of X with samples of Y, so refinement cannot start or "
-            "end on samples: use FeatureRegression or Registration"
+            "end on samples: use FeatureRegression or Registration."
         )
 
 

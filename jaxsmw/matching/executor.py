@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int64, PyTree
 
-from jaxsmw.core.refinement import Refinement, refine
+from jaxsmw.core.refinement import Refinement, RefineSettings, refine
 from jaxsmw.core.refiner import Problem, Refiner, Samples, State
 from jaxsmw.core.refiner import reverse_map as reverse_map_of_state
 from jaxsmw.core.results import RESULTS
@@ -215,7 +215,7 @@ def _run_one(stages: Sequence[Stage], seen: Sequence[SpectralPair], start: Start
         if _compiling:
             key = _key(stage, (x, y, matches, samples), partial, history)
             wait([program] if (program := _compiling.pop(key, None)) else [])
-        settings = {**stage.settings, "partial": partial, "history": history}
+        settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
         found = compiled(refine)(x, y, matches, samples=samples, **settings)
         refinements.append(found)
         matches = found.pointwise_map
@@ -315,7 +315,7 @@ def compile_stage(
 
     key = _key(stage, jax.eval_shape(arguments), partial, history)
     if key not in _compiling:  # stages that differ only in their levels share a program
-        settings = {**stage.settings, "partial": partial, "history": history}
+        settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
         _compiling[key] = compile_ahead(refine, arguments, **settings)
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Float64, Int, Int64, Shaped
 
 from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.creases import crease_eigenvectors
 from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.mesh import Mesh
@@ -238,15 +238,6 @@ class DescriptorAxes(NamedTuple):
         return with_descriptors(shape, self.principal.components(_shot_rows(shape, self.radii).astype(dtype)))
 
 
-def check_number_of_descriptors(number: int) -> None:
-    """Check that SHOT has a number of principal components.
-
-    **Raises:** `InputError` if the number is not from 1 to 352.
-    """
-    if not 1 <= number <= SHOT_DIMENSION:
-        raise InputError(f"{number} descriptors were requested: give a number from 1 to {SHOT_DIMENSION}.")
-
-
 def with_descriptors(shape: PreparedShape, components: Float[np.ndarray, "a d"]) -> PreparedShape:
     """Return a shape with descriptors, given at its compared vertices (a, d)."""
     everywhere = shape.everywhere(components) * np.asarray(shape.spectrum.mask)[:, None]
@@ -426,7 +417,7 @@ class PreparedPair:
         - `required`: whether to raise `InputError` if a mesh is too coarse for descriptors. If False, the
           function issues a `UserWarning` instead, and the result has no descriptors.
         """
-        check_number_of_descriptors(number_of_descriptors)
+        check_whole_number("number_of_descriptors", number_of_descriptors, 1, SHOT_DIMENSION)
         try:
             shot = [self.shot]
         except InputError as error:

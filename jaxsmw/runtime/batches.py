@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple, TypedDict, TypeVar
+from typing import NamedTuple, TypeVar, Unpack
 
 import equinox as eqx
 import jax
@@ -15,10 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, Int32
 
-from jaxsmw.choices import ITERATIONS
-from jaxsmw.core.refinement import Refinement, refine
-from jaxsmw.core.refiner import Refiner
-from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.refinement import Refinement, RefineSettings, refine
 from jaxsmw.core.search import queries_per_block
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
@@ -79,17 +76,11 @@ def refine_pairs(
     pairs: Sequence[tuple[int, int]],
     pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     *,
-    refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
-    iterations: int = ITERATIONS,
     samples: Sequence[Int[Array, " _"]] | None = None,
-    starts_on_samples: bool = False,
-    ends_on_samples: bool = False,
-    partial: bool = False,
-    stop_when_unchanged: bool = False,
-    history: bool = False,
     batch_size: int | None = None,
     memory: int | None = None,
     devices: Sequence[jax.Device] | None = None,
+    **settings: Unpack[RefineSettings],
 ) -> Iterator[tuple[int, Refinement]]:
     """Refine many pairs of shapes, of equal or different sizes, in batches on all devices.
 
@@ -111,16 +102,8 @@ def refine_pairs(
       counted from 0. A pair may occur several times with different initial maps.
     - `pointwise_maps`: for each pair, the initial map T: X -> Y, an integer array (m,) with one 0-based
       vertex of Y per vertex of X.
-    - `refiner`: the method, a `Refiner` such as `WaveletPreservation()`.
-    - `iterations`: the number of iterations, an integer of at least 1.
     - `samples`: for each shape, an integer array (s,) of the 0-based vertices on which the refiner iterates.
       The number s must be the same for all shapes. If None, all iterations use all vertices.
-    - `starts_on_samples`, `ends_on_samples`: whether the first and the last step of each refinement use only
-      the samples; see `refine`.
-    - `partial`: whether one shape of each pair is a partial shape and the other shape is the full shape. If
-      True, both shapes must have the same unit of length.
-    - `stop_when_unchanged`: whether to stop the refinement of a pair when an iteration changes no match.
-    - `history`: whether to record a `History` of each pair.
     - `batch_size`: the number of pairs that each device receives at the same time. Accelerators refine these
       pairs at the same time, and CPUs refine them one after another. The default on CPUs is 1, because larger
       batches save no time there. On other devices, the default is the number of pairs that fit into `memory`,
@@ -128,6 +111,8 @@ def refine_pairs(
     - `memory`: the memory in bytes that a batch may use on each device if `batch_size` is None. The default
       is half of the device's memory.
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
+    - `settings`: the arguments of `refine` that all pairs share: `refiner`, `iterations`,
+      `starts_on_samples`, `ends_on_samples`, `partial`, `stop_when_unchanged` and `history`.
 
     **Returns:** An iterator over tuples of two elements: the 0-based index of a pair in `pairs`, and the
     `Refinement` of this pair. The iterator groups the pairs by their padded sizes, so their order differs
@@ -144,14 +129,6 @@ def refine_pairs(
     check_devices(devices)
     if batch_size is not None and batch_size < 1:
         raise InputError(f"batch_size is {batch_size}, but a batch needs at least 1 pair")
-    settings = _Settings(
-        iterations=iterations,
-        starts_on_samples=starts_on_samples,
-        ends_on_samples=ends_on_samples,
-        partial=partial,
-        stop_when_unchanged=stop_when_unchanged,
-        history=history,
-    )
     devices = jax.devices() if devices is None else devices
     mesh = Mesh(np.array(devices), ("pairs",))
 
@@ -175,7 +152,7 @@ def refine_pairs(
                     y.rows([pairs[p][1] for p in filled]),
                     jax.device_put(maps.astype(np.int32), NamedSharding(mesh, _DIVIDED)),
                 )
-                for position, one in zip(chosen, _refinements(refiner, batch, mesh, settings), strict=False):
+                for position, one in zip(chosen, _refinements(batch, mesh, settings), strict=False):
                     yield position, one.unpadded(len(pointwise_maps[position]))
 
     return results()
@@ -220,17 +197,6 @@ def _check_pairs(
                 f"the initial map of pair {position} has shape {pointwise_map.shape}, but X has "
                 f"{vertices[0]} vertices: give one vertex of Y for each vertex of X"
             )
-
-
-class _Settings(TypedDict):
-    """The arguments of `refine` that are the same for all pairs."""
-
-    iterations: int
-    starts_on_samples: bool
-    ends_on_samples: bool
-    partial: bool
-    stop_when_unchanged: bool
-    history: bool
 
 
 class _Sizes(NamedTuple):
@@ -303,11 +269,11 @@ def _take(tree: Tree, places: Int[Array, " batch"], mesh: Mesh) -> Tree:
     return lax.with_sharding_constraint(taken, NamedSharding(mesh, _DIVIDED))
 
 
-def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settings) -> Refinement:
+def _refine_batch(batch: _Batch, mesh: Mesh, settings: RefineSettings) -> Refinement:
     def one(pair: _Batch) -> Refinement:
         (spectrum_x, samples_x), (spectrum_y, samples_y), initial_map = pair
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
-        return refine(spectrum_x, spectrum_y, initial_map, refiner=refiner, samples=samples, **settings)
+        return refine(spectrum_x, spectrum_y, initial_map, samples=samples, **settings)
 
     # CPUs use `lax.map`, because a batch of pairs takes more time than the pairs one after another.
     each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
@@ -320,10 +286,10 @@ def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settin
     return lax.with_sharding_constraint(refined, NamedSharding(mesh, _DIVIDED))
 
 
-def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settings) -> Iterator[Refinement]:
+def _refinements(batch: _Batch, mesh: Mesh, settings: RefineSettings) -> Iterator[Refinement]:
     """Refine a batch and yield the refinement of each pair."""
     with one_blas_thread():
-        refined = compiled(_refine_batch)(refiner, batch, mesh, settings)
+        refined = compiled(_refine_batch)(batch, mesh, settings)
         refined = multihost_utils.process_allgather(refined, tiled=True)
     for row in range(len(batch.initial_maps)):
         yield jax.tree.map(lambda leaf, row=row: jnp.asarray(leaf[row]), refined)
