@@ -5,9 +5,8 @@ from __future__ import annotations
 import functools
 import warnings
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -114,20 +113,21 @@ class Correspondence:
                 else ""
             )
             raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
-        extended = extend_to_unreferenced(prepared.pair.mesh_x, outcome.pointwise_map)
-        found, left_out = pair.with_small_components(extended)
+        initial_map, refined_map = (
+            extend_to_unreferenced(prepared.pair.mesh_x, matches)
+            for matches in (outcome.initial_map, outcome.pointwise_map)
+        )
+        pointwise_map, left_out = pair.with_small_components(refined_map)
         seen = prepared.spectra.seen_by(preset.stages[-1])
         return cls(
             pair=pair,
-            pointwise_map=found,
-            initial_map=outcome.initial_map,
+            pointwise_map=pointwise_map,
+            initial_map=initial_map,
             init=start.origin if start.origin in INITIAL_MAPS else None,
             preset=preset,
             spectrum_x=seen.x.reflect() if prepared.mirrored else seen.x,
             spectrum_y=seen.y,
-            refinement=eqx.tree_at(
-                lambda tree: tree.pointwise_map, last, jax.device_put(found.astype(np.int32))
-            ),
+            refinement=replace(last, pointwise_map=jax.device_put(pointwise_map.astype(np.int32))),
             iterations=sum(int(refinement.iterations) for refinement in outcome.refinements),
             distortion=scored.distortion,
             suspicious=scored.suspicious,

@@ -71,21 +71,24 @@ def initial_map(
     another mesh, a mesh that is too coarse for SHOT, or signatures that are not finite. `ArithmeticError` if
     the functional map of `"functional"` cannot be computed.
     """
-    check_initial_map(pair, init)
-    return make_start(PreparedPair.of(pair, spectrum_x, spectrum_y), init).pointwise_map
+    start = make_start(PreparedPair.of(pair, spectrum_x, spectrum_y), init)
+    return extend_to_unreferenced(pair.mesh_x, start.pointwise_map)
 
 
 def make_start(prepared: PreparedPair, init: InitialMap | ArrayLike | SurfacePoints) -> Start:
-    """Return the start of a prepared pair from the initial map that `initial_map` describes."""
-    given, mesh_x = check_initial_map(prepared.pair, init), prepared.pair.mesh_x
-    if isinstance(given, str):
-        found = nearest_map(prepared, _finite(prepared, given, FEATURES[given](prepared)))
-        return Start(extend_to_unreferenced(mesh_x, found), given)
-    if given.ndim == 1:
-        return Start(extend_to_unreferenced(mesh_x, given), "map")
-    found = nearest_map(prepared, _finite(prepared, "landmark", _landmark_features(prepared, given)))
-    found[given[:, 0]] = given[:, 1]
-    return Start(extend_to_unreferenced(mesh_x, found), "landmarks")
+    """Return the start of a prepared pair from the initial map that `initial_map` describes.
+
+    The matches of unreferenced vertices have no meaning.
+    """
+    init = check_initial_map(prepared.pair, init)
+    if isinstance(init, str):
+        return Start(nearest_map(prepared, _finite(prepared, init, FEATURES[init](prepared))), init)
+    if init.ndim == 1:
+        return Start(init, "map")
+    features = _finite(prepared, "landmark", _landmark_features(prepared, init))
+    pointwise_map = nearest_map(prepared, features)
+    pointwise_map[init[:, 0]] = init[:, 1]
+    return Start(pointwise_map, "landmarks")
 
 
 def check_initial_map(
