@@ -478,9 +478,9 @@ def prepare(
 def pair_up(pair: Pair, x: PreparedShape, y: PreparedShape, *, trimmed: bool = False) -> PreparedPair:
     """Return the prepared pair of two prepared shapes.
 
-    Two full shapes keep their own units, in which each has area 1. The shapes of a partial pair are scaled by
-    one common factor, so that the larger shape has area 1. Their spectra are then cut at a common limit; see
-    `common_range`.
+    Two full shapes keep their own units, in which each has area 1. This compensates for a difference in size.
+    The shapes of a partial pair are scaled by one common factor, so that the larger shape has area 1. Their
+    spectra are then cut at a common limit; see `common_range`.
 
     **Arguments:**
 
@@ -506,26 +506,19 @@ def paired_spectra(
 ) -> tuple[Spectrum, Spectrum]:
     """Compute the spectra of the two meshes of a pair in comparable units.
 
-    Two full shapes are each scaled to area 1, which compensates for a difference in size. The shapes of a
-    partial pair are scaled by one common factor, so that the larger shape has area 1. For a partial pair, the
-    spectra are then cut at a common limit. The limit is the largest eigenvalue of X or the largest eigenvalue
-    of Y, whichever is smaller. Eigenpairs with eigenvalues above this limit are removed, so k_X and k_Y
-    usually differ for a partial pair.
+    Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by one common factor,
+    and their spectra are cut at a common limit; see `pair_up`.
 
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
     - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh. It must be at
       least 1, and less than the number of referenced vertices of each mesh.
-    - `laplacian`: the discretization of the Laplacian. `"cotangent"` is the usual discretization. `"robust"`
-      also handles non-manifold and badly shaped meshes. `"auto"` chooses `"robust"` for a mesh with
-      degenerate triangles or edges with more than two faces, else `"cotangent"`.
-    - `eigensolver`: `"exact"`, or `"approximate"`, which takes less time on large meshes. `"auto"` chooses
-      `"approximate"` for both meshes if one mesh has at least 50 000 referenced vertices, else `"exact"`.
+    - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`. Both meshes get the same eigensolver.
 
     **Returns:** Two spectra, each a `Spectrum` with positions and normals, in `Pair.units_of_length`. The
     spectrum of X has m vertices and k_X eigenvectors. The spectrum of Y has n vertices and k_Y eigenvectors.
-    For two full shapes, k_X = k_Y = k.
+    For two full shapes, k_X = k_Y = k. For a partial pair, k_X and k_Y usually differ.
 
     **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if all
     eigenvalues of a mesh are zero. For a partial pair, `InputError` is also raised if the area of one mesh is
