@@ -274,7 +274,8 @@ def test_refinement_can_start_and_end_on_samples(pair):
     maps, state = [initial_map[samples[0]]], None
     for _ in range(3):
         state, _ = refiner.update(prepared, maps[-1], state)
-        maps.append(refiner.recover(prepared, state))
+        after, state = refiner.recover_both(prepared, state)
+        maps.append(after)
     options = dict(refiner=refiner, iterations=3, samples=samples, starts_on_samples=True, history=True)
     others = np.setdiff1d(np.arange(M), samples[0])
     # The entries of other vertices may be missing.

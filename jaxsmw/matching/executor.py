@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int64, PyTree
 
 from jaxsmw.core.refinement import Refinement, RefineSettings, refine
-from jaxsmw.core.refiner import Problem, Refiner, Samples, State
-from jaxsmw.core.refiner import reverse_map as reverse_map_of_state
+from jaxsmw.core.refiner import Problem, Refiner, Samples, State, recover_reverse
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
@@ -338,7 +337,7 @@ def reverse_map(refiner: Refiner, spectra: SpectralPair, state: State) -> Int64[
     - `spectra`: the spectra that the stage has seen, without padding; see `SpectralPair.seen_by`.
     - `state`: the `State` of the refiner.
     """
-    found = compiled(reverse_map_of_state)(refiner, _problem(spectra), state)
+    found = compiled(recover_reverse)(refiner, _problem(spectra), state)
     return np.asarray(found)[: spectra.y.mask.shape[0]].astype(np.int64)
 
 

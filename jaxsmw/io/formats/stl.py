@@ -7,7 +7,8 @@ import re
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import coincident_vertices, first_equal_rows
+from jaxsmw.geometry.arrays import first_equal_rows
+from jaxsmw.geometry.mesh import coincident_vertices
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions
 from jaxsmw.io.formats.text import numbers, text
 from jaxsmw.io.mesh_data import MeshData
