@@ -20,7 +20,7 @@ from synthetic import bumpy_mesh
 
 from jaxsmw import InputError, make_mesh, read_mesh, write_mesh
 from jaxsmw.choices import EDGES_PER_SHAPE
-from jaxsmw.collection import edge_matcher, match_collection
+from jaxsmw.collection import edges, match_collection
 from jaxsmw.collection.files import write_registered
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
@@ -70,7 +70,7 @@ def error(collection, shapes, i, j):
 def matched(monkeypatch):
     """The pairs that a call matches, as lists of names."""
     pairs = []
-    original = edge_matcher.match_edges
+    original = edges.match_edges
 
     def recording(tasks, *arguments):
         def noted():
@@ -80,7 +80,7 @@ def matched(monkeypatch):
 
         return original(noted(), *arguments)
 
-    monkeypatch.setattr(edge_matcher, "match_edges", recording)
+    monkeypatch.setattr(edges, "match_edges", recording)
     return pairs
 
 
@@ -138,6 +138,13 @@ def test_a_second_call_matches_nothing_and_gives_the_same_result(meshes, work, f
     assert again.edges == found.edges
 
 
+def test_maps_of_another_eigensolver_are_not_reused(meshes, work, found, matched, monkeypatch):
+    """A large mesh that is added to a collection changes the eigensolver of all shapes."""
+    monkeypatch.setattr("jaxsmw.collection.matching.choose_eigensolver", lambda *_: "approximate")
+    match_collection(meshes, preset="paper", edges_per_shape=2, mirror="no", directory=work)
+    assert len(matched) >= len(found.edges)
+
+
 def test_an_interrupted_call_continues(meshes, found, matched, tmp_path):
     class Interrupted(Exception):
         pass
@@ -193,7 +200,7 @@ def test_an_unusable_mesh_is_left_out_and_named(meshes, found, work):
 
 def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch):
     """The first match of one pair maps every vertex to the mirror image of its match."""
-    original = edge_matcher.match_edges
+    original = edges.match_edges
 
     def corrupting(tasks, *arguments):
         tasks = list(tasks)
@@ -201,16 +208,15 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
             if task.init is None and (task.x.mesh.name, task.y.mesh.name) == ("shape1", "shape3"):
                 shuffled = np.random.default_rng(0).permutation(len(edge.forward))
                 back = np.random.default_rng(1).permutation(len(edge.backward))
-                edge = edge_matcher.EdgeMap(
+                edge = edges.EdgeMap(
                     edge.forward[shuffled],
                     edge.backward[back],
                     edge.expected_error,
                     edge.distortion,
-                    edge.suspicious,
                 )
             yield edge
 
-    monkeypatch.setattr(edge_matcher, "match_edges", corrupting)
+    monkeypatch.setattr(edges, "match_edges", corrupting)
     options = {"preset": "paper", "edges_per_shape": 2, "mirror": "no", "directory": tmp_path}
     result = match_collection(meshes, **options)
     (edge,) = (edge for edge in result.edges if (edge.source, edge.target) == (1, 3))
@@ -228,7 +234,7 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
 
 
 def test_a_mesh_whose_matches_all_fail_is_named(meshes, monkeypatch):
-    original = edge_matcher.match_edges
+    original = edges.match_edges
 
     def failing(tasks, *arguments):
         for task in tasks:
@@ -237,7 +243,7 @@ def test_a_mesh_whose_matches_all_fail_is_named(meshes, monkeypatch):
             else:
                 yield from original(iter([task]), *arguments)
 
-    monkeypatch.setattr(edge_matcher, "match_edges", failing)
+    monkeypatch.setattr(edges, "match_edges", failing)
     with pytest.raises(ArithmeticError, match="failed numerically: shape4"):
         match_collection(meshes, preset="paper", edges_per_shape=2, mirror="no")
 
@@ -277,7 +283,7 @@ def test_bad_arguments_are_refused(meshes, arguments, message):
 
 
 def test_tasks_of_workers_are_kept_in_the_directory(meshes, work, found, monkeypatch):
-    monkeypatch.setattr(edge_matcher, "TemporaryDirectory", None)
+    monkeypatch.setattr(edges, "TemporaryDirectory", None)
     with ThreadPoolExecutor(1) as executor:
         again = match_collection(
             meshes, preset="paper", edges_per_shape=2, mirror="no", directory=work, executor=executor

@@ -370,7 +370,7 @@ def test_batches_are_not_refined_a_second_time(three, monkeypatch):
 
 def test_the_first_failure_of_a_batch_is_reported(three, monkeypatch):
     """Later stages start from the map of the failure, and must not hide its reason."""
-    shape = prepare_shape(three[0], PRESETS["paper"])
+    shape = prepare_shape(three[0], PRESETS["paper"], "exact")
     eigenvectors = shape.spectrum.eigenvectors.at[0, 0].set(jnp.nan)
     broken = SpectralPair(shape.spectrum, replace(shape.spectrum, eigenvectors=eigenvectors))
     identity = np.arange(len(three[0].vertices))

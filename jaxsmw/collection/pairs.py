@@ -41,9 +41,8 @@ def match_pairs(
     """Match any pairs of several full shapes.
 
     Spectra, descriptors and samples are computed once per shape. The descriptors of all shapes have the same
-    axes (`DescriptorAxes`), so a map can differ slightly from the map of `match`. On accelerators or on
-    several devices, pairs are refined in batches (`jaxsmw.refine_pairs`). On one CPU, pairs are refined one
-    after another. Maps are repaired as in `match`. Mirror images are not considered.
+    axes (`DescriptorAxes`), so a map can differ slightly from the map of `match`. On accelerators or several
+    devices, pairs are refined in batches. Mirror images are not considered.
 
     **Arguments:**
 
@@ -55,27 +54,27 @@ def match_pairs(
     - `batch_size`: the number of pairs that each device refines at the same time; see `refine_pairs`.
     - `devices`: the JAX devices. The default is all devices of the default backend.
 
-    **Returns:** An iterator over tuples. Each tuple contains the 0-based position of a pair in `pairs`, and
-    the `Correspondence` of this pair.
+    **Returns:** An iterator over tuples of the 0-based position of a pair in `pairs`, and its
+    `Correspondence`.
 
-    **Raises:** `InputError` if a mesh or an argument cannot be used, or if a pair contains a number that
-    belongs to no shape. The iterator raises `ArithmeticError` if the refinement of a pair fails numerically.
+    **Raises:** `InputError` if an argument is not as described. The iterator raises `ArithmeticError` if the
+    refinement of a pair fails numerically.
     """
-    given = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
-    checked = check_pairs(pairs, len(given), "pair")
+    uncut = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
+    checked = check_pairs(pairs, len(uncut), "pair")
     check_devices(devices)
     if batch_size is not None:
         check_whole_number("batch_size", batch_size, 1)
-    chosen = choose_preset(preset)
-    shapes, _ = prepare_collection(given, chosen)
+    preset = choose_preset(preset)
+    shapes, _ = prepare_collection(uncut, preset)
 
     def results() -> Iterator[tuple[int, Correspondence]]:
-        tasks = (prepare_task(shapes[i], shapes[j], given=Pair(given[i], given[j])) for i, j in checked)
-        matched = match_many(tasks, chosen, alternatives, batch_size=batch_size, devices=devices)
-        for number, found in enumerate(matched):
-            if isinstance(found, ArithmeticError):
-                raise found
-            yield number, found
+        tasks = (prepare_task(shapes[i], shapes[j], given=Pair(uncut[i], uncut[j])) for i, j in checked)
+        matched = match_many(tasks, preset, alternatives, batch_size=batch_size, devices=devices)
+        for number, result in enumerate(matched):
+            if isinstance(result, ArithmeticError):
+                raise result
+            yield number, result
 
     return results()
 
@@ -118,17 +117,10 @@ def match_many(
     batch_size: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[Correspondence | ArithmeticError]:
-    """Match many prepared pairs. The stages run in batches, except on one CPU without a batch size.
+    """Match prepared pairs, and yield their results in order, or the error of a failed refinement.
 
-    **Arguments:**
-
-    - `tasks`: each prepared pair with its starts; see `match_prepared`.
-    - `preset`: the stages and the repair. For each pair, the preset is adapted to small meshes.
-    - `alternatives`: whether repair tries alternative maps.
-    - `batch_size`, `devices`: see `jaxsmw.refine_pairs`.
-
-    **Returns:** An iterator over the results in the order of the tasks. If the refinement of a pair fails
-    numerically, its result is the `ArithmeticError`.
+    The stages run in batches, except on one CPU without a batch size. For each pair, the preset is adapted to
+    small meshes. The other arguments are those of `match_pairs`.
     """
     devices = jax.devices() if devices is None else devices
     batched = batch_size is not None or len(devices) > 1 or devices[0].platform != "cpu"

@@ -6,8 +6,7 @@ and come out have one entry per vertex of X.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, wait
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Int64, PyTree
+from jaxtyping import Array, Bool, Float, Int, Int64
 
 from jaxsmw.core.refinement import Refinement, RefineSettings, refine
 from jaxsmw.core.refiner import Problem, Refiner, Samples, State, recover_reverse
@@ -211,9 +210,6 @@ def _run_one(stages: Sequence[Stage], seen: Sequence[SpectralPair], start: Start
             excluded = jnp.asarray(pad_rows(start.excluded, len(spectra.x.mask)))
             spectra = replace(spectra, x=spectra.x.excluding(excluded))
         x, y, samples, partial = spectra.x, spectra.y, spectra.samples, spectra.partial
-        if _compiling:
-            key = _key(stage, (x, y, matches, samples), partial, history)
-            wait([program] if (program := _compiling.pop(key, None)) else [])
         settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
         found = compiled(refine)(x, y, matches, samples=samples, **settings)
         refinements.append(found)
@@ -279,22 +275,10 @@ def padded_map(pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
     return jax.device_put(padded.astype(np.int32))
 
 
-# The programs that are being compiled in the background; see `compile_stage`.
-_compiling: dict[Hashable, Future[object]] = {}
-
-
-def _key(stage: Stage, arrays: PyTree, partial: bool, history: bool) -> Hashable:
-    """Return what distinguishes the program of a stage from other programs. Levels are traced."""
-    sizes = tuple(leaf.shape for leaf in jax.tree.leaves(arrays))
-    return repr(stage.settings), sizes, partial, history
-
-
 def compile_stage(
     stage: Stage, number_x: int, number_y: int, *, partial: bool = False, history: bool = False
 ) -> None:
-    """Compile the program of a stage in the background. `run` waits for the program when it needs it.
-
-    Both shapes must have as many eigenvectors as the stage.
+    """Compile the program of a stage in the background. Both shapes must have its number of eigenvectors.
 
     **Arguments:**
 
@@ -312,10 +296,8 @@ def compile_stage(
         x, y = (_outline(stage, size) for size in sizes)
         return (x, y, jnp.zeros(sizes[0], jnp.int32)), {"samples": samples}
 
-    key = _key(stage, jax.eval_shape(arguments), partial, history)
-    if key not in _compiling:  # stages that differ only in their levels share a program
-        settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
-        _compiling[key] = compile_ahead(refine, arguments, **settings)
+    settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
+    compile_ahead(refine, arguments, **settings)
 
 
 def _outline(stage: Stage, number_of_vertices: int) -> Spectrum:

@@ -76,13 +76,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Int32
 
-from jaxsmw.benchmark.opponents.base import (
-    Method,
-    MethodInput,
-    PointwiseMap,
-    check_spectrum,
-    successful,
-)
+from jaxsmw.benchmark.opponents.base import Method, MethodInput, PointwiseMap, successful
 from jaxsmw.core.checks import all_finite
 from jaxsmw.core.functional_map import dual_eigenvectors, encode
 from jaxsmw.core.linear_algebra import product
@@ -90,6 +84,7 @@ from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import diagnose
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime.compilation import compiled
@@ -130,16 +125,16 @@ class SurfaceGradient(eqx.Module):
 
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> SurfaceGradient:
-        """Return the gradient operator of a mesh, in the spectrum's unit of length.
-
-        **Arguments:**
-
-        - `mesh`: the mesh, with n vertices and f faces.
-        - `spectrum`: the spectrum of the mesh, padded or not.
+        """Return the gradient operator of a mesh, in the unit of its spectrum, which may be padded.
 
         **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
         """
-        check_spectrum(mesh, spectrum)
+        rows, n = spectrum.mask.shape[0], len(mesh.vertices)
+        if rows < n:
+            raise InputError(
+                f"{mesh.name}: has {n} vertices, but its spectrum has {rows} rows: give the spectrum of this "
+                "mesh."
+            )
         scale = math.sqrt(float(jnp.sum(spectrum.vertex_areas)) / mesh.area)
         corners = scale * mesh.vertices[mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -158,15 +153,7 @@ class SurfaceGradient(eqx.Module):
         )
 
     def total_variation(self, function: Float[Array, " n"]) -> Float[Array, ""]:
-        """Return the total variation of a function: the integral of the gradient's length over the surface.
-
-        The Mumford-Shah term of the paper is the total variation if xi = 1. The length of the gradient is
-        smoothed at zero.
-
-        **Arguments:**
-
-        - `function`: the values at the vertices (n,).
-        """
+        """Return the integral of the gradient's length, smoothed at zero, for values at the vertices (n,)."""
         gradient = jnp.einsum("fc,fcd->fd", function[self.faces], self.hats)
         return jnp.sum(self.areas * _smoothed_norm(gradient, axis=1))
 
@@ -200,8 +187,7 @@ def partial_functional_map(
 ) -> PartialMap:
     """Match a partial shape X with a full shape Y by partial functional maps (Rodolà et al. 2017).
 
-    The function is pure and can be compiled. The result does not depend on the signs of eigenvectors or on
-    padding. The docstring of this module contains the equations.
+    The function is traced JAX code. The docstring of this module contains the equations.
 
     **Arguments:**
 
@@ -318,13 +304,8 @@ def eta(membership: Float[Array, " n"]) -> Float[Array, " n"]:
 def slanted_weights(k_x: int, k_y: int) -> Float[Array, "k_x k_y"]:
     """Return the weights W of the paper (k_x, k_y), which grow with the distance to a slanted diagonal.
 
-    The slanted diagonal starts at the first entry and moves k_x / k_y rows per column. The weight of an entry
-    is its distance to the diagonal, measured in entries, times `exp(-0.03 sqrt(i^2 + j^2))`. Rows i and
-    columns j are counted from 1.
-
-    **Arguments:**
-
-    - `k_x`, `k_y`: the numbers of rows and columns of the functional map, in the pullback convention.
+    The diagonal starts at the first entry and moves k_x / k_y rows per column. The weight of an entry is its
+    distance to the diagonal in entries, times `exp(-0.03 sqrt(i^2 + j^2))`, with i and j counted from 1.
     """
     row, column = jnp.meshgrid(*(jnp.arange(1, k + 1, dtype=float) for k in (k_x, k_y)), indexing="ij")
     slope = k_x / k_y
@@ -337,31 +318,19 @@ def fidelity(
     coefficients_x: Float[Array, "k_x functions"],
     coefficients_y: Float[Array, "k_y functions"],
 ) -> Float[Array, ""]:
-    """Return the fidelity term, which averages the column norms of `C A - B`.
+    """Return the fidelity term for C^T (k_x, k_y), A (k_x, functions) and B (k_y, functions).
 
-    The last column of the matrix `C A - B` belongs to the constant function, and each other column belongs to
-    a descriptor. The fidelity term is the norm of the last column plus the mean norm of the other columns.
-    The norms are smoothed at zero.
-
-    **Arguments:**
-
-    - `functional_map`: C in the pullback convention (k_x, k_y), the transpose of C in the formula.
-    - `coefficients_x`, `coefficients_y`: A (k_x, functions) and B (k_y, functions).
+    It is the norm of the last column of `C A - B`, which belongs to the constant function, plus the mean norm
+    of the other columns. The norms are smoothed at zero.
     """
     norms = _smoothed_norm(product(functional_map.T, coefficients_x) - coefficients_y, axis=0)
     return jnp.mean(norms[:-1]) + norms[-1]
 
 
 def map_energy(functional_map: Float[Array, "k_x k_y"], weights: Float[Array, "k_x k_y"]) -> Float[Array, ""]:
-    """Return the sum of the terms with the weights mu_1, mu_2 and mu_3, which regularise the functional map.
+    """Return the sum of the terms with the weights mu_1, mu_2 and mu_3, given C and its `slanted_weights`.
 
-    These terms keep the large entries of C near the slanted diagonal, and keep the rows of C nearly
-    orthonormal.
-
-    **Arguments:**
-
-    - `functional_map`: C in the pullback convention (k_x, k_y).
-    - `weights`: the weights (k_x, k_y) that `slanted_weights` returns.
+    These terms keep the large entries of C near the slanted diagonal, and its rows nearly orthonormal.
     """
     slant, orthogonality, length = MAP_WEIGHTS
     gram = product(functional_map, functional_map.T)
@@ -379,17 +348,9 @@ def region_energy(
     spectrum_y: Spectrum,
     gradient_y: SurfaceGradient,
 ) -> Float[Array, ""]:
-    """Return the sum of the terms with the weights mu_4 and mu_5, which regularise the region.
+    """Return the sum of the terms with the weights mu_4 and mu_5, for v on Y (n,), where Y has area 1.
 
-    The term with the weight mu_4 keeps the area of the region close to the area of X. The term with the
-    weight mu_5 keeps the boundary of the region short.
-
-    **Arguments:**
-
-    - `membership`: the membership function v on Y (n,).
-    - `area_x`: the area of X, divided by the area of Y.
-    - `spectrum_y`, `gradient_y`: the spectrum of Y and the gradient operator of Y, in the unit of length in
-      which Y has area 1.
+    These terms keep the area of the region close to the area of X, and its boundary short.
     """
     area, length = REGION_WEIGHTS
     missing = area_x - jnp.sum(spectrum_y.vertex_areas * eta(membership))
@@ -437,12 +398,7 @@ def _minimum(
 
 @dataclass(frozen=True)
 class PartialFunctionalMaps(Method):
-    """A method that matches a partial shape X with a full shape Y by `partial_functional_map`.
-
-    **Attributes:** the attributes of `Method`, and the following attribute.
-
-    - `iterations`: the number of iterations; see `partial_functional_map`.
-    """
+    """A method that matches a partial shape X with a full shape Y by `partial_functional_map`."""
 
     reference: str
     number_of_eigenvectors: int = 100
@@ -458,10 +414,10 @@ class PartialFunctionalMaps(Method):
         )
         spectra = pair.spectra.seen_by(stage).both
         gradient = SurfaceGradient.of(pair.meshes[1], spectra[1])
-        found = compiled(partial_functional_map)(
+        partial_map = compiled(partial_functional_map)(
             *spectra, gradient, pair.initial_map, iterations=self.iterations
         )
-        return successful(found.pointwise_map, found.result)
+        return successful(partial_map.pointwise_map, partial_map.result)
 
 
 PARTIAL_FUNCTIONAL_MAPS = PartialFunctionalMaps(
