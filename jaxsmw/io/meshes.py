@@ -153,8 +153,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
         )
     try:
         polygons = _parse(data, suffix, path.parent)
-        at, polygon = triangles_of(polygons.sizes, polygons.is_strip)
-        faces, notes = _triangles(polygons, at)
+        is_strip = np.zeros(len(polygons.sizes), bool) if polygons.strips is None else polygons.strips
+        at, polygon = triangles_of(polygons.sizes, is_strip)
+        faces = polygons.corners[at]
+        notes = [*polygons.notes, *_notes(polygons.sizes[~is_strip], polygons.lines, len(faces))]
         texture, lost = texture_or_note(lambda: _texture_at(polygons, at))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -195,21 +197,20 @@ def _parse(data: bytes, suffix: str, folder: Path) -> Polygons:
         return parse(data, folder) if suffix == ".gltf" else parse(data)
 
 
-def _triangles(polygons: Polygons, at: Int64[np.ndarray, "t 3"]) -> tuple[np.ndarray, list[str]]:
-    """Return the vertices of the triangles (t, 3), and the notes of the file."""
-    sizes = polygons.sizes[~polygons.is_strip]
-    notes = list(polygons.notes)
+def _notes(sizes: Int64[np.ndarray, " f"], lines: int, triangles: int) -> list[str]:
+    """Return notes on faces that are no triangles. Refuse a file that contains only lines."""
+    notes = []
     edges, large = int((sizes == 2).sum()), int((sizes > 3).sum())
-    if (edges or polygons.lines) and not len(at):
+    if (edges or lines) and not triangles:
         raise InputError(
-            f"contains {count_of(edges + polygons.lines, 'line')} (edges or faces with 2 corners), but no "
-            "triangles, so it describes no surface: export the mesh with its faces."
+            f"contains {count_of(edges + lines, 'line')} (edges or faces with 2 corners), but no triangles, "
+            "so it describes no surface: export the mesh with its faces."
         )
     if edges:
         notes.append(f"{count_of(edges, 'face')} with 2 corners ignored: lines are not part of a surface.")
     if large:
         notes.append(f"{count_of(large, 'face')} with more than three corners split into triangles.")
-    return polygons.corners[at], notes
+    return notes
 
 
 def _texture_at(polygons: Polygons, at: Int64[np.ndarray, "t 3"]) -> Texture | None:
