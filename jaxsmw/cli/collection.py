@@ -154,7 +154,8 @@ def run(options: argparse.Namespace) -> None:
         files = _mesh_files(options)
         _check(options, files)
         from jaxsmw.collection.files import RESULT_DIRECTORIES, check_replaceable, replace_results
-        from jaxsmw.io.landmarks import check_frame, read_landmark_file
+        from jaxsmw.io.landmark_files import read_landmark_file
+        from jaxsmw.io.landmarks import check_frame
         from jaxsmw.runtime.files import make_directory, remove_leftovers
         from jaxsmw.runtime.provenance import claimed_directory
     with stopwatch.step("reading"):
@@ -234,7 +235,7 @@ _NAMED_FILES = 8
 
 def _note_other_files(options: argparse.Namespace) -> None:
     """Print a note that names the files that are neither meshes nor usual companions of meshes."""
-    from jaxsmw.io.landmarks import LANDMARK_SUFFIXES
+    from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
     from jaxsmw.io.meshes import MESH_SUFFIXES
 
     known = (*MESH_SUFFIXES, *LANDMARK_SUFFIXES, *_COMPANIONS)
@@ -268,7 +269,7 @@ def _inside(options: argparse.Namespace, option: str, file: str, files: Mapping[
 def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
     """Check the options and the output directory before the long computation."""
     from jaxsmw.collection.files import RESULT_FILES
-    from jaxsmw.io.landmarks import check_landmark_suffix, check_readable_suffix
+    from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
     from jaxsmw.io.meshes import check_mesh_suffix
     from jaxsmw.runtime.files import size_of_file
 

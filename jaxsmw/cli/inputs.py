@@ -98,7 +98,7 @@ def check_initial_map_files(init: str) -> None:
     files = initial_map_files(init)
     if not init.startswith("landmarks:"):
         return
-    from jaxsmw.io.landmarks import LANDMARK_SUFFIXES, check_readable_suffix
+    from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES, check_readable_suffix
 
     if len(files) > 1:
         for file in files:
@@ -113,7 +113,7 @@ def check_initial_map_files(init: str) -> None:
 
 def _has_positions(file: str) -> bool:
     """Return whether a table contains positions of landmarks, and not pairs of vertices."""
-    from jaxsmw.io.landmarks import read_landmark_file
+    from jaxsmw.io.landmark_files import read_landmark_file
     from jaxsmw.io.maps import Table
 
     with suppress(InputError):
@@ -144,7 +144,8 @@ def read_initial_map(
 
 def _read_landmark_files(files: Sequence[str], meshes: tuple[Mesh, Mesh]) -> Int64[np.ndarray, "l 2"]:
     """Read landmarks on X and on Y, and return the nearest vertices of those with a name in both files."""
-    from jaxsmw.io.landmarks import match_landmarks, read_landmark_file
+    from jaxsmw.io.landmark_files import read_landmark_file
+    from jaxsmw.io.landmarks import match_landmarks
     from jaxsmw.transfer.landmarks import landmark_vertices
     from jaxsmw.wording import count_of
 

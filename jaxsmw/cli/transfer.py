@@ -185,7 +185,7 @@ def _check(options: argparse.Namespace) -> None:
     init_files = initial_map_files(options.init)
     check_method(options)
     refuse_without(options, "--map or a file of --init", bool(options.map or init_files), "index_base")
-    from jaxsmw.io.landmarks import check_landmark_suffix, check_readable_suffix
+    from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
     from jaxsmw.io.meshes import check_attribute_suffix, check_mesh_suffix
 
     if options.registered:
@@ -208,7 +208,8 @@ def _check(options: argparse.Namespace) -> None:
 
 def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
     """Read the landmarks of the source, convert them to the coordinates of the meshes, and check them."""
-    from jaxsmw.io.landmarks import check_frame, check_known_system, read_landmark_file
+    from jaxsmw.io.landmark_files import check_known_system, read_landmark_file
+    from jaxsmw.io.landmarks import check_frame
 
     landmarks = read_landmark_file(options.landmarks)
     for note in landmarks.notes:
@@ -284,7 +285,7 @@ def _transfer_landmarks(
     stopwatch: Stopwatch,
 ) -> Landmarks:
     """Transfer the landmarks, print their expected errors, write them if requested, and return them."""
-    from jaxsmw.io.landmarks import write_landmark_file
+    from jaxsmw.io.landmark_files import write_landmark_file
     from jaxsmw.transfer.landmarks import transfer_landmarks
 
     with stopwatch.step("landmarks"):
