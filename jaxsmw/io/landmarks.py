@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -166,7 +166,7 @@ class PointList:
         self._noun = noun
         self._names: list[str] = []
         self._numbers: list[int] = []
-        self._coordinates: list[str] | list[float] = []
+        self._coordinates: list[str | float] = []
         self._left_out: list[int] = []
 
     @property
@@ -174,7 +174,7 @@ class PointList:
         """The 1-based number of the next point."""
         return len(self._numbers) + len(self._left_out) + 1
 
-    def add(self, name: str, position: Sequence[Any], line: int | None = None) -> None:
+    def add(self, name: str, position: Sequence[str] | Sequence[float], line: int | None = None) -> None:
         """Add a point whose three coordinates are floats or words. Without a name, its number is its name."""
         self._names.append(name or str(self.next))
         self._numbers.append(line or self.next)
