@@ -82,9 +82,9 @@ def write_collection_page(
     vertices, its triangulation is simplified, and all shapes are shown with the same vertices. The positions
     on the page are rounded to 16 bits per coordinate.
 
-    **Raises:** `InputError` if there is no shape, or if names, faces, edges or the model do not fit the
-    shapes. `InputError` is also raised if a coordinate is not finite, the template has no area, `up` is not
-    an axis, or the file cannot be written.
+    **Raises:** `InputError` if there is no shape, if names, faces, edges or the model do not fit the shapes,
+    if a coordinate is not finite, the template has no area, `up` is not an axis, or the file cannot be
+    written.
     """
     _check(names, faces, registered, template, edges, model)
     corners = np.asarray(faces, dtype=np.int64)

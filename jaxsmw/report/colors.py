@@ -10,6 +10,7 @@ from jaxtyping import Float, Float64
 
 from jaxsmw.evaluation.metrics import THRESHOLDS
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.report.standing import visible
 
 ERROR_LIMIT = max(THRESHOLDS)
 """The error at which the colour scale ends, as a fraction of the square root of the target's area.
@@ -107,7 +108,7 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
 
     **Returns:** sRGB colours (n, 3) in [0, 1].
     """
-    used = mesh.vertices[mesh.referenced_vertices]
+    used = visible(mesh)
     low, high = used.min(axis=0), used.max(axis=0)
     # Coordinates are rounded to this grid. Without the grid, the ranks of vertices on a flat mesh would
     # depend on rounding errors, and the colours would be noisy.
@@ -115,10 +116,8 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     coordinates = np.empty_like(mesh.vertices)
     for axis in range(3):
         values = np.round(mesh.vertices[:, axis] / grid)
-        sorted_values = np.sort(values[mesh.referenced_vertices])
-        below = np.searchsorted(sorted_values, values, "left") + np.searchsorted(
-            sorted_values, values, "right"
-        )
+        ordered = np.sort(visible(mesh, values))
+        below = sum(np.searchsorted(ordered, values, side) for side in ("left", "right"))
         position = (mesh.vertices[:, axis] - low[axis]) / max(high[axis] - low[axis], grid)
         coordinates[:, axis] = np.clip(position, 0, 1) + below / (2 * len(used)) - 1
     lateral, up, forward = coordinates.T

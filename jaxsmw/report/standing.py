@@ -157,8 +157,13 @@ def _turned_like(mesh: Mesh, matches: Float64[np.ndarray, "m 3"]) -> Mesh:
 
 def _centered(positions: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """Move new positions of a mesh such that the middle of the bounding box is the origin."""
-    used = positions[mesh.referenced_vertices]
+    used = visible(mesh, positions)
     return positions - (used.min(axis=0) + used.max(axis=0)) / 2
+
+
+def visible(mesh: Mesh, values: Float64[np.ndarray, "n ..."] | None = None) -> Float64[np.ndarray, "_ ..."]:
+    """Return the positions, or other values, of the vertices that faces use. Pictures show only these."""
+    return (mesh.vertices if values is None else values)[mesh.referenced_vertices]
 
 
 def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
@@ -174,9 +179,8 @@ def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], F
     **Returns:** The matrix (3, 3), which is a rotation times the scale, and the offset (3,) in the unit of
     the file.
     """
-    used = mesh.referenced_vertices
     scale = np.sqrt(mesh.area / standing.area)
-    motion = rigid_fit(scale * standing.vertices[used], mesh.vertices[used])
+    motion = rigid_fit(scale * visible(mesh, standing.vertices), visible(mesh))
     return scale * motion.rotation.T, motion.offset
 
 
@@ -234,7 +238,7 @@ def _suits_opening(mesh: Mesh, up: Axis) -> float:
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:
     """Return the mean of the vertices in each grid cell, and the pairs of cells that edges join."""
-    used = mesh.vertices[mesh.referenced_vertices]
+    used = visible(mesh)
     # The number of cells along a thin mesh may exceed the range of integers, so the keys remain floats.
     keys = np.floor((used - used.min(axis=0)) / cell)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)

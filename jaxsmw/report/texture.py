@@ -11,6 +11,7 @@ from matplotlib.image import imsave
 
 from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.report.standing import visible
 from jaxsmw.runtime.files import atomic_write
 
 TEXTURE_FILES = ("texture.png", "texture.mtl", "target.obj", "source.obj")
@@ -54,7 +55,7 @@ def write_textured_pair(
 
 def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
     """Return coordinates (n, 2) along the two longest principal axes, in [0, 1] for referenced vertices."""
-    used = mesh.vertices[mesh.referenced_vertices]
+    used = visible(mesh)
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
     # The sign of a singular vector is arbitrary. Here, the component with the largest absolute value is
     # positive.
