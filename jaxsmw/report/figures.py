@@ -73,15 +73,14 @@ def draw_correspondence(
 
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices), each a `Mesh` in any unit of length.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `errors`: a dictionary from the name of each kind of error to an array (m,). The array contains the
-      error of each match as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array,
-      the figure contains a panel that shows the errors as colours on X.
+    - `errors`: a dictionary from the name of each kind of error to an array (m,), as in
+      `jaxsmw.report.page.ShownMap`. For each array, a panel shows the errors as colours on X.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two figures are comparable if their limits are equal.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`; by default guessed from each
       mesh (`jaxsmw.report.standing.guess_up`).
     - `azimuth`: the direction from which the bodies are seen, in degrees from the front of the body towards
-      its left; by default, `jaxsmw.report.rendering.choose_azimuth` chooses the direction.
+      its left; by default chosen for the bodies (`jaxsmw.report.rendering.choose_azimuth`).
 
     **Raises:** `InputError` if the map or the errors do not fit the meshes, if the limit is not positive, or
     if `up` is not an axis.
@@ -108,11 +107,10 @@ def draw_mesh(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """Draw one shaded mesh.
+    """Draw one shaded mesh, a `Mesh` with n vertices in any unit of length.
 
     **Arguments:**
 
-    - `mesh`: a surface with n vertices, a `Mesh` in any unit of length.
     - `colors`: one sRGB colour in [0, 1] per vertex (n, 3); by default, the mesh is grey.
     - `up`, `azimuth`: the axis that points up and the direction of view, as in `draw_correspondence`.
 
@@ -134,11 +132,8 @@ def draw_functional_map(
 ) -> Figure:
     """Draw a functional map C. Positive entries are red, and negative entries are blue.
 
-    **Arguments:**
-
-    - `functional_map`: the functional map C, with shape (k_X, k_Y) in the pullback convention and shape
-      (k_Y, k_X) in the pushforward convention.
-    - `convention`: the convention of C, `"pullback"` or `"pushforward"`, which determines the axis labels.
+    C has the shape (k_X, k_Y) in the convention `"pullback"` and (k_Y, k_X) in the convention
+    `"pushforward"`, which determines the axis labels.
 
     **Raises:** `InputError` if C is not a matrix of finite numbers.
     """
@@ -170,9 +165,9 @@ def draw_filters(
 
     **Arguments:**
 
-    - `eigenvalue_grid`: the values of lambda at which the responses are given (p,), ascending.
-    - `responses`: the responses (filters, p). The first row belongs to the scaling function, and the other
-      rows belong to the wavelets, from the coarsest to the finest.
+    - `eigenvalue_grid`: the ascending values of lambda at which the responses are given (p,).
+    - `responses`: the responses (filters, p), first of the scaling function, then of the wavelets, from the
+      coarsest to the finest.
     - `eigenvalues`: the eigenvalues of a shape (k,), which the figure marks on the horizontal axis.
 
     **Raises:** `InputError` if the responses do not fit the grid.
@@ -224,17 +219,14 @@ def draw_quality_curves(
     *,
     mean_errors: Mapping[str, float] = MappingProxyType({}),
 ) -> Figure:
-    """Draw correspondence quality curves.
-
-    A curve shows, for each threshold, the share of matches whose error is at most this threshold.
+    """Draw correspondence quality curves: the shares of matches with at most a given error.
 
     **Arguments:**
 
-    - `curves`: a dictionary from the name of each map to its curve. A curve is a pair of two arrays,
-      thresholds (p,) and shares (p,). The thresholds are fractions of sqrt(area of Y), in ascending order.
-      The shares are numbers in [0, 1].
-    - `mean_errors`: a dictionary from the name of a map to its mean error, as a fraction of sqrt(area of Y),
-      which the legend shows. The dictionary need not contain all maps.
+    - `curves`: a dictionary from the name of each map to a pair of arrays: ascending thresholds (p,), as
+      fractions of sqrt(area of Y), and shares (p,) in [0, 1].
+    - `mean_errors`: a dictionary from the names of some maps to their mean errors, as fractions of sqrt(area
+      of Y), for the legend.
 
     **Raises:** `InputError` if there is no curve, or if the arguments do not fit together.
     """
@@ -348,12 +340,7 @@ def draw_functions(
 
 
 def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
-    """Write a figure as PNG, PDF or SVG. The file is written completely or not at all.
-
-    **Arguments:**
-
-    - `path`: the file to create or to replace. The suffix (`.png`, `.pdf` or `.svg`) determines the format.
-    - `figure`: a `matplotlib.figure.Figure`.
+    """Write a figure as PNG, PDF or SVG, as the suffix says. The file is written completely or not at all.
 
     **Raises:** `InputError` for any other suffix, or if the file cannot be written.
     """

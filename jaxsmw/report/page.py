@@ -121,8 +121,8 @@ def write_page(
     **Arguments:**
 
     - `path`: the HTML file. Any browser with WebGL opens the file from disk. The viewer takes about 0.6 MB of
-      the file. The meshes take 50 bytes per vertex, and each map takes a few bytes per vertex. The spectra
-      take 133 bytes per vertex, but at most 8 MB in total.
+      the file, and the meshes take 50 bytes per vertex. The spectra take 133 bytes per vertex, but at most 8
+      MB in total.
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices), each a `Mesh` in any unit of length.
     - `maps`: a dictionary from the name of each map to a `ShownMap`. The page opens with the first map.
     - `title`: the heading of the page.
@@ -130,8 +130,7 @@ def write_page(
       `jaxsmw.report.page_data.eigenvectors_on_page` limits the number of eigenvectors on the page.
     - `refiner`: a `WaveletPreservation` refiner, whose filter bank defines the wavelets.
     - `statistics`: a dictionary from labels to values as text, which the page shows below the bodies.
-    - `error_meanings`: a dictionary from each name in `ShownMap.errors` to a sentence that explains this kind
-      of error on the page.
+    - `error_meanings`: a sentence on the page about each kind of error in `ShownMap.errors`, by its name.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two pages are comparable if their limits are equal.
     - `figures`: the figures at the end of the page, each a pair of a caption and the bytes of a PNG file.

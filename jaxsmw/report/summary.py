@@ -89,26 +89,24 @@ def write_report(
 ) -> list[Path]:
     """Write pictures of a match, an interactive page and a summary to a directory.
 
-    The report contains the expected error. If measured errors are given, the report also contains them.
+    The function writes `report.html`, an interactive page with both bodies, the map and the initial map. It
+    also writes `correspondence.png`, `functional_map.png` and `summary.json`, `filters.png` if a stage has
+    filters, and `quality.png` if errors are given. The report contains the expected error.
 
     **Arguments:**
 
-    - `directory`: the directory of the report, which is created if it does not exist. The function always
-      writes `report.html`, `correspondence.png`, `functional_map.png` and `summary.json`. The file
-      `report.html` is an interactive page with both bodies, the map and the initial map. The function writes
-      `filters.png` if a stage has filters, and `quality.png` if errors are given.
+    - `directory`: the directory of the report, which is created if it does not exist.
     - `correspondence`: the result of `match`, a `Correspondence`.
     - `errors`: a dictionary from the name of each map to its `GeodesicError`. The last entry must contain the
       errors of `correspondence.pointwise_map`. An entry named `initial` must contain the errors of
       `correspondence.initial_map`.
-    - `settings`: a dictionary of settings to include in `summary.json`. The settings must be serialisable as
-      JSON.
-    - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds. The
-      default is `correspondence.seconds`. The steps must not overlap, because the report adds its own steps
-      and prints the sum as the total time.
+    - `settings`: a dictionary of settings to include in `summary.json`, serialisable as JSON.
+    - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds, by default
+      `correspondence.seconds`. The steps must not overlap, because the report adds its own steps and prints
+      the sum as the total time.
     - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`; by default guessed from each
       mesh (`jaxsmw.report.standing.guess_up`).
-    - `registered`: the `RegisteredMesh` that the page shows. By default, the page shows the result of
+    - `registered`: the `RegisteredMesh` that the page shows, by default the result of
       `Correspondence.registered_mesh`.
     - `landmarks`: a pair of `Landmarks`, on X and on Y, with which the page opens; see
       `jaxsmw.report.page.write_page`.
@@ -256,15 +254,13 @@ def write_comparison(
 
     - `path`: the HTML file.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_maps`: a dictionary from the name of each map to the map T: X -> Y (m,), an array of 0-based
-      vertices of Y. The page lists the maps in the order of the dictionary.
-    - `errors`: a dictionary from the same names to the `GeodesicError` of each map. The page shows these
-      errors as colours. The page also contains the correspondence quality curves, and a table of statistics
-      such as the mean errors.
-    - `partial`: whether one mesh is a partial shape and the other mesh the full shape. If True, both meshes
-      must have the same unit of length.
-    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`; by default guessed from each
-      mesh (`jaxsmw.report.standing.guess_up`).
+    - `pointwise_maps`: a dictionary from the name of each map to the map T: X -> Y (m,), in the order of the
+      page.
+    - `errors`: a dictionary from the same names to the `GeodesicError` of each map. The page shows them as
+      colours, as correspondence quality curves, and in a table of statistics.
+    - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
+      length.
+    - `up`: the axis of the mesh files that points up, as in `write_report`.
 
     **Raises:** `InputError` if the maps do not fit the meshes, if the file cannot be written, if `up` is not
     an axis, or if errors are given and matplotlib is missing.

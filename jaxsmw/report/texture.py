@@ -29,15 +29,8 @@ def write_textured_pair(
 
     The picture is projected onto the target along the shortest principal axis of the target. The projection
     has no seams, and the front and the back of the target look the same. Each source vertex receives the
-    texture coordinates of its match on the target.
-
-    **Arguments:**
-
-    - `directory`: an existing directory, to which `TEXTURE_FILES` are written. Existing files with these
-      names are replaced. Each file is replaced completely or not at all.
-    - `mesh_x`, `mesh_y`: source X (m vertices) and target Y.
-    - `points`: one `SurfacePoints` with m points on Y, which are the matches of the vertices of X. The result
-      of `Correspondence.surface_points()` is an example.
+    texture coordinates of its match in `points`, m points on Y. Each of the `TEXTURE_FILES` in the existing
+    directory is replaced completely or not at all.
 
     **Raises:** `InputError` if a file cannot be written.
     """
