@@ -234,7 +234,7 @@ class TestBadFiles:
             ("1\n2 3\n3\n4\n", "line 2: has 2 numbers instead of 1"),
             ("1\n2\n3.5\n4\n", "line 3: 3.5 is not one of the vertices of"),
             ("1\n2\n-3\n4\n", "line 3: -3 is not one of"),
-            ("1\n9\n3\n4\n", "line 2: 9 is not one of .*looks 1-based: pass index_base=1 .--index-base 1."),
+            ("1\n9\n3\n4\n", "line 2: 9 is not one of .*looks 1-based: pass index_base=1[.]"),
             ("0\n9\n3\n4\n", "line 2: 9 is not one of .*0 to 8: correct the number"),
             ("1\n2\n3\n12\n", "line 4: 12 is not one of .*0 to 8: correct the number"),
             ("1\n2\n3\n99999999999999999999999999\n", "line 4: 9999999999.* is not one of"),

@@ -402,7 +402,7 @@ def test_distances_to_a_surface_are_exact():
     assert bounding_box_diagonal(mesh) == pytest.approx(np.sqrt(32))
 
 
-@pytest.mark.parametrize(("coordinates", "named"), [("LPS", "to RAS: give --coordinates RAS"), (None, "signs of x and y")])  # fmt: skip
+@pytest.mark.parametrize(("coordinates", "named"), [("LPS", "to RAS: set coordinates=\"RAS\""), (None, "signs of x and y")])  # fmt: skip
 def test_a_missing_change_of_coordinates_is_found_and_named(coordinates, named):
     mesh = shifted_sphere()
     right = Landmarks(("a", "b", "c"), mesh.vertices[[0, 50, 100]], coordinates, name="points.csv")
@@ -447,7 +447,7 @@ def test_a_real_skull(shared, tmp_path):
     assert len(landmarks) == 51 and landmarks.coordinates == "LPS" and landmarks.names[:2] == ("1", "2")
     assert check_frame(landmarks, mesh) == ()
     assert find_frame(landmarks, mesh).as_read < 0.002 * bounding_box_diagonal(mesh)
-    with pytest.raises(InputError, match="from RAS to LPS: give --coordinates LPS"):
+    with pytest.raises(InputError, match='from RAS to LPS: set coordinates="LPS"'):
         check_frame(landmarks.in_coordinates("RAS"), mesh)
     for suffix in WRITTEN:
         write_landmark_file(tmp_path / f"p{suffix}", landmarks)
