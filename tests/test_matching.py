@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
+from sampled_cases import first_always
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
-from sampled_cases import first_always
 from synthetic import bumpy_mesh
 from threadpoolctl import threadpool_info, threadpool_limits
 
