@@ -3,6 +3,7 @@
 import igl
 import numpy as np
 import pytest
+from messages import refused
 from sampled_cases import first_always
 from scipy.sparse.linalg import eigsh
 
@@ -224,5 +225,5 @@ def test_bad_arguments_are_refused(arguments, fault):
 
 
 def test_an_unknown_pose_is_refused():
-    with pytest.raises(InputError, match="'wave' of a quadruped is unknown: choose one of rest, stand"):
+    with refused("'wave'", "quadruped", "rest, stand"):
         creature("quadruped", pose="wave")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
+from messages import refused
 from sampled_cases import first_always
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
@@ -534,7 +535,7 @@ def test_presets_fit_small_meshes(monkeypatch):
 
 
 def test_an_unknown_preset_is_refused():
-    with pytest.raises(InputError, match="'exact' is not a preset: choose from fast, paper, accurate"):
+    with refused("'exact'", "preset", "fast, paper, accurate"):
         choose_preset("exact")
     with pytest.raises((InputError, TypeCheckError), match="preset"):
         choose_preset(3)
