@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from sampled_cases import first_always
 from synthetic import random_spectrum
 
 from jaxsmw.core.banks import CubicSpline
@@ -47,11 +48,14 @@ def test_at_most_17_padded_sizes_cover_4001_to_16000_vertices():
 @pytest.mark.parametrize("batch_size", [None, 3])
 @pytest.mark.parametrize(
     ("refiner", "pairs"),
-    [
-        (WaveletPreservation(), 7),
-        (WaveletPreservation(CubicSpline(5), LeastSquares(), convention="pushforward"), 2),
-        (WaveletPreservation(solution=RegularizedLeastSquares()), 2),
-    ],
+    first_always(
+        [
+            (WaveletPreservation(), 7),
+            (WaveletPreservation(CubicSpline(5), LeastSquares(), convention="pushforward"), 2),
+            (WaveletPreservation(solution=RegularizedLeastSquares()), 2),
+        ],
+        names=2,
+    ),
     ids=["filtering", "least squares", "regularized"],
 )
 def test_batched_pairs_get_the_results_of_single_pairs(refiner, pairs, batch_size):
@@ -249,7 +253,7 @@ def one():
     return dict(refine_pairs(spectra, PAIRS, starts, batch_size=2, history=True))
 
 
-@pytest.mark.parametrize("processes", [1, 2])
+@pytest.mark.parametrize("processes", first_always([2, 1]))
 @pytest.mark.cluster
 def test_four_devices_give_the_results_of_one(one, tmp_path, processes):
     """The devices belong to one process, or to two processes that communicate over the network."""
