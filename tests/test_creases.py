@@ -90,11 +90,7 @@ def test_impossible_numbers_are_refused(number):
 
 
 def test_stages_refuse_a_negative_number():
-<<<<<<< HEAD
-    with pytest.raises(InputError, match="number_of_crease_eigenvectors is -1"):
-=======
-    with refused("-1", "crease eigenvectors", "0 or more"):
->>>>>>> w-tests
+    with refused("number_of_crease_eigenvectors", "-1", "at least 0"):
         Stage(FeatureRegression((5,)), number_of_crease_eigenvectors=-1)
 
 

@@ -103,7 +103,7 @@ def match_edges(
     provide a better initial map later.
     """
     prepared = (prepare_task(task.x, task.y, init=task.init, aligned=task.aligned) for task in tasks)
-    for found in match_many(prepared, preset, False, devices=devices):
+    for found in match_many(prepared, preset.without_alternatives(), devices=devices):
         try:
             yield found if isinstance(found, ArithmeticError) else EdgeMap.of(found)
         except ArithmeticError as error:

@@ -174,7 +174,6 @@ def match_prepared(
     preset: Preset,
     *,
     outcomes: Sequence[Outcome] = (),
-    alternatives: bool = True,
     history: bool = False,
     step: Step = no_step,
 ) -> Correspondence:
@@ -186,7 +185,6 @@ def match_prepared(
     - `starts`: the initial maps: one map, or `"shot"` and `"aligned"`.
     - `preset`: the stages and the repair.
     - `outcomes`: the outcome of `preset.judged` for each start, if these stages have already run.
-    - `alternatives`: whether repair tries alternative maps.
     - `history`: whether to record a `History` of the last stage.
     - `step`: reports and measures the steps. By default, nothing is reported.
 
@@ -199,14 +197,7 @@ def match_prepared(
     return_free_memory()
     with step("refinement"), one_blas_thread():
         repaired = [
-            refine_and_repair(
-                prepared,
-                start,
-                preset,
-                outcome=outcome,
-                alternatives=None if alternatives else (),
-                history=history,
-            )
+            refine_and_repair(prepared, start, preset, outcome=outcome, history=history)
             for start, outcome in itertools.zip_longest(starts, outcomes)
         ]
     successful = [pair for pair in zip(starts, repaired, strict=True) if pair[1].successful]

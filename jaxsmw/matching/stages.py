@@ -264,6 +264,13 @@ class Preset:
             return self.large.fitted(number_of_vertices)
         return replace(self, large=None)._with_stages(lambda stage: stage.fitted(number_of_vertices))
 
+    def without_alternatives(self) -> Preset:
+        """Return the preset whose repair tries no alternative maps."""
+        if self.repair is None:
+            return self
+        large = None if self.large is None else self.large.without_alternatives()
+        return replace(self, repair=replace(self.repair, finalists=0), large=large)
+
     def without_descriptors(self) -> Preset:
         """Return the preset with stages that use no descriptors."""
         return self._with_stages(Stage.without_descriptors)
