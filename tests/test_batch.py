@@ -184,7 +184,7 @@ def test_arguments_that_do_not_fit_together_are_refused(monkeypatch):
         refine_pairs(spectra[:1], PAIRS, starts)
     with pytest.raises(ValueError, match="pair 0 is"):
         refine_pairs(spectra, [(0, 1, 1)], starts[:1])
-    with pytest.raises(ValueError, match="pair 0 has type float"):
+    with pytest.raises(TypeError, match="pair 0 has type float"):
         refine_pairs(spectra, PAIRS, [np.asarray(start, float) for start in starts])
     with pytest.raises(ValueError, match="initial map of pair 1"):
         refine_pairs(spectra, PAIRS, [starts[0]] * 7)

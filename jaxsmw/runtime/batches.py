@@ -15,6 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, Int32
 
+from jaxsmw.core.checks import check_pointwise_map
 from jaxsmw.core.refinement import Refinement, RefineSettings, refine
 from jaxsmw.core.search import queries_per_block
 from jaxsmw.core.spectrum import Spectrum
@@ -170,17 +171,7 @@ def _check_pairs(
                 f"pair {position} is {tuple(pair)}, but there are {len(spectra)} shapes: give the indices of "
                 "two shapes, counted from 0"
             )
-        if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
-            raise InputError(
-                f"the initial map of pair {position} has type {pointwise_map.dtype}: give integer vertex "
-                "indices"
-            )
-        vertices = spectra[pair[0]].mask.shape
-        if pointwise_map.shape != vertices:
-            raise InputError(
-                f"the initial map of pair {position} has shape {pointwise_map.shape}, but X has "
-                f"{vertices[0]} vertices: give one vertex of Y for each vertex of X"
-            )
+        check_pointwise_map(f"initial map of pair {position}", pointwise_map, len(spectra[pair[0]].mask))
 
 
 class _Sizes(NamedTuple):

@@ -15,9 +15,9 @@ from scipy.sparse.linalg import cg
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.arrays import ratio
-from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
 from jaxsmw.geometry.mesh import Mesh, connected_components
 from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_facing_points, nearest_surface_points
+from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, check_surface_points
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.transfer.coverage import Attraction, UncoveredVertices, at_slits
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
@@ -414,7 +414,7 @@ def points_of_map(
 
     **Raises:** `InputError` if the map does not fit the meshes.
     """
-    vertices = check_indices(pointwise_map, len(mesh_y.vertices), f"map to {mesh_y.name}: vertex")
+    vertices = check_pointwise_map(pointwise_map, mesh_x, mesh_y)
     # An unreferenced vertex of Y is replaced by the nearest point of the surface.
     points, _ = nearest_surface_points(mesh_y.vertices[vertices], mesh_y)
     smooth = register_mesh(mesh_x, mesh_y, points, stiffness=_STIFFNESS_OF_MAPS, scale=scale)
