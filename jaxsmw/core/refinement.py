@@ -120,9 +120,8 @@ def refine(
     """Refine a pointwise map T: X -> Y by alternating between functional maps and pointwise maps.
 
     The loop is Algorithm 1 of the MWP paper, generalised to any refiner. The function is pure and
-    jit-compiled. JAX compiles it again only when sizes or static settings change. For many pairs of equal
-    size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For pairs of different sizes, use
-    `jaxsmw.refine_pairs`.
+    jit-compiled. For many pairs of equal size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For
+    pairs of different sizes, use `jaxsmw.refine_pairs`.
 
     If samples are given, only the first functional map and the last pointwise map are computed from all
     vertices, as in the fast variant of the MWP authors' program. `starts_on_samples` and `ends_on_samples`

@@ -157,6 +157,22 @@ class _Lines(NamedTuple):
     ends: Int[np.ndarray, " l"]
     lengths: Float64[np.ndarray, " l"]
 
+    def distances(
+        self,
+        to_vertices: Float64[np.ndarray, "s n"],
+        sources: Int64[np.ndarray, " q"],
+        points: Int64[np.ndarray, " q"],
+    ) -> Float64[np.ndarray, " q"]:
+        """Return the distances from `sources[i]` to the origin `points[i]`, given those to all vertices.
+
+        The origins must be ascending. A path ends with a line to one of them, in the opposite direction.
+        """
+        start = np.searchsorted(self.origins, points)
+        counts = np.searchsorted(self.origins, points, side="right") - start
+        pair, line = ranges(start, counts)
+        lengths = to_vertices[sources[pair], self.ends[line]] + self.lengths[line]
+        return np.minimum.reduceat(lengths, np.cumsum(counts) - counts)
+
 
 def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.ndarray, depth: int) -> _Lines:
     """Return straight lines from the given points to vertices. Each line crosses at most `depth` sides."""
@@ -295,7 +311,7 @@ def geodesic_distances_between(
     if isinstance(starts, SurfacePoints) and isinstance(ends, SurfacePoints):
         distances = _straight_distances(mesh, starts, ends)
     graph, nodes = _network(mesh, starts)
-    arrivals = _arrivals(mesh, ends)
+    arrivals = _lines_from(mesh, ends)
     at_once = max(1, _DISTANCES_AT_ONCE // graph.shape[0])
     pending = np.argsort(nodes, kind="stable")
     for radius in [*(np.sqrt(mesh.area) * np.array(_RADII)), np.inf]:
@@ -352,52 +368,25 @@ def _network(
     if not isinstance(points, SurfacePoints):
         return graph, points
     coordinates = graph.tocoo()
-    number, vertices, lengths = _lines_from_points(mesh, points)
+    added = _lines_from(mesh, points)
     lines = (
         _Lines(coordinates.row, coordinates.col, coordinates.data),
-        _Lines(size + number, vertices, lengths),
+        added._replace(origins=size + added.origins),
     )
     return _shortest(lines, size + len(points)), size + np.arange(len(points))
 
 
-def _lines_from_points(mesh: Mesh, points: SurfacePoints) -> _Lines:
-    """Return straight lines from points on faces to vertices; an origin is the number of a point."""
+def _lines_from(mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints) -> _Lines:
+    """Return straight lines from points to vertices, with the numbers of the points as origins, ascending."""
+    if not isinstance(points, SurfacePoints):
+        return _Lines(np.arange(len(points)), points, np.zeros(len(points)))
     corners, sides = mesh.faces[points.faces], _sides(mesh)
     offsets = mesh.vertices[corners] - points.positions(mesh)[:, None]
     number = np.repeat(np.arange(len(points)), 3)
     near = _Lines(number, corners.ravel(), np.linalg.norm(offsets, axis=2).ravel())
     far = _lines(sides, *_exits(sides, points), _DEPTH)
-    return _Lines(*(np.concatenate(part) for part in zip(near, far, strict=True)))
-
-
-class _Arrivals(NamedTuple):
-    """The last lines of paths to points: those of point i are numbered `first[i]` to `first[i + 1] - 1`."""
-
-    first: Int64[np.ndarray, " p1"]
-    vertices: Int64[np.ndarray, " l"]
-    lengths: Float64[np.ndarray, " l"]
-
-    def distances(
-        self,
-        to_vertices: Float64[np.ndarray, "s n"],
-        sources: Int64[np.ndarray, " q"],
-        points: Int64[np.ndarray, " q"],
-    ) -> Float64[np.ndarray, " q"]:
-        """Return the distances from `sources[i]` to `points[i]`, given those to all vertices (s, n)."""
-        counts = self.first[points + 1] - self.first[points]
-        pair, line = ranges(self.first[points], counts)
-        lengths = to_vertices[sources[pair], self.vertices[line]] + self.lengths[line]
-        return np.minimum.reduceat(lengths, np.cumsum(counts) - counts)
-
-
-def _arrivals(mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints) -> _Arrivals:
-    """Return the last lines of the paths to points; a vertex is reached from itself by a line of length 0."""
-    if not isinstance(points, SurfacePoints):
-        return _Arrivals(np.arange(len(points) + 1), points, np.zeros(len(points)))
-    number, vertices, lengths = _lines_from_points(mesh, points)
-    order = np.argsort(number, kind="stable")
-    first = np.searchsorted(number[order], np.arange(len(points) + 1))
-    return _Arrivals(first, vertices[order], lengths[order])
+    order = np.argsort(np.concatenate([near.origins, far.origins]), kind="stable")
+    return _Lines(*(np.concatenate(part)[order] for part in zip(near, far, strict=True)))
 
 
 def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
