@@ -34,7 +34,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark_speed import ITERATIONS, Part, measure_parts, medians, truth_of
+from benchmark_speed import ITERATIONS, truth_of
+from common import Part, make_parser, measure_parts, medians
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Int
@@ -314,22 +315,14 @@ PARTS = {"paper": paper, "accurate": accurate, "agreement": agreement}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
+    parser = make_parser(__doc__, parts=PARTS, faust=True, output="batches", pairs=64)
     parser.add_argument("--vertices", type=int, default=5000, help="per shape (default: %(default)s)")
     parser.add_argument(
         "--eigenvectors", type=int, default=100, help="per random shape (default: %(default)s)"
     )
-    parser.add_argument("--pairs", type=int, default=64, help="(default: %(default)s)")
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[4, 16, 64])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="refine 8 pairs once, in batches of 2 and 8")
-    parser.add_argument(
-        "--data", type=Path, metavar="FAUST_R", help="the directory of the remeshed FAUST set"
-    )
-    parser.add_argument("--output", type=Path, default=Path("batches"), metavar="DIR")
     options = parser.parse_args()
     if options.quick:
         options.pairs, options.batch_sizes, options.repeats = 8, [2, 8], 1

@@ -34,7 +34,6 @@ three minutes.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import re
@@ -43,7 +42,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from importlib import import_module
@@ -57,13 +56,13 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import scipy.sparse as sp
+from common import Part, make_parser, measure_parts, medians
 from jaxtyping import Array, Float32, Int64
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from jaxsmw.benchmark.tables import markdown
 from jaxsmw.choices import Eigensolver, Search
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import Refiner
@@ -83,10 +82,8 @@ from jaxsmw.matching.preparation import paired_spectra
 from jaxsmw.matching.stages import PresetName, Stage
 from jaxsmw.matching.starts import initial_map
 from jaxsmw.report.figures import save_figure
-from jaxsmw.report.summary import provenance
 from jaxsmw.runtime.cache import cache_compiled_programs
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.files import make_directory
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
@@ -96,9 +93,6 @@ XLA_DEFAULTS = ", XLA's defaults"
 # For shapes with more than this number of vertices, a matrix of all distances would take gigabytes.
 STORED = 10_000
 
-Part = tuple[str, str, list[list[str]], dict[str, Any]]
-"""A tuple of a table's title, a note on the measurement, the rows of the table, and all measured numbers."""
-
 
 class PlainSearch(WaveletPreservation):
     """Wavelet preservation with the simplest search: an argmin over a stored matrix of all distances."""
@@ -107,32 +101,6 @@ class PlainSearch(WaveletPreservation):
         queries, database = self.embeddings(prepared, state)
         products = queries @ database.T
         return jnp.argmin(0.5 * jnp.sum(database**2, axis=1)[None, :] - products, axis=1).astype(jnp.int32)
-
-
-def medians(
-    candidates: dict[str, Callable[[], object]],
-    repeats: int,
-    clock: Callable[[], Any] = time.perf_counter,
-    *,
-    warm: bool = True,
-) -> dict[str, Any]:
-    """Run the candidates alternately, and return the median time of each candidate in seconds.
-
-    **Arguments:**
-
-    - `candidates`: a dictionary from the name of each candidate to the function to time.
-    - `repeats`: the number of timed runs of each candidate.
-    - `clock`: a function that returns the current time in seconds, or an array of times in seconds.
-    - `warm`: whether each candidate first runs once without timing, so that JAX compiles it.
-    """
-    seconds: dict[str, list[Any]] = {name: [] for name in candidates}
-    for turn in range(repeats + warm):
-        for name, candidate in candidates.items():
-            start = clock()
-            jax.block_until_ready(candidate())
-            if turn >= warm:
-                seconds[name].append(clock() - start)
-    return {name: np.median(times, axis=0).tolist() for name, times in seconds.items()}
 
 
 def wall_and_cpu() -> np.ndarray:
@@ -986,47 +954,13 @@ PARTS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = make_parser(__doc__, parts=PARTS, faust=True, output="speed")
     parser.add_argument("--quick", action="store_true", help="measure only the smallest sizes")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
-    parser.add_argument(
-        "--data", type=Path, metavar="FAUST_R", help="the directory of the remeshed FAUST set"
-    )
-    parser.add_argument("--output", type=Path, default=Path("speed"), metavar="DIR")
     options = parser.parse_args()
     options.sizes, options.repeats = (SIZES[:1], 3) if options.quick else (SIZES, 9)
     os.environ["JAXSMW_CACHE"] = "off"
 
     measure_parts("Speed", PARTS, options, draw)
-
-
-def measure_parts(
-    title: str,
-    parts: Mapping[str, Callable[[argparse.Namespace], Iterator[Part]]],
-    options: argparse.Namespace,
-    draw: Callable[[dict[str, Any], Path], object] | None = None,
-) -> None:
-    """Measure the parts named in `options.only`, and print each table when it is measured.
-
-    The tables and all numbers are written to files in `options.output`, with names made from the title. The
-    function `draw` draws the numbers to a file.
-    """
-    file = make_directory(options.output) / title.lower()
-    origin = provenance()
-    texts, numbers = [f"# {title}\n\n{json.dumps(origin)}"], {"provenance": origin}
-    print(texts[0])
-    for name in options.only:
-        numbers[name] = []
-        for heading, note, rows, measured in parts[name](options):
-            texts.append(f"## {heading}\n\n{note}\n\n{markdown(rows)}")
-            print(f"\n{texts[-1]}", flush=True)
-            numbers[name].append(measured)
-            file.with_suffix(".md").write_text("\n\n".join(texts), "utf-8")
-            file.with_suffix(".json").write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")
-            if draw is not None:
-                draw(numbers, file.with_suffix(".png"))
 
 
 if __name__ == "__main__":
