@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -208,10 +208,10 @@ def measure_pair(
 def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], float]:
     """Run a method, and return its map and its seconds without compilation; see `Method.measure`."""
     for _ in range(2):
-        with _CompilationClock() as compilation, one_blas_thread():
+        with _compilation_seconds() as compilation, one_blas_thread():
             pointwise_map, seconds = method.measure(pair)
-            seconds -= compilation.seconds
-        warm = name in _warm and not compilation.seconds
+            seconds -= sum(compilation)
+        warm = name in _warm and not compilation
         _warm.add(name)
         # The first run of a method takes longer, for example because of imports, so the method runs a second
         # time. In a long first run, the time for imports is negligible.
@@ -226,20 +226,20 @@ _LONG = 60
 _warm: set[str] = set()
 
 
-class _CompilationClock:
-    """A context manager that adds up the seconds that XLA spends on compilation in this process."""
+@contextmanager
+def _compilation_seconds() -> Iterator[list[float]]:
+    """Collect the seconds of each compilation of XLA in this process within the block."""
+    seconds: list[float] = []
 
-    def __enter__(self) -> _CompilationClock:
-        self.seconds = 0.0
-        jax.monitoring.register_event_duration_secs_listener(self._listen)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        jax.monitoring.unregister_event_duration_listener(self._listen)
-
-    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event == "/jax/core/compile/backend_compile_duration":
-            self.seconds += duration_secs
+            seconds.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield seconds
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 # The statistics of a method that failed.

@@ -4,17 +4,15 @@ This module implements the methods of two papers: Rodolà, Moeller, Cremers, *Po
 refinement from functional correspondence*, VMV 2015, arXiv 1506.05603; and Myronenko, Song, *Point set
 registration: Coherent Point Drift*, IEEE TPAMI 32 (2010).
 
-A search for nearest neighbours recovers a good pointwise map if the functional map is nearly a rotation of
-one spectral embedding onto the other. For non-isometric shapes the functional map is not a rotation. For such
-shapes, Rodolà et al. recover the pointwise map by a non-rigid registration of two point sets in k dimensions.
-The embedding of Y (`Phi_Y C^T`, the "centroids") moves smoothly, and the embedding of X (`Phi_X`, the "data")
-stays fixed.
+For non-isometric shapes, the functional map is not a rotation of one spectral embedding onto the other, so a
+search for nearest neighbours recovers no good pointwise map. Rodolà et al. recover it by a non-rigid
+registration of two point sets in k dimensions. The embedding of Y (`Phi_Y C^T`, the "centroids") moves
+smoothly, and the embedding of X (`Phi_X`, the "data") stays fixed.
 
-In the statistical model, a data point is uniform noise with probability w. Otherwise the data point is drawn
-from a mixture of isotropic Gaussians around the centroids. All Gaussians have the same variance s. Vertex
-areas are ignored, so all vertices have equal weight. The displacement of the centroids is a linear
-combination of Gaussian kernels at the initial centroids `Y`. `G` (n, n) is the kernel matrix, and `W` (n, d)
-contains the coefficients of the linear combination. The moved centroids are `T = Y + G W`.
+In the statistical model, a data point is uniform noise with probability w. Otherwise it is drawn from a
+mixture of isotropic Gaussians of variance s around the centroids. All vertices have equal weight. The moved
+centroids are `T = Y + G W`, with the initial centroids `Y`, the matrix `G` (n, n) of Gaussian kernels at
+them, and the coefficients `W` (n, d).
 
 Expectation maximisation (EM) alternates between two steps. The E-step computes the probability `P_ji` that
 data point i was drawn from the Gaussian around centroid j:
