@@ -20,8 +20,8 @@ from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 
 _Vector = tuple[float, float, float]
 

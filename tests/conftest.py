@@ -1,5 +1,6 @@
 """Settings and fixtures for all tests."""
 
+import functools
 import gc
 import os
 import pickle
@@ -215,6 +216,19 @@ def private_cache(common_directory: Path) -> Iterator[None]:
     """Keep tests from reading or filling the user's cache, and share one cache among all test processes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JAXSMW_CACHE", str(common_directory / "cache"))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def make_one_parser() -> Iterator[None]:
+    """Give all commands of one process the same parser.
+
+    The parser contains many small functions, and the type checks take about a millisecond for each.
+    """
+    from jaxsmw.cli import run
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "make_parser", functools.cache(run.make_parser))
         yield
 
 

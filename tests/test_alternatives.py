@@ -30,14 +30,14 @@ from jaxsmw.matching.starts import make_start
 
 REPAIR = PRESETS["accurate"].repair
 # Fewer samples and levels, which compile faster.
-FEW = {"samples": 500, "levels": (8, 11, 15, 20), "fine_levels": (15, 20, 20, 20)}
+FEW = {"samples": 250, "levels": (8, 11, 15, 20), "fine_levels": (15, 20, 20, 20)}
 REPAIR = replace(REPAIR, alternatives=replace(REPAIR.alternatives, **FEW))
 
 
 @pytest.fixture(scope="module")
 def pair():
     """Two poses of a body with different triangulations."""
-    found = creature_pair(vertices=1500)
+    found = creature_pair(vertices=900)
     return found.source, found.target, found.truth.nearest_corners(found.target)
 
 

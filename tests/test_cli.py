@@ -22,6 +22,7 @@ import pytest
 import scipy.io
 import trimesh
 from command_line import COMMANDS, SMALL, Outcome, assert_refused, runner, write_pair
+from messages import assert_names
 from scipy.spatial import KDTree
 from synthetic import grid_mesh
 
@@ -30,6 +31,7 @@ import jaxsmw.matching.match
 from jaxsmw.banks import CubicSpline, Itersine, Meyer, SpectralDistribution, Warped
 from jaxsmw.benchmark.measurement import Settings
 from jaxsmw.cli.banks import BANKS, bounds_unless_tight, make_bank
+from jaxsmw.cli.console import with_options
 from jaxsmw.cli.run import run_command
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
@@ -436,9 +438,23 @@ def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
     assert outcome.code == 0 and mean_error(outcome.output) == 0
     assert outcome.errors.count(f"note: {tmp_path / 'truth.mat'} is read with indices from 1") == 2
     from_0 = ("evaluate", *meshes, tmp_path / "from_0.mat", "--ground-truth", pair / "truth.txt", "--quiet")
-    assert run(*from_0).code == 2
+    outcome = run(*from_0)
+    assert outcome.code == 2 and "pass --index-base 0" in outcome.errors
     outcome = run(*from_0, "--index-base", "0")
     assert outcome.code == 0 and mean_error(outcome.output) == 0 and not outcome.errors
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ("welding (weld=True).", "welding (--weld)."),
+        ("the robust Laplacian (laplacian='robust', on the command line --laplacian robust).", "the robust Laplacian (--laplacian robust)."),
+        ('set mirror="no" (--mirror no); if', "set --mirror no; if"),
+        ("scale=1.5.ply: pass index_base=1.", "scale=1.5.ply: pass --index-base 1."),
+    ],
+)  # fmt: skip
+def test_messages_of_the_library_name_options(message, expected):
+    assert with_options(message) == expected
 
 
 def test_a_mesh_with_many_defects_has_one_line_of_each_kind(run, tmp_path):
@@ -723,9 +739,9 @@ def test_output_that_cannot_be_written_is_reported(pair, arguments, unbuffered):
     with open("/dev/full", "w") as full:
         result = subprocess.run(call, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
     assert result.returncode == 2
-    assert result.stderr == (
-        "jaxsmw: standard output: cannot be written (No space left on device): redirect standard output to "
-        "a disk with free space.\n"
+    assert result.stderr.count("\n") == 1
+    assert_names(
+        result.stderr, "jaxsmw: standard output", "No space left on device", "redirect", "free space"
     )
 
 

@@ -233,7 +233,7 @@ def test_landmarks_of_both_meshes_are_the_initial_map(run, pair, tmp_path):
         ("--landmarks {p}/x.mrk.json --landmarks-output {t}/l.csv --coordinates XYZ", "invalid choice: 'XYZ'"),
         (
             "--landmarks {p}/x.csv --landmarks-output {t}/l.mrk.json",
-            "the one of {p}/x.csv is not known: state LPS or RAS (--coordinates)",
+            "the one of {p}/x.csv is not known: set --coordinates LPS or --coordinates RAS",
         ),
         ("--registered {t}/r.off --init landmarks:{p}/x.mrk.json,{t}/missing.csv", "missing.csv"),
     ],

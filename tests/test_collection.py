@@ -27,7 +27,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io import Landmarks, MeshData, read_landmark_file, write_landmark_file
 from jaxsmw.runtime.cache import Store
 
-VERTICES = 1000
+VERTICES = 800
 
 
 def renumbered(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:

@@ -541,7 +541,7 @@ SURFACE = {
 }
 BASIS = {"evals": np.arange(3.0), "evecs": np.eye(8, 3)}
 BAD_VARIABLES = {
-    "map counted from 0": ("pointwise map", {"T12": np.arange(M) % N}, r"row 1: 0 is not .* numbered 1 to 162.*--index-base 0"),
+    "map counted from 0": ("pointwise map", {"T12": np.arange(M) % N}, r"row 1: 0 is not .* numbered 1 to 162.*index_base=0"),
     "map out of range": ("pointwise map", {"T12": np.arange(M) % N + 2}, "row 162: 163 is not one of the vertices of y"),
     "map of another pair": ("pointwise map", {"T12": np.ones(N)}, "has 162 rows, but needs one for each of the 642"),
     "map of fractions": ("pointwise map", {"T12": np.full(M, 1.5)}, "row 1: 1.5 is not one of"),
@@ -614,8 +614,8 @@ def test_unsupported_and_damaged_files_are_refused(bodies, spectra, tmp_path):
         "not all finite": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.mat", np.eye(3) * np.nan),
         "read from .npz and .mat": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.txt"),
         "does not exist": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.npz"),
-        "damaged or lacks": lambda: jaxsmw.io.read_spectrum(tmp_path / "damaged.npz"),
-        "lacks one of": lambda: jaxsmw.io.read_spectrum(tmp_path / "fields.npz"),
+        "damaged or not a .npz file": lambda: jaxsmw.io.read_spectrum(tmp_path / "damaged.npz"),
+        "lacks eigenvectors, vertex_areas": lambda: jaxsmw.io.read_spectrum(tmp_path / "fields.npz"),
         "not a pointwise map": lambda: jaxsmw.write_pointwise_map(tmp_path / "t.mat", [0.5]),
     }.items():
         with pytest.raises(InputError, match=fault):

@@ -29,7 +29,7 @@ from hypothesis import strategies as st
 
 from jaxsmw.cli.run import run_command
 from jaxsmw.errors import InputError
-from jaxsmw.io.landmarks import read_landmark_file
+from jaxsmw.io.landmark_files import read_landmark_file
 
 CORPUS = Path(__file__).parent / "corpus"
 MESHES = sorted(

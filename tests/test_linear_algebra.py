@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 import numpy as np
 import pytest
+from sampled_cases import first_always
 from synthetic import random_spectrum
 
 from jaxsmw.core import linear_algebra
@@ -67,9 +68,7 @@ def refine_batch(name, vertices, eigenvectors):
     print("refined")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "regression" else pytest.mark.slow) for name in REFINERS]
-)
+@pytest.mark.parametrize("name", first_always(sorted(REFINERS, key=lambda name: name != "regression")))
 def test_a_batch_of_pairs_does_not_wait_for_ever(name):
     """Without a loop around LAPACK, the batch of `FeatureRegression` waits for ever (jaxlib 0.10)."""
     here = Path(__file__).parent

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from messages import refused
 from report_helpers import TALL, decode, ellipsoid, embedded, renumbered
 from synthetic import random_spectrum
 
@@ -36,8 +37,14 @@ def _page(mesh_x: Mesh, mesh_y: Mesh, pointwise_map: Any, *, errors: Any = None,
 def test_invalid_maps_and_errors_are_refused(show: Callable[..., Any]) -> None:
     n = len(TALL.vertices)
     good = np.arange(n)
-    for bad in (good[1:], good.astype(float), good[None], good + 1, good - 1):
-        with pytest.raises(InputError, match="give a map from X to Y"):
+    for bad, fault in (
+        (good[1:], f"has {n - 1} .*: give a map from X to Y"),
+        (good.astype(float), "must be a list of integers"),
+        (good[None], "must be a list of integers"),
+        (good + 1, f"between 0 and {n - 1}, but entry {n - 1} is {n}: .* count from 1"),
+        (good - 1, f"between 0 and {n - 1}, but entry 0 is -1"),
+    ):
+        with pytest.raises(InputError, match=fault):
             show(TALL, TALL, bad)
     for errors in (np.zeros(n - 1), np.full(n, -0.1)):
         with pytest.raises(InputError, match="non-negative"):
@@ -127,7 +134,7 @@ def test_page_holds_the_placements_and_the_registered_source(tmp_path: Path) -> 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("registered", [TALL.vertices[1:], TALL.vertices * np.nan, TALL.vertices[:, :2]])
 def test_registered_positions_that_do_not_fit_are_refused(registered: np.ndarray) -> None:
-    with pytest.raises(InputError, match="three finite numbers for each of the 642 vertices of ellipsoid"):
+    with refused("three finite numbers", "642 vertices", "ellipsoid"):
         _page(TALL, TALL, np.arange(len(TALL.vertices)), registered=registered)
 
 

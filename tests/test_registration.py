@@ -256,7 +256,7 @@ def test_both_maps_of_a_state_are_recovered_together(pair, refiner, sampled):
     prepared = refiner.prepare(Problem(x, y, samples))
     start = initial_map[samples[0]] if sampled else initial_map
     state, _ = refiner.update(prepared, start, None)
-    state, _ = refiner.update(prepared, refiner.recover(prepared, state), state)
+    state, _ = refiner.update(prepared, *refiner.recover_both(prepared, state))
     found, completed = refiner.recover_both(prepared, state)
     np.testing.assert_array_equal(found, refiner.recover(prepared, state))
     assert state.reverse_map is None

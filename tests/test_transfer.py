@@ -395,7 +395,7 @@ class TestLandmarks:
         registered = on_same_numbering(mesh_x, self.mesh_y)
         landmarks = self.landmarks(coordinates="LPS")
         flipped = (landmarks.positions + SHIFT) * [-1, -1, 1]
-        with pytest.raises(InputError, match="--coordinates RAS"):
+        with pytest.raises(InputError, match='coordinates="RAS"'):
             transfer_landmarks(replace(landmarks, positions=flipped), registered)
 
     def test_expected_errors_have_the_unit_of_the_target(self):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import get_args
 
 from jaxsmw.choices import APPROXIMATE_FROM, Axis, Eigensolver, IndexBase, Laplacian, Scale
@@ -51,9 +51,60 @@ def path(text: str) -> str:
     return text
 
 
+def positive_number(text: str) -> float:
+    """An argument type for positive numbers."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if 0 < number < math.inf:
+        return number
+    raise argparse.ArgumentTypeError(f"{shortened(text)!r} is not a positive number")
+
+
+def _scale(text: str) -> float | Scale:
+    (unknown,) = get_args(Scale)
+    if text == unknown:
+        return unknown
+    try:
+        return positive_number(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(
+            f"{shortened(text)!r} is no scale: give a positive number or {unknown}"
+        ) from None
+
+
 def shortened(text: str) -> str:
     """Shorten a text for a message."""
     return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
+
+
+def add_values(
+    parser: argparse._ActionsContainer, kind: Callable[[str], object], helps: Mapping[str, str]
+) -> None:
+    """Add options with a value of one argument type. The keys of `helps` are like `--output FILE`."""
+    for words, text in helps.items():
+        option, _, metavar = words.partition(" ")
+        parser.add_argument(option, metavar=metavar, type=kind, help=text)
+
+
+def add_paths(parser: argparse._ActionsContainer, helps: Mapping[str, str]) -> None:
+    """Add options with the name of a file or directory, as `add_values` does."""
+    add_values(parser, path, helps)
+
+
+def add_seed(parser: argparse.ArgumentParser, purpose: str) -> None:
+    """Add `--seed`. The help text begins with `purpose`."""
+    parser.add_argument("--seed", type=whole_number(0), default=0, help=f"{purpose} (default: %(default)s)")
+
+
+def add_processes(parser: argparse.ArgumentParser, *, default: int | None, purpose: str) -> None:
+    """Add `--workers` and `--scheduler`, which exclude each other. `purpose` is the help of `--workers`."""
+    processes = parser.add_mutually_exclusive_group()
+    processes.add_argument("--workers", metavar="N", type=whole_number(1), default=default, help=purpose)
+    processes.add_argument(
+        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, whose workers match the pairs"
+    )
 
 
 def add_quiet(parser: argparse.ArgumentParser) -> None:
@@ -94,13 +145,9 @@ def add_eigenproblem(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def add_weld(parser: argparse.ArgumentParser) -> None:
-    """Add `--weld`."""
-    parser.add_argument("--weld", action="store_true", help="merge vertices at the same position")
-
-
-def add_index_base(parser: argparse.ArgumentParser) -> None:
-    """Add `--index-base`."""
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """Add `--weld` and `--index-base`, which say how files are read."""
+    add_weld(parser)
     parser.add_argument(
         "--index-base",
         type=int,
@@ -110,51 +157,27 @@ def add_index_base(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_partial(
-    parser: argparse.ArgumentParser, *, condition: str = "; both must have the same unit of length"
-) -> None:
-    """Add `--partial`. The help text of `--partial` ends with `condition`."""
+def add_weld(parser: argparse.ArgumentParser) -> None:
+    """Add `--weld`."""
+    parser.add_argument("--weld", action="store_true", help="merge vertices at the same position")
+
+
+def add_partial(parser: argparse.ArgumentParser, *, with_scale: bool) -> None:
+    """Add `--partial`, and perhaps `--scale`."""
+    condition = "" if with_scale else "; both must have the same unit of length"
     parser.add_argument(
         "--partial",
         action="store_true",
         help=f"declare that one mesh or both meshes are partial shapes of the body{condition}",
     )
-
-
-def add_partial_of_any_scale(parser: argparse.ArgumentParser) -> None:
-    """Add `--partial` and `--scale`."""
-    add_partial(parser, condition="")
-    parser.add_argument(
-        "--scale",
-        type=_scale,
-        help="with --partial: the number by which lengths on the source are multiplied to become lengths in "
-        "the target's unit, or unknown to estimate this number (default: 1, for the same unit of length)",
-    )
-
-
-def _scale(text: str) -> float | Scale:
-    (unknown,) = get_args(Scale)
-    if text == unknown:
-        return unknown
-    if (number := _finite(text)) > 0:
-        return number
-    raise argparse.ArgumentTypeError(f"{shortened(text)!r} is no scale: give a positive number or {unknown}")
-
-
-def positive_number(text: str) -> float:
-    """An argument type for positive numbers."""
-    if (number := _finite(text)) > 0:
-        return number
-    raise argparse.ArgumentTypeError(f"{shortened(text)!r} is not a positive number")
-
-
-def _finite(text: str) -> float:
-    """Return a finite number; NaN for any other text."""
-    try:
-        number = float(text)
-    except ValueError:
-        return math.nan
-    return number if math.isfinite(number) else math.nan
+    if with_scale:
+        parser.add_argument(
+            "--scale",
+            type=_scale,
+            help="with --partial: the number by which lengths on the source are multiplied to become lengths "
+            "in the target's unit, or unknown to estimate this number (default: 1, for the same unit of "
+            "length)",
+        )
 
 
 def add_up(parser: argparse.ArgumentParser) -> None:
@@ -172,7 +195,12 @@ def refuse_without(options: argparse.Namespace, needed: str, is_given: bool, *na
     for name in names:
         value = getattr(options, name)
         if not is_given and value is not None and value is not False:
-            option = f"--{name.replace('_', '-')}"
+            option = option_of(name)
             raise InputError(
                 f"{option}: has no effect without {needed}: add {needed}, or leave {option} out."
             )
+
+
+def option_of(name: str) -> str:
+    """Return the option of an attribute of the parsed options, such as `--index-base` for `index_base`."""
+    return f"--{name.replace('_', '-')}"

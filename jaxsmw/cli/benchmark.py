@@ -9,12 +9,8 @@ from typing import get_args
 
 from jaxsmw.benchmark.opponents.registry import METHODS, PEERS
 from jaxsmw.benchmark.protocols import PROTOCOLS
-from jaxsmw.choices import (
-    DEFAULT_INITIAL_MAP,
-    DEFAULT_MATCH_INIT,
-    MatchInit,
-)
-from jaxsmw.cli.arguments import path, whole_number
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MATCH_INIT, MatchInit
+from jaxsmw.cli.arguments import add_paths, add_processes, add_seed, option_of, path, whole_number
 from jaxsmw.cli.console import report_progress, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
 from jaxsmw.cli.outputs import check_outputs
@@ -56,13 +52,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=list(PROTOCOLS),
         help="the pairs on which papers report errors: %(choices)s. The data set must be complete",
     )
-    parser.add_argument(
-        "--init",
-        metavar="INITIAL_MAP",
-        type=path,
-        help=f"initial map of all methods: {', '.join(get_args(MatchInit))}, or a directory with maps "
-        f"in files named X_Y.map (default: {DEFAULT_MATCH_INIT}). With {DEFAULT_MATCH_INIT}, all methods "
-        f"start from {DEFAULT_INITIAL_MAP}, and accurate also from aligned if the shapes are asymmetric",
+    add_paths(
+        parser,
+        {
+            "--init INITIAL_MAP": f"initial map of all methods: {', '.join(get_args(MatchInit))}, or a "
+            f"directory with maps in files named X_Y.map (default: {DEFAULT_MATCH_INIT}). With "
+            f"{DEFAULT_MATCH_INIT}, all methods start from {DEFAULT_INITIAL_MAP}, and accurate also from "
+            "aligned if the shapes are asymmetric"
+        },
     )
     parser.add_argument(
         "--mirrored",
@@ -75,37 +72,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=whole_number(1),
         help="number of random points at which errors are measured (default: all points)",
     )
-    parser.add_argument(
-        "--seed",
-        type=whole_number(0),
-        default=0,
-        help="seed for the random choice of pairs and points (default: %(default)s)",
+    add_seed(parser, "seed for the random choice of pairs and points")
+    add_paths(
+        parser,
+        {
+            "--output DIR": "directory for results, tables and figures (default: jaxsmw-benchmark-NAME, "
+            "where NAME is the name of the data set)",
+            "--verify RESULTS.CSV": "measure a random tenth of the pairs in this file again, with all its "
+            "methods or with --methods, and compare the errors; nothing is stored",
+        },
     )
-    parser.add_argument(
-        "--output",
-        metavar="DIR",
-        type=path,
-        help="directory for results, tables and figures (default: jaxsmw-benchmark-NAME, where NAME is the "
-        "name of the data set)",
-    )
-    parser.add_argument(
-        "--verify",
-        metavar="RESULTS.CSV",
-        type=path,
-        help="measure a random tenth of the pairs in this file again, with all its methods or with "
-        "--methods, and compare the errors; nothing is stored",
-    )
-    processes = parser.add_mutually_exclusive_group()
-    processes.add_argument(
-        "--workers",
-        metavar="N",
-        type=whole_number(1),
+    add_processes(
+        parser,
         default=os.cpu_count() or 1,
-        help="number of worker processes, each on one core; measured times are most accurate with one "
+        purpose="number of worker processes, each on one core; measured times are most accurate with one "
         "process (default: %(default)s, the number of cores)",
-    )
-    processes.add_argument(
-        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, whose workers match the pairs"
     )
 
 
@@ -161,10 +142,7 @@ def _measure(options: argparse.Namespace) -> None:
     directory = make_directory(output)
     report_progress(f"{data_set.layout}, {len(pairs)} of {len(data_set.pairs)} pairs")
     announce_consequence(f"finished pairs are kept in {output}, and the same command continues from there")
-    with (
-        quiet_children(),
-        open_executor(options.workers, options.scheduler) as executor,
-    ):
+    with quiet_children(), open_executor(options.workers, options.scheduler) as executor:
         results = run_benchmark(data_set, pairs, directory, methods, settings, executor, quiet=options.quiet)
     if results.rows:
         show(markdown_table(write_tables(directory, data_set, results, settings, methods)).rstrip("\n"))
@@ -179,17 +157,12 @@ def _verify(options: argparse.Namespace) -> None:
     from jaxsmw.benchmark.verification import StoredResults
     from jaxsmw.runtime.workers import open_executor
 
-    given = {
-        "--pairs": options.pairs,
-        "--protocol": options.protocol,
-        "--mirrored": options.mirrored or None,
-        "--evaluation-samples": options.evaluation_samples,
-        "--output": options.output,
-    }
-    if unused := [name for name, value in given.items() if value is not None]:
-        raise InputError(
-            f"--verify uses the settings of the stored results, so {unused[0]} has no effect: leave it out."
-        )
+    for name in ("pairs", "protocol", "mirrored", "evaluation_samples", "output"):
+        if getattr(options, name) not in (None, False):
+            raise InputError(
+                f"--verify uses the settings of the stored results, so {option_of(name)} has no effect: "
+                "leave it out."
+            )
     data_set = open_data_set(options.data)
     stored = StoredResults(Path(options.verify), options.init)
     pairs = stored.draw(data_set, options.seed)

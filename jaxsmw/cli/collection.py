@@ -5,13 +5,22 @@ from __future__ import annotations
 import argparse
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, NamedTuple, get_args
 
 from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, EDGES_PER_SHAPE, MirrorCollection, PresetName
-from jaxsmw.cli.arguments import add_weld, path, refuse_without, whole_number
+from jaxsmw.cli.arguments import (
+    add_paths,
+    add_processes,
+    add_seed,
+    add_weld,
+    option_of,
+    path,
+    refuse_without,
+    whole_number,
+)
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
 from jaxsmw.cli.outputs import check_outputs
@@ -27,6 +36,8 @@ if TYPE_CHECKING:
 
 HELP = "match all meshes of a directory consistently; register a template on each; compute a shape model"
 
+# The options that name one mesh of the directory.
+_ONE_MESH = ("template", "landmarks_of", "attributes_of")
 # More edges cost time, but hardly improve the maps. (Table R26 of docs/research_log.md)
 _MOST_EDGES = 6
 
@@ -48,12 +59,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="directory for the results. An interrupted run is continued by the same command. If meshes are "
         "added to DIRECTORY, the same command matches only their own pairs",
     )
-    parser.add_argument(
-        "--template",
-        metavar="FILE",
-        type=path,
-        help="mesh of DIRECTORY whose triangulation all meshes receive (default: the template of earlier "
-        "results in DIR, otherwise the mesh that is most similar to all others)",
+    add_paths(
+        parser,
+        {
+            "--template FILE": "mesh of DIRECTORY whose triangulation all meshes receive (default: the "
+            "template of earlier results in DIR, otherwise the mesh that is most similar to all others)"
+        },
     )
     parser.add_argument(
         "--exclude",
@@ -107,42 +118,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=".ply",
         help="suffix of the written meshes, which determines their format (default: %(default)s)",
     )
-    parser.add_argument(
-        "--landmarks",
-        metavar="FILE",
-        type=path,
-        help="landmarks on one mesh, which are transferred to all meshes, in the formats of transfer "
-        "--landmarks",
+    add_paths(
+        parser,
+        {
+            "--landmarks FILE": "landmarks on one mesh, which are transferred to all meshes, in the formats "
+            "of transfer --landmarks",
+            "--landmarks-of FILE": "mesh of DIRECTORY to which the landmarks belong (default: the mesh with "
+            "the name of the landmark file)",
+            "--attributes-of FILE": "mesh of DIRECTORY whose colours, labels, texture coordinates and other "
+            "attributes are transferred to all meshes",
+        },
     )
-    parser.add_argument(
-        "--landmarks-of",
-        metavar="FILE",
-        type=path,
-        help="mesh of DIRECTORY to which the landmarks belong (default: the mesh with the name of the "
-        "landmark file)",
-    )
-    parser.add_argument(
-        "--attributes-of",
-        metavar="FILE",
-        type=path,
-        help="mesh of DIRECTORY whose colours, labels, texture coordinates and other attributes are "
-        "transferred to all meshes",
-    )
-    parser.add_argument(
-        "--seed",
-        type=whole_number(0),
-        default=0,
-        help="seed of the random pairs (default: %(default)s)",
-    )
-    processes = parser.add_mutually_exclusive_group()
-    processes.add_argument(
-        "--workers",
-        metavar="N",
-        type=whole_number(1),
-        help="number of worker processes that match pairs, each on one core (default: this process alone)",
-    )
-    processes.add_argument(
-        "--scheduler", metavar="ADDRESS", help="address of a Dask scheduler, whose workers match the pairs"
+    add_seed(parser, "seed of the random pairs")
+    add_processes(
+        parser,
+        default=None,
+        purpose="number of worker processes that match pairs, each on one core (default: this process alone)",
     )
     add_weld(parser)
 
@@ -154,22 +145,21 @@ def run(options: argparse.Namespace) -> None:
         files = _mesh_files(options)
         _check(options, files)
         from jaxsmw.collection.files import RESULT_DIRECTORIES, check_replaceable, replace_results
-        from jaxsmw.io.landmarks import check_frame, read_landmark_file
+        from jaxsmw.io.landmark_files import read_landmark_file
+        from jaxsmw.io.landmarks import check_frame
         from jaxsmw.runtime.files import make_directory, remove_leftovers
         from jaxsmw.runtime.provenance import claimed_directory
     with stopwatch.step("reading"):
         _note_other_files(options)
         landmarks = read_landmark_file(options.landmarks) if options.landmarks else None
-        data, unreadable = _read(files, weld=options.weld)
-    for option in ("template", "landmarks_of", "attributes_of"):
-        if (file := getattr(options, option)) and Path(file).name not in data:
-            raise InputError(
-                f"--{option.replace('_', '-')}: {file} was left out (see above): choose another mesh."
-            )
+        meshes = _read(files, weld=options.weld)
+    for option in _ONE_MESH:
+        if (file := getattr(options, option)) and Path(file).name not in meshes.data:
+            raise InputError(f"{option_of(option)}: {file} was left out (see above): choose another mesh.")
     if landmarks is not None:
-        check_frame(landmarks, data[Path(options.landmarks_of).name].mesh)
-    check_replaceable(Path(options.output), _names(data))
-    _keep_template(options, data)
+        check_frame(landmarks, meshes.data[Path(options.landmarks_of).name].mesh)
+    check_replaceable(Path(options.output), list(meshes.names.values()))
+    _keep_template(options, meshes)
     directory = make_directory(options.output)
     work = make_directory(directory / "work")
     announce_consequence(
@@ -179,8 +169,8 @@ def run(options: argparse.Namespace) -> None:
         # Killed runs leave temporary files.
         for place in (directory, work, *(directory / name for name in RESULT_DIRECTORIES)):
             remove_leftovers(place)
-        collection = _match(options, data, work, executor)
-        collection.left_out.update(unreadable)
+        collection = _match(options, meshes, work, executor)
+        collection.left_out.update(meshes.unreadable)
         stopwatch.add(collection.seconds)
         with stopwatch.step("shape model"):
             model = collection.shape_model(scale=options.scale, number_of_modes=options.modes)
@@ -189,11 +179,23 @@ def run(options: argparse.Namespace) -> None:
             # Results of an earlier run are replaced only when all new results are complete.
             new = work / "new"
             shutil.rmtree(new, ignore_errors=True)  # a killed run left this directory
-            _write(options, collection, data, landmarks, model, measures, make_directory(new))
+            _write(options, collection, meshes, landmarks, model, measures, make_directory(new))
             replace_results(new, directory)
-    _show(collection, measures, scale=options.scale)
+    _show(collection, model, scale=options.scale)
     show(f"time: {stopwatch.summary()} (compilation included)")
     report_progress(f"the results are in {options.output}")
+
+
+class _Meshes(NamedTuple):
+    """The meshes of the directory that can be read, and the reasons why other files cannot be read.
+
+    The keys are file names. `names` contains unique names for the results, such as `cat` for `cat.ply`, or
+    `cat_ply` if there are two cats.
+    """
+
+    data: dict[str, MeshData]
+    names: dict[str, str]
+    unreadable: dict[str, str]
 
 
 def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
@@ -234,7 +236,7 @@ _NAMED_FILES = 8
 
 def _note_other_files(options: argparse.Namespace) -> None:
     """Print a note that names the files that are neither meshes nor usual companions of meshes."""
-    from jaxsmw.io.landmarks import LANDMARK_SUFFIXES
+    from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
     from jaxsmw.io.meshes import MESH_SUFFIXES
 
     known = (*MESH_SUFFIXES, *LANDMARK_SUFFIXES, *_COMPANIONS)
@@ -260,15 +262,14 @@ def _inside(options: argparse.Namespace, option: str, file: str, files: Mapping[
         if Path(file).name in files and _same(given, files[Path(file).name]):
             return given
     raise InputError(
-        f"--{option.replace('_', '-')}: {file} is not a mesh file in {options.directory}: give one of its "
-        "files."
+        f"{option_of(option)}: {file} is not a mesh file in {options.directory}: give one of its files."
     )
 
 
 def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
     """Check the options and the output directory before the long computation."""
     from jaxsmw.collection.files import RESULT_FILES
-    from jaxsmw.io.landmarks import check_landmark_suffix, check_readable_suffix
+    from jaxsmw.io.landmark_files import check_readable_suffix
     from jaxsmw.io.meshes import check_mesh_suffix
     from jaxsmw.runtime.files import size_of_file
 
@@ -281,19 +282,16 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
     options.mirrored = [_inside(options, "mirrored", file, files) for file in options.mirrored]
     if options.suffix.count(".") != 1 or "/" in options.suffix:
         raise InputError(f"--suffix: {options.suffix!r} is not a suffix: give for example .ply or .obj.")
-    for option in ("template", "landmarks_of", "attributes_of"):
+    for option in _ONE_MESH:
         if file := getattr(options, option):
             setattr(options, option, _inside(options, option, file, files))
     if options.landmarks:
         size_of_file(options.landmarks)
-        check_readable_suffix(options.landmarks)
-        check_landmark_suffix(f"landmarks{_landmark_suffix(options.landmarks)}")
-        options.landmarks_of = options.landmarks_of or _mesh_of(options.landmarks, files)
-    check_outputs(
-        [*map(str, files.values()), options.landmarks],
-        directories=[(options.output, RESULT_FILES)],
-    )
-    _refuse_results_as_inputs(options, files)
+        suffix = check_readable_suffix(options.landmarks)
+        options.landmarks_of = options.landmarks_of or _mesh_of(options.landmarks, suffix, files)
+    inputs = [*map(str, files.values()), *([options.landmarks] if options.landmarks else [])]
+    check_outputs(inputs, directories=[(options.output, RESULT_FILES)])
+    _refuse_results_as_inputs(options.output, inputs, files)
     if _same(options.output, Path(options.directory)):
         raise InputError(
             f"{options.output}: is the directory of the meshes: choose another directory for the results."
@@ -304,21 +302,20 @@ def _check(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
 _LONGEST_NAME = 255
 
 
-def _refuse_results_as_inputs(options: argparse.Namespace, files: Mapping[str, Path]) -> None:
+def _refuse_results_as_inputs(output: str, inputs: Iterable[str], names: Iterable[str]) -> None:
     """Refuse inputs that the results would replace, and mesh names that are too long for result files."""
     from jaxsmw.collection.files import RESULT_DIRECTORIES
 
-    output = Path(os.path.realpath(options.output))
-    for file in filter(None, [*map(str, files.values()), options.landmarks]):
+    root = Path(os.path.realpath(output))
+    for file in inputs:
         path = Path(os.path.realpath(file))
-        if path.is_relative_to(output):
-            inside = path.relative_to(output)
-            if inside.parts[0] in (*RESULT_DIRECTORIES, "work") or inside.stem == "mean":
-                raise InputError(
-                    f"{file}: lies among the results in {options.output}, which would replace it: choose "
-                    "another directory for the results."
-                )
-    for name in files:
+        inside = path.relative_to(root).parts if path.is_relative_to(root) else ()
+        if inside and (inside[0] in (*RESULT_DIRECTORIES, "work") or path.stem == "mean"):
+            raise InputError(
+                f"{file}: lies among the results in {output}, which would replace it: choose another "
+                "directory for the results."
+            )
+    for name in names:
         if len(os.fsencode(f".{'x' * 16}{name}_from_template.txt")) > _LONGEST_NAME:
             raise InputError(f"{name}: the file name is too long for the names of the results: shorten it.")
 
@@ -327,31 +324,23 @@ def _same(file: str, other: Path) -> bool:
     return os.path.realpath(file) == os.path.realpath(other)
 
 
-def _landmark_suffix(file: str) -> str:
-    """Return the suffix of the files to which transferred landmarks are written."""
-    name = Path(file).name.lower()
-    if name.endswith(".mps"):
-        return ".csv"
-    return ".mrk.json" if name.endswith(".mrk.json") else Path(name).suffix
-
-
-def _mesh_of(landmarks: str, files: Mapping[str, Path]) -> str:
+def _mesh_of(landmarks: str, suffix: str, files: Mapping[str, Path]) -> str:
     """Return the mesh file that has the same name as a landmark file, apart from the suffix."""
-    stem = Path(landmarks).name[: -len(_landmark_suffix(landmarks))]
-    found = [str(file) for name, file in files.items() if Path(name).stem == stem]
-    if len(found) != 1:
+    stem = Path(landmarks).name[: -len(suffix)]
+    of_stem = [str(file) for name, file in files.items() if Path(name).stem == stem]
+    if len(of_stem) != 1:
         raise InputError(
             f"{landmarks}: no single mesh is named {stem}: give --landmarks-of FILE, the mesh with these "
             "landmarks."
         )
-    return found[0]
+    return of_stem[0]
 
 
-def _read(files: Mapping[str, Path], *, weld: bool) -> tuple[dict[str, MeshData], dict[str, str]]:
-    """Return the meshes by their file names, and the reasons why other files cannot be read."""
+def _read(files: Mapping[str, Path], *, weld: bool) -> _Meshes:
     from jaxsmw.io.meshes import read_mesh_data
 
-    data, unreadable = {}, {}
+    data: dict[str, MeshData] = {}
+    unreadable = {}
     for name, file in files.items():
         try:
             data[name] = read_mesh_data(file, weld=weld)
@@ -362,15 +351,18 @@ def _read(files: Mapping[str, Path], *, weld: bool) -> tuple[dict[str, MeshData]
             say(f"{name} is left out: {error}")
     if len(data) < 2:
         raise InputError(f"only {len(data)} of {len(files)} meshes can be read: a collection needs two.")
-    return data, unreadable
+    for names in ([Path(name).stem for name in data], [name.replace(".", "_") for name in data], list(data)):
+        if len(set(names)) == len(names):
+            break
+    return _Meshes(data, dict(zip(data, names, strict=True)), unreadable)
 
 
-def _keep_template(options: argparse.Namespace, data: Mapping[str, MeshData]) -> None:
+def _keep_template(options: argparse.Namespace, meshes: _Meshes) -> None:
     """Keep the template of earlier results, because another one would renumber all registered meshes."""
     from jaxsmw.collection.files import read_template
 
     earlier = None if options.template else read_template(Path(options.output))
-    for file, name in zip(data, _names(data), strict=True):
+    for file, name in meshes.names.items():
         if name == earlier:
             options.template = str(Path(options.directory) / file)
             report_progress(
@@ -389,26 +381,15 @@ def _executor(options: argparse.Namespace) -> Iterator[Executor | None]:
         yield executor
 
 
-def _provenance(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+def _provenance(options: argparse.Namespace) -> dict[str, dict[str, object]]:
     """Return the settings and versions that must be equal in all runs with the same output directory."""
     from jaxsmw.runtime.provenance import code_digest, measured_code, versions
 
     settings = {name: getattr(options, name) for name in ("preset", "mirror", "weld", "seed")}
-    return {"settings": settings, "versions": versions() | {"code": code_digest(measured_code())}}
+    return {"settings": settings, "versions": {**versions(), "code": code_digest(measured_code())}}
 
 
-def _names(data: Mapping[str, MeshData]) -> list[str]:
-    """Return a unique name for each mesh, such as `cat` for `cat.ply`, or `cat_ply` if there are two cats."""
-    stems = [Path(name).stem for name in data]
-    for names in (stems, [name.replace(".", "_") for name in data]):
-        if len(set(names)) == len(names):
-            return names
-    return list(data)
-
-
-def _match(
-    options: argparse.Namespace, data: Mapping[str, MeshData], work: Path, executor: Executor | None
-) -> Collection:
+def _match(options: argparse.Namespace, meshes: _Meshes, work: Path, executor: Executor | None) -> Collection:
     from tqdm import tqdm
 
     from jaxsmw.collection.matching import match_collection
@@ -425,11 +406,11 @@ def _match(
             bars.pop(step).close()
 
     return match_collection(
-        [one.mesh for one in data.values()],
-        names=_names(data),
+        [data.mesh for data in meshes.data.values()],
+        names=list(meshes.names.values()),
         preset=options.preset,
-        template=None if options.template is None else list(data).index(Path(options.template).name),
-        mirror=[name in mirrored for name in data] if mirrored else options.mirror,
+        template=None if options.template is None else list(meshes.data).index(Path(options.template).name),
+        mirror=[name in mirrored for name in meshes.data] if mirrored else options.mirror,
         edges_per_shape=options.edges,
         seed=options.seed,
         directory=work,
@@ -438,11 +419,11 @@ def _match(
     )
 
 
-def _measures(model: ShapeModel) -> dict[str, Any]:
+def _measures(model: ShapeModel) -> dict[str, object]:
     """Return the variances and the figures of merit of a shape model, for `collection.json`."""
     count, modes = len(model.scores), len(model.modes)
     numbers = [number for number in _REPORTED_MODES if number <= min(modes, count - 2)]
-    found: dict[str, Any] = {
+    measures: dict[str, object] = {
         "variances": model.variances.tolist(),
         "compactness": model.compactness().tolist(),
         "numbers_of_modes": numbers,
@@ -452,8 +433,8 @@ def _measures(model: ShapeModel) -> dict[str, Any]:
             ("generalisation", model.generalisation(numbers)),
             ("specificity", model.specificity(numbers)),
         ):
-            found[name] = {"mean": curve.mean.tolist(), "standard_error": curve.standard_error.tolist()}
-    return found
+            measures[name] = {"mean": curve.mean.tolist(), "standard_error": curve.standard_error.tolist()}
+    return measures
 
 
 # If the sizes of two meshes differ by more than this factor, the meshes probably have different units of
@@ -468,10 +449,10 @@ _REPORTED_MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 def _write(
     options: argparse.Namespace,
     collection: Collection,
-    data: Mapping[str, MeshData],
+    meshes: _Meshes,
     landmarks: Landmarks | None,
     model: ShapeModel,
-    measures: Mapping[str, Any],
+    measures: Mapping[str, object],
     directory: Path,
 ) -> None:
     from jaxsmw.collection.files import (
@@ -482,32 +463,36 @@ def _write(
         write_registered,
         write_summary,
     )
+    from jaxsmw.io.landmark_files import check_readable_suffix
     from jaxsmw.report.collection_page import write_collection_page
     from jaxsmw.runtime.provenance import machine
 
-    names = dict(zip(data, _names(data), strict=True))
-    by_name = {names[file]: contents for file, contents in data.items()}
+    by_name = {meshes.names[file]: data for file, data in meshes.data.items()}
     kept = [by_name[name] for name in collection.names]
-    sources = {
-        option: _number(collection, names[Path(file).name], file)
-        for option in ("landmarks_of", "attributes_of")
-        if (file := getattr(options, option))
-    }
+
+    def number(file: str) -> int:
+        name = meshes.names[Path(file).name]
+        if name not in collection.names:
+            raise InputError(f"{file}: was left out of the collection: choose another mesh.")
+        return collection.names.index(name)
+
+    landmarks_of = number(options.landmarks_of) if options.landmarks_of else None
+    attributes_of = number(options.attributes_of) if options.attributes_of else None
     files = write_maps(collection, directory)
     files += write_registered(collection, kept[collection.template], directory, options.suffix)
     files += write_model(collection, model, directory, options.suffix)
-    if landmarks is not None:
-        suffix = _landmark_suffix(options.landmarks)
-        written, notes = write_landmarks(collection, sources["landmarks_of"], landmarks, directory, suffix)
+    if landmarks is not None and landmarks_of is not None:
+        suffix = check_readable_suffix(options.landmarks)
+        suffix = ".csv" if suffix == ".mps" else suffix  # no .mps files are written
+        written, notes = write_landmarks(collection, landmarks_of, landmarks, directory, suffix)
         files += written
         for note in notes:
             say(f"note: {note}")
-    if options.attributes_of:
-        files += write_attributes(collection, sources["attributes_of"], kept, directory, options.suffix)
-    shared = _provenance(options)
+    if attributes_of is not None:
+        files += write_attributes(collection, attributes_of, kept, directory, options.suffix)
     unlisted = ("directory", "output", "quiet", "run")
     settings = {name: value for name, value in vars(options).items() if name not in unlisted}
-    provenance = {**shared, "settings": settings, "machine": machine()}
+    provenance = {**_provenance(options), "settings": settings, "machine": machine()}
     write_summary(collection, measures, directory, provenance, [*files, directory / "index.html"])
     template = collection.meshes[collection.template]
     write_collection_page(
@@ -525,13 +510,7 @@ def _write(
     )
 
 
-def _number(collection: Collection, name: str, file: str) -> int:
-    if name not in collection.names:
-        raise InputError(f"{file}: was left out of the collection: choose another mesh.")
-    return collection.names.index(name)
-
-
-def _show(collection: Collection, measures: Mapping[str, Any], *, scale: bool) -> None:
+def _show(collection: Collection, model: ShapeModel, *, scale: bool) -> None:
     from jaxsmw.wording import count_of
 
     for sentence in collection.sentences():
@@ -542,7 +521,7 @@ def _show(collection: Collection, measures: Mapping[str, Any], *, scale: bool) -
             f"the largest mesh is {ratio:.3g} times as large as the smallest, which dominates the shape "
             "model: use --scale, or convert all meshes to one unit of length."
         )
-    if shares := measures["compactness"]:
+    if len(shares := model.compactness()):
         first = ", ".join(f"{share:.0%}" for share in shares[:3])
         show(
             f"shape model: {count_of(len(shares), 'mode')}; the first modes together have {first} of the "

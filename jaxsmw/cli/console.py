@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 import time
 from collections.abc import Iterator
@@ -46,10 +47,28 @@ def _writing_output() -> Iterator[None]:
 
 
 def say(message: str) -> None:
-    """Print a message as one line on standard error."""
+    """Print a message as one line on standard error, with options in place of arguments of functions."""
     if sys.stderr is not None:
         with suppress(OSError):  # the command continues even if a message cannot be printed
-            print(printable(message), file=sys.stderr, flush=True)
+            print(printable(with_options(message)), file=sys.stderr, flush=True)
+
+
+# An argument that a message of the library recommends, and perhaps the same option behind it.
+_ARGUMENT = re.compile(
+    r"\b(coordinates|index_base|laplacian|mirror|partial|preset|scale|weld)="
+    r"(?:True|([01])(?!\.?\w)|([\"'])(\w+)\3)"
+    r"(?:,(?: on the command line)? --[a-z-]+(?: \w+)?| \(--[a-z-]+(?: \w+)?\))?"
+)
+
+
+def with_options(message: str) -> str:
+    """Return a message of the library with options such as `--weld` in place of `weld=True`."""
+
+    def option(argument: re.Match[str]) -> str:
+        value = argument[2] or argument[4]
+        return f"--{argument[1].replace('_', '-')}" + (f" {value}" if value else "")
+
+    return _ARGUMENT.sub(option, message)
 
 
 def report_progress(message: str) -> None:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from jaxsmw.cli.arguments import path, whole_number
-from jaxsmw.cli.conclusion import estimate_error, measure_match, show_match, write_match_report
+from jaxsmw.cli.arguments import add_seed, path, whole_number
 from jaxsmw.cli.console import Stopwatch, report_progress, show
-from jaxsmw.cli.inputs import initial_map_files
+from jaxsmw.cli.measurement import estimate_error, show_match
 from jaxsmw.cli.method import add_method, check_method, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_written
+from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
 
 HELP = "generate a creature in two poses, match the poses and write a report"
 
@@ -35,13 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=5000,
         help="number of vertices of the source mesh (default: %(default)s)",
     )
-    parser.add_argument(
-        "--seed",
-        type=whole_number(0),
-        default=0,
-        help="seed of the creature; creatures with different seeds have different shapes (default: "
-        "%(default)s)",
-    )
+    add_seed(parser, "seed of the creature; creatures with different seeds have different shapes")
     add_method(parser)
 
 
@@ -50,9 +43,11 @@ def run(options: argparse.Namespace) -> None:
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         check_method(options)
-        _check_output(options)
+        ((output, report_files),) = report_directories(options.output)
+        check_outputs(options.init.files, directories=[(output, (*_FILES, *report_files))])
         from jaxsmw.creature import creature_pair
         from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
+        from jaxsmw.evaluation.metrics import geodesic_error
         from jaxsmw.io.maps import write_pointwise_map
         from jaxsmw.io.meshes import write_mesh
         from jaxsmw.runtime.files import make_directory
@@ -69,17 +64,11 @@ def run(options: argparse.Namespace) -> None:
         write_ground_truth(true_points, truth, pair.target)
         write_pointwise_map(found_map, correspondence.pointwise_map)
     report_written(source, target, true_points, found_map)
-    errors = measure_match(correspondence, truth, {}, stopwatch, {})
+    maps = {"initial": correspondence.initial_map, "refined": correspondence.pointwise_map}
+    report_progress("geodesic errors ...")
+    with stopwatch.step("geodesic errors"):
+        errors = {name: geodesic_error(pair.target, vertices, truth) for name, vertices in maps.items()}
     estimate_error(correspondence, stopwatch)
     write_match_report(options.output, correspondence, errors, options, stopwatch, up="y")
     show_match(correspondence, errors, stopwatch)
     show(f"Open {directory / 'report.html'} or {directory / 'correspondence.png'} to see the result.")
-
-
-def _check_output(options: argparse.Namespace) -> None:
-    from jaxsmw.report.figures import check_drawable
-
-    check_drawable()
-    from jaxsmw.report.summary import REPORT_FILES
-
-    check_outputs(initial_map_files(options.init), directories=[(options.output, (*_FILES, *REPORT_FILES))])

@@ -8,24 +8,18 @@ from pathlib import Path
 
 from jaxsmw.cli.arguments import (
     MAP_FORMS,
-    add_index_base,
     add_partial,
+    add_paths,
+    add_reading,
     add_source_and_target,
     add_up,
-    add_weld,
     path,
     refuse_without,
 )
 from jaxsmw.cli.console import show
-from jaxsmw.cli.inputs import check_inputs, read_maps, read_mesh_file, read_truth
-from jaxsmw.cli.measurement import (
-    add_evaluation,
-    add_ground_truth,
-    check_evaluation,
-    evaluation_settings,
-    measure_errors,
-)
-from jaxsmw.cli.outputs import check_outputs, report_written, write_comparison_page
+from jaxsmw.cli.inputs import check_inputs, read_maps, read_meshes, read_truth
+from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, measure_errors
+from jaxsmw.cli.outputs import check_outputs, write_comparison_page, write_figure, write_text
 from jaxsmw.errors import InputError
 
 HELP = "measure the geodesic errors of maps against the ground truth"
@@ -36,25 +30,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source_and_target(parser)
     parser.add_argument("map", type=path, metavar="MAP", nargs="+", help=f"maps to measure: {MAP_FORMS}")
     add_ground_truth(parser, required=True, purpose="true map")
-    parser.add_argument(
-        "--output", metavar="FILE", type=path, help="write the errors and quality curves to this file (.json)"
+    add_paths(
+        parser,
+        {
+            "--output FILE": "write the errors and quality curves to this file (.json)",
+            "--figure FILE": "draw the correspondence quality curves to this file (.png, .pdf or .svg)",
+            "--page FILE.html": "write an interactive page to this file; the page shows one map at a time "
+            "with its errors",
+        },
     )
-    parser.add_argument(
-        "--figure",
-        metavar="FILE",
-        type=path,
-        help="draw the correspondence quality curves to this file (.png, .pdf or .svg)",
-    )
-    parser.add_argument(
-        "--page",
-        metavar="FILE.html",
-        type=path,
-        help="write an interactive page to this file; the page shows one map at a time with its errors",
-    )
-    add_partial(parser)
+    add_partial(parser, with_scale=False)
     add_up(parser)
-    add_weld(parser)
-    add_index_base(parser)
+    add_reading(parser)
     add_evaluation(parser)
 
 
@@ -64,19 +51,13 @@ def run(options: argparse.Namespace) -> None:
     refuse_without(options, "--page", bool(options.page), "partial", "up")
     inputs = [options.source, options.target, *options.map, *options.ground_truth]
     check_inputs(*inputs)
-    check_outputs(
-        inputs,
-        files=[options.output],
-        figures=[options.figure],
-        pages=[options.page],
-    )
+    check_outputs(inputs, files=[options.output], figures=[options.figure], pages=[options.page])
     if options.output and Path(options.output).suffix.lower() != ".json":
         raise InputError(f"{options.output}: errors are written as JSON: choose a name that ends in .json.")
-    mesh_x = read_mesh_file(options.source, weld=options.weld)
-    mesh_y = read_mesh_file(options.target, weld=options.weld)
+    mesh_x, mesh_y = read_meshes(options.source, options.target, weld=options.weld)
     truth = read_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
     maps = read_maps(options.map, mesh_x, mesh_y, index_base=options.index_base)
-    errors = measure_errors(mesh_y, maps, truth, evaluation_settings(options))
+    errors = measure_errors(options, mesh_y, maps, truth)
     if options.page:
         write_comparison_page(
             options.page, mesh_x, mesh_y, maps, errors, partial=options.partial, up=options.up
@@ -84,15 +65,9 @@ def run(options: argparse.Namespace) -> None:
     for name, error in errors.items():
         show(f"{name}: {error}")
     if options.figure:
-        from jaxsmw.report.figures import save_figure
         from jaxsmw.report.summary import draw_errors
 
-        save_figure(options.figure, draw_errors(errors))
-        report_written(options.figure)
+        write_figure(options.figure, draw_errors(errors))
     if options.output:
-        from jaxsmw.runtime.files import atomic_write
-
         results = {name: error.as_dictionary() for name, error in errors.items()}
-        with atomic_write(options.output) as temporary:
-            temporary.write_text(json.dumps(results, indent=2) + "\n", "utf-8")
-        report_written(options.output)
+        write_text(options.output, json.dumps(results, indent=2) + "\n")

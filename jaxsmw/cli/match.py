@@ -7,32 +7,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxsmw.cli.arguments import (
-    add_index_base,
-    add_partial_of_any_scale,
+    add_partial,
+    add_paths,
+    add_reading,
     add_source_and_target,
     add_up,
-    add_weld,
     path,
     refuse_without,
 )
-from jaxsmw.cli.conclusion import estimate_error, measure_match, show_match, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, show
-from jaxsmw.cli.inputs import (
-    check_inputs,
-    initial_map_files,
-    read_mesh_file,
-    read_truth,
+from jaxsmw.cli.inputs import check_inputs, read_meshes, read_truth
+from jaxsmw.cli.measurement import (
+    add_evaluation,
+    add_ground_truth,
+    check_evaluation,
+    estimate_error,
+    measure_errors,
+    show_match,
 )
-from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, evaluation_settings
 from jaxsmw.cli.method import add_method, check_method, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
+from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Int64, Shaped
 
-    from jaxsmw.geometry.geodesics import SurfacePoints
+    from jaxsmw.geometry.surface_points import SurfacePoints
     from jaxsmw.matching.correspondence import Correspondence
 
 HELP = "match two meshes and write the map"
@@ -50,56 +51,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "from 0; if the suffix is .npy, a NumPy array, counted from 0; if the suffix is .mat, the column "
         "vector T12 for MATLAB, counted from 1",
     )
-    parser.add_argument(
-        "--surface-points",
-        metavar="FILE.baryc_gt",
-        type=path,
-        help="write to this file, for each source vertex, a point on the target surface: a face, counted "
-        "from 1, and the barycentric weights of the face's corners",
-    )
-    parser.add_argument(
-        "--expected-error",
-        metavar="FILE",
-        type=path,
-        help="write to this file the expected error of each match, one per line: an estimate of the geodesic "
-        "error without ground truth, divided by the square root of the target's area",
-    )
-    parser.add_argument(
-        "--overlap",
-        metavar="FILE",
-        type=path,
-        help="with --partial: write to this file a line for each source vertex, 1 if the vertex has a "
-        "counterpart on the target and 0 if not",
-    )
-    parser.add_argument(
-        "--one-to-one",
-        metavar="FILE",
-        type=path,
-        help="write to this file a map in which no two source vertices share a target vertex, in the formats "
-        "of --output; use this map only for meshes with the same triangulation, because it is much less "
-        "accurate for other meshes",
-    )
-    parser.add_argument(
-        "--texture",
-        metavar="DIR",
-        type=path,
-        help="write both meshes to this directory as OBJ files with a common texture, which is projected "
-        "onto the target and transferred to the source by the map",
-    )
-    parser.add_argument(
-        "--report",
-        metavar="DIR",
-        type=path,
-        help="write pictures, an interactive 3D page and a summary to this directory",
+    add_paths(
+        parser,
+        {
+            "--surface-points FILE.baryc_gt": "write to this file, for each source vertex, a point on the "
+            "target surface: a face, counted from 1, and the barycentric weights of the face's corners",
+            "--expected-error FILE": "write to this file the expected error of each match, one per line: an "
+            "estimate of the geodesic error without ground truth, divided by the square root of the target's "
+            "area",
+            "--overlap FILE": "with --partial: write to this file a line for each source vertex, 1 if the "
+            "vertex has a counterpart on the target and 0 if not",
+            "--one-to-one FILE": "write to this file a map in which no two source vertices share a target "
+            "vertex, in the formats of --output; use this map only for meshes with the same triangulation, "
+            "because it is much less accurate for other meshes",
+            "--texture DIR": "write both meshes to this directory as OBJ files with a common texture, which "
+            "is projected onto the target and transferred to the source by the map",
+            "--report DIR": "write pictures, an interactive 3D page and a summary to this directory",
+        },
     )
     add_up(parser)
     add_ground_truth(
         parser, required=False, purpose="true map, for errors of the map before and after refinement"
     )
-    add_partial_of_any_scale(parser)
+    add_partial(parser, with_scale=True)
     add_method(parser)
-    add_weld(parser)
-    add_index_base(parser)
+    add_reading(parser)
     add_evaluation(parser)
 
 
@@ -109,8 +85,7 @@ def run(options: argparse.Namespace) -> None:
     with stopwatch.step("loading"):
         _check(options)
     with stopwatch.step("reading"):
-        mesh_x = read_mesh_file(options.source, weld=options.weld)
-        mesh_y = read_mesh_file(options.target, weld=options.weld)
+        mesh_x, mesh_y = read_meshes(options.source, options.target, weld=options.weld)
         truth = None
         if options.ground_truth:
             truth = read_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
@@ -118,25 +93,18 @@ def run(options: argparse.Namespace) -> None:
         from jaxsmw.geometry.assignment import check_one_to_one
 
         check_one_to_one(int(mesh_x.referenced_vertices.sum()), int(mesh_y.referenced_vertices.sum()))
-    correspondence = match_meshes(
-        options,
-        mesh_x,
-        mesh_y,
-        stopwatch,
-        partial=options.partial,
-        scale=options.scale,
-        index_base=options.index_base,
-    )
-    others = _write_files(options, correspondence, stopwatch)
+    correspondence = match_meshes(options, mesh_x, mesh_y, stopwatch)
+    maps = _write_files(options, correspondence, stopwatch)
     expected = estimate_error(correspondence, stopwatch)
     if options.expected_error:
         with stopwatch.step("writing"):
             _write_numbers(options.expected_error, expected)
-        report_written(options.expected_error)
     if options.overlap:
         _write_overlap(options.overlap, correspondence, stopwatch)
-    settings = evaluation_settings(options)
-    errors = measure_match(correspondence, truth, settings, stopwatch, others)
+    errors = {}
+    if truth is not None:
+        with stopwatch.step("geodesic errors"):
+            errors = measure_errors(options, correspondence.mesh_y, maps, truth)
     if options.report:
         write_match_report(options.report, correspondence, errors, options, stopwatch, up=options.up)
     show_match(correspondence, errors, stopwatch)
@@ -144,7 +112,7 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
-    init_files = initial_map_files(options.init)
+    init_files = options.init.files
     check_method(options)
     check_evaluation(options)
     refuse_without(options, "--partial", options.partial, "scale", "overlap")
@@ -189,17 +157,17 @@ def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]
 def _write_files(
     options: argparse.Namespace, correspondence: Correspondence, stopwatch: Stopwatch
 ) -> dict[str, Int64[np.ndarray, " m"] | SurfacePoints]:
-    """Write all files except the expected errors and the report. Return the further maps to measure."""
+    """Write all maps. Return the initial map, the maps that were written, and the refined map."""
     from jaxsmw.io.maps import write_pointwise_map
 
-    others: dict[str, Int64[np.ndarray, " m"] | SurfacePoints] = {}
+    maps: dict[str, Int64[np.ndarray, " m"] | SurfacePoints] = {"initial": correspondence.initial_map}
     with stopwatch.step("writing"):
         write_pointwise_map(options.output, correspondence.pointwise_map)
     report_written(options.output)
     if options.one_to_one:
         report_progress("one-to-one map ...")
         with stopwatch.step("one-to-one map"):
-            others["one-to-one"] = one_to_one = correspondence.one_to_one()
+            maps["one-to-one"] = one_to_one = correspondence.one_to_one()
             write_pointwise_map(options.one_to_one, one_to_one)
         report_written(options.one_to_one)
     if options.surface_points or options.texture:
@@ -209,8 +177,8 @@ def _write_files(
         with stopwatch.step("writing"):
             _write_points(options, correspondence, points)
         if options.surface_points:
-            others["surface"] = points
-    return others
+            maps["surface"] = points
+    return maps | {"refined": correspondence.pointwise_map}
 
 
 def _write_points(options: argparse.Namespace, correspondence: Correspondence, points: SurfacePoints) -> None:
@@ -235,7 +203,6 @@ def _write_overlap(file: str, correspondence: Correspondence, stopwatch: Stopwat
     with stopwatch.step("overlap"):
         mask_x, mask_y = correspondence.overlap()
         _write_numbers(file, mask_x, "%d")
-    report_written(file)
     share_x, share_y = correspondence.mesh_x.average(mask_x), correspondence.mesh_y.average(mask_y)
     show(
         f"overlap:     {share_x:.0%} of the source's area and {share_y:.0%} of the target's area have a "
@@ -251,3 +218,4 @@ def _write_numbers(file: str, numbers: Shaped[np.ndarray, " m"], form: str = "%.
 
     with atomic_write(file) as temporary:
         savetxt(temporary, numbers, form)
+    report_written(file)

@@ -1,29 +1,30 @@
-"""Measures the geodesic errors of maps, and defines the options of this measurement."""
+"""Measures the geodesic errors of maps and the quality of matches, and defines the options for this."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, TypeAlias, get_args
 
 from jaxsmw.choices import GeodesicMethod
 from jaxsmw.cli.arguments import path, refuse_without, whole_number
-from jaxsmw.cli.console import report_progress
+from jaxsmw.cli.console import Stopwatch, report_progress, show
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float, Int64
+
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
     from jaxsmw.geometry.mesh import Mesh
+    from jaxsmw.geometry.surface_points import SurfacePoints
+    from jaxsmw.matching.correspondence import Correspondence
+
+    Maps: TypeAlias = Mapping[str, Int64[np.ndarray, " m"] | SurfacePoints]
 
 
 def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose: str) -> None:
-    """Add `--ground-truth`.
-
-    **Arguments:**
-
-    - `required`: whether the command requires the option.
-    - `purpose`: the beginning of the help text, before the list of accepted files.
-    """
+    """Add `--ground-truth`. The help text begins with `purpose`, before the list of accepted files."""
     parser.add_argument(
         "--ground-truth",
         metavar="FILE",
@@ -58,41 +59,66 @@ def add_evaluation(parser: argparse.ArgumentParser) -> None:
 
 
 def check_evaluation(options: argparse.Namespace) -> None:
-    """Refuse options of `add_evaluation` that have no effect because another option is missing.
-
-    **Raises:** `InputError` that names the first given option that has no effect.
-    """
+    """Refuse options of `add_evaluation` that have no effect because another option is missing."""
     measured = bool(options.ground_truth)
     refuse_without(options, "--ground-truth", measured, "evaluation_samples", "geodesics")
     refuse_without(options, "--evaluation-samples", bool(options.evaluation_samples), "seed")
 
 
-def evaluation_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the given options of `add_evaluation` as keyword arguments of `jaxsmw.geodesic_error`."""
-    settings = {
-        "method": options.geodesics,
-        "number_of_samples": options.evaluation_samples,
-        "seed": options.seed,
-    }
-    return {name: value for name, value in settings.items() if value is not None}
-
-
 def measure_errors(
-    mesh_y: Mesh, maps: Mapping[str, Any], truth: GroundTruth, settings: Mapping[str, Any]
+    options: argparse.Namespace, mesh_y: Mesh, maps: Maps, truth: GroundTruth
 ) -> dict[str, GeodesicError]:
-    """Measure the geodesic error of each map.
-
-    **Arguments:**
-
-    - `maps`: a dictionary from names to maps X -> Y. A map is an array (m,) of 0-based vertices of Y, or one
-      `SurfacePoints` with m points on Y.
-    - `settings`: keyword arguments of `jaxsmw.geodesic_error`; see `evaluation_settings`.
-
-    **Returns:** A dictionary from the name of each map to its geodesic errors.
-    """
+    """Measure the geodesic errors of maps X -> Y, by their names, with the options of `add_evaluation`."""
     from jaxsmw.evaluation.metrics import geodesic_error
 
     report_progress("geodesic errors ...")
+    default, *_ = get_args(GeodesicMethod)
     return {
-        name: geodesic_error(mesh_y, pointwise_map, truth, **settings) for name, pointwise_map in maps.items()
+        name: geodesic_error(
+            mesh_y,
+            pointwise_map,
+            truth,
+            method=options.geodesics or default,
+            number_of_samples=options.evaluation_samples,
+            seed=options.seed or 0,
+        )
+        for name, pointwise_map in maps.items()
     }
+
+
+def estimate_error(correspondence: Correspondence, stopwatch: Stopwatch) -> Float[np.ndarray, " m"]:
+    """Return the expected error of each match (m,), as a fraction of sqrt(area of Y).
+
+    The correspondence keeps the result, so the time of the first call is the time of the step.
+    """
+    report_progress("expected error ...")
+    with stopwatch.step("expected error"):
+        return correspondence.expected_error()
+
+
+def show_quality(correspondence: Correspondence) -> None:
+    """Print one line with the quality of a match."""
+    from jaxsmw.wording import percentage
+
+    parts = []
+    if correspondence.distortion is not None:
+        parts.append(f"distortion {correspondence.distortion:.3f} (1 for isometries)")
+    mean = correspondence.mesh_x.average(correspondence.expected_error())
+    parts.append(f"area-weighted mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)")
+    if (probability := correspondence.wrong_probability()) is not None:
+        parts.append(f"wrong on a part of the body with probability {percentage(probability)}")
+    if correspondence.left_out:
+        parts.append(f"{correspondence.left_out:.1%} of the source has no counterpart (small components)")
+    if correspondence.suspicious:
+        parts.append("the map is suspicious")
+    show(f"quality:     {', '.join(parts)}")
+
+
+def show_match(
+    correspondence: Correspondence, errors: Mapping[str, GeodesicError], stopwatch: Stopwatch
+) -> None:
+    """Print the quality of a match, the errors of all maps and the times of all steps on standard output."""
+    show_quality(correspondence)
+    for name, error in errors.items():
+        show(f"{name + ' map:':12} {error}")
+    show(f"time:        {stopwatch.summary()} (compilation included)")

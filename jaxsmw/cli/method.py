@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 from jaxsmw.choices import (
     DEFAULT_MATCH_INIT,
@@ -11,17 +11,16 @@ from jaxsmw.choices import (
     DEFAULT_PRESET,
     ITERATIONS,
     NUMBER_OF_EIGENVECTORS,
-    IndexBase,
     MatchInit,
     Mirror,
     PresetName,
     Scale,
     Search,
 )
-from jaxsmw.cli.arguments import add_eigenproblem, whole_number
+from jaxsmw.cli.arguments import add_eigenproblem, add_values, option_of, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.inputs import check_initial_map_files, initial_map_choice, read_initial_map
+from jaxsmw.cli.initial_map import InitialMap
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
@@ -50,6 +49,7 @@ _CHANGES = (
     "search",
     "stop_when_unchanged",
 )
+_DEFAULT_SEARCH: Search = get_args(Search)[0]
 # The preset that the options in `_CHANGES` modify.
 _PAPER: PresetName = "paper"
 
@@ -60,7 +60,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--init",
         metavar="INITIAL_MAP",
-        type=initial_map_choice,
+        type=InitialMap.parse,
         default=DEFAULT_MATCH_INIT,
         help=f"initial map: {', '.join(get_args(MatchInit))}, landmarks:FILE, "
         "landmarks:SOURCE_FILE,TARGET_FILE or map:FILE (default: "
@@ -101,11 +101,10 @@ def add_method(parser: argparse.ArgumentParser) -> None:
 
 def _add_changes(group: argparse._ActionsContainer) -> None:
     """Add the options in `_CHANGES`. If the user omits an option, its value is None."""
-    group.add_argument(
-        "--eigenvectors",
-        metavar="N",
-        type=whole_number(1),
-        help=f"number of eigenvectors per shape (default: {NUMBER_OF_EIGENVECTORS})",
+    add_values(
+        group,
+        whole_number(1),
+        {"--eigenvectors N": f"number of eigenvectors per shape (default: {NUMBER_OF_EIGENVECTORS})"},
     )
     add_bank(group)
     group.add_argument(
@@ -116,25 +115,20 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
         "least-squares with equal weights for all vertices. regularized is least-squares with additional "
         f"terms for commutativity with the Laplacian and for orthogonality (default: {_PAPER_SOLUTION})",
     )
-    group.add_argument(
-        "--iterations",
-        metavar="N",
-        type=whole_number(1),
-        help=f"number of iterations (default: {ITERATIONS})",
+    add_values(
+        group,
+        whole_number(1),
+        {
+            "--iterations N": f"number of iterations (default: {ITERATIONS})",
+            "--samples N": "number of samples per shape on which the refiner iterates; the last step matches "
+            "all vertices (default: the refiner iterates on all vertices)",
+        },
     )
-    group.add_argument(
-        "--samples",
-        metavar="N",
-        type=whole_number(1),
-        help="number of samples per shape on which the refiner iterates; the last step matches all vertices "
-        "(default: the refiner iterates on all vertices)",
-    )
-    default_search, *_ = get_args(Search)
     group.add_argument(
         "--search",
         choices=get_args(Search),
         help="method of nearest-neighbour search: exhaustive and patches give the same result; patches is "
-        f"faster on large meshes; auto chooses the faster search (default: {default_search})",
+        f"faster on large meshes; auto chooses the faster search (default: {_DEFAULT_SEARCH})",
     )
     group.add_argument(
         "--stop-when-unchanged",
@@ -151,7 +145,7 @@ def check_method(options: argparse.Namespace) -> None:
             f"{changes[0]}: changes the paper's method, but --preset {options.preset} is another method: "
             "leave one of the two options out."
         )
-    check_initial_map_files(options.init)
+    options.init.check()
 
 
 def preset_name(options: argparse.Namespace) -> PresetName:
@@ -161,15 +155,17 @@ def preset_name(options: argparse.Namespace) -> PresetName:
 
 def given_method(options: argparse.Namespace) -> list[str]:
     """Return the names of the given options that matter only if meshes are matched, such as `--preset`."""
-    given = _changes(options)
-    given += ["--preset"] if options.preset else []
-    defaults = {"init": DEFAULT_MATCH_INIT, "mirror": DEFAULT_MIRROR}
-    return given + [f"--{name}" for name, default in defaults.items() if getattr(options, name) != default]
+    others = {
+        "--preset": options.preset is not None,
+        "--init": options.init.text != DEFAULT_MATCH_INIT,
+        "--mirror": options.mirror != DEFAULT_MIRROR,
+    }
+    return _changes(options) + [name for name, is_given in others.items() if is_given]
 
 
 def _changes(options: argparse.Namespace) -> list[str]:
     """Return the names of the given options that change the paper's method, such as `--bank`."""
-    return [f"--{name.replace('_', '-')}" for name in _CHANGES if getattr(options, name) is not None]
+    return [option_of(name) for name in _CHANGES if getattr(options, name) is not None]
 
 
 def match_meshes(
@@ -177,16 +173,16 @@ def match_meshes(
     mesh_x: Mesh,
     mesh_y: Mesh,
     stopwatch: Stopwatch,
-    *,
-    partial: bool = False,
-    scale: float | Scale | None = None,
-    index_base: IndexBase | None = None,
 ) -> Correspondence:
-    """Match two meshes with the options of `add_method`, and print their scale and hand if unknown."""
+    """Match two meshes with the options of a command, and print their scale and hand if unknown.
+
+    Some commands have no options `--partial`, `--scale` and `--index-base`.
+    """
     import jax
 
     from jaxsmw.matching.match import match
 
+    scale: float | Scale | None = getattr(options, "scale", None)
     changes = _changes(options)
     if changes and options.preset is None:
         listed = " and ".join(filter(None, [", ".join(changes[:-1]), changes[-1]]))
@@ -199,10 +195,10 @@ def match_meshes(
             mesh_x,
             mesh_y,
             preset=_changed_stage(options) if changes else preset_name(options),
-            init=read_initial_map(options.init, mesh_x, mesh_y, index_base=index_base),
+            init=options.init.read(mesh_x, mesh_y, index_base=getattr(options, "index_base", None)),
             laplacian=options.laplacian,
             eigensolver=options.eigensolver,
-            partial=partial,
+            partial=getattr(options, "partial", False),
             scale=scale or 1.0,
             mirror=options.mirror,
         )
@@ -223,13 +219,12 @@ def _changed_stage(options: argparse.Namespace) -> Stage:
     from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
     from jaxsmw.matching.stages import Stage
 
-    method: dict[str, Any] = {"search": options.search} if options.search else {}
-    if options.bank or options.filters:
-        method["bank"] = make_bank(options.bank, options.filters)
-    if options.solution:
-        name, arguments = _SOLUTIONS[options.solution]
-        method["solution"] = getattr(solutions, name)(*arguments)
-    refiner = WaveletPreservation(**method)
+    kind, arguments = _SOLUTIONS[options.solution or _PAPER_SOLUTION]
+    refiner = WaveletPreservation(
+        bank=make_bank(options.bank, options.filters),
+        solution=getattr(solutions, kind)(*arguments),
+        search=options.search or _DEFAULT_SEARCH,
+    )
     filtering = isinstance(refiner.solution, solutions.Filtering)
     if options.bank and filtering and (bounds := bounds_unless_tight(refiner.bank)):
         lower, upper = bounds
@@ -237,10 +232,10 @@ def _changed_stage(options: argparse.Namespace) -> Stage:
             f"note: {options.bank} is not a tight frame (frame bounds {lower:.2g} and {upper:.2g}), but "
             "filtering is meant for tight frames; --solution least-squares is exact for all banks."
         )
-    settings = {
-        "number_of_eigenvectors": options.eigenvectors,
-        "iterations": options.iterations,
-        "number_of_samples": options.samples,
-        "stop_when_unchanged": options.stop_when_unchanged,
-    }
-    return Stage(refiner, **{name: value for name, value in settings.items() if value is not None})
+    return Stage(
+        refiner,
+        number_of_eigenvectors=options.eigenvectors or NUMBER_OF_EIGENVECTORS,
+        iterations=options.iterations or ITERATIONS,
+        number_of_samples=options.samples,
+        stop_when_unchanged=bool(options.stop_when_unchanged),
+    )

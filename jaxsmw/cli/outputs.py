@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxsmw.cli.console import report_progress
+from jaxsmw.cli.console import Stopwatch, report_progress
+from jaxsmw.cli.method import preset_name
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Int64
+    from matplotlib.figure import Figure
 
     from jaxsmw.choices import Axis
     from jaxsmw.evaluation.metrics import GeodesicError
     from jaxsmw.geometry.mesh import Mesh
+    from jaxsmw.io.landmarks import Landmarks
+    from jaxsmw.matching.correspondence import Correspondence
+    from jaxsmw.transfer.registered_mesh import RegisteredMesh
 
 
 def check_outputs(
@@ -99,6 +105,54 @@ def report_written(*paths: str | os.PathLike[str]) -> None:
     """Print the names of written files as progress messages."""
     for path in paths:
         report_progress(f"wrote {path}")
+
+
+def write_figure(path: str, figure: Figure) -> None:
+    """Write a figure to a file."""
+    from jaxsmw.report.figures import save_figure
+
+    save_figure(path, figure)
+    report_written(path)
+
+
+def write_text(path: str, text: str) -> None:
+    """Write a text to a file."""
+    from jaxsmw.runtime.files import atomic_write
+
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, "utf-8")
+    report_written(path)
+
+
+def write_match_report(
+    directory: str,
+    correspondence: Correspondence,
+    errors: Mapping[str, GeodesicError],
+    options: argparse.Namespace,
+    stopwatch: Stopwatch,
+    *,
+    up: Axis | None,
+    registered: RegisteredMesh | None = None,
+    landmarks: tuple[Landmarks, Landmarks] | None = None,
+) -> None:
+    """Write the report of a match to a directory; its summary contains the options of the command."""
+    from jaxsmw.report.summary import write_report
+
+    report_progress("report ...")
+    settings = {**vars(options), "init": options.init.text, "preset": preset_name(options)}
+    del settings["run"]
+    with stopwatch.step("report"):
+        written = write_report(
+            directory,
+            correspondence,
+            errors=errors,
+            settings=settings,
+            seconds=stopwatch.steps(),
+            up=up,
+            registered=registered,
+            landmarks=landmarks,
+        )
+    report_written(*written)
 
 
 def write_comparison_page(

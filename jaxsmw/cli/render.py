@@ -4,17 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from jaxsmw.cli.arguments import (
-    MAP_FORMS,
-    add_index_base,
-    add_partial,
-    add_up,
-    add_weld,
-    path,
-    refuse_without,
-)
-from jaxsmw.cli.inputs import check_inputs, read_maps, read_mesh_file
-from jaxsmw.cli.outputs import check_outputs, is_page, report_written, write_comparison_page
+from jaxsmw.cli.arguments import MAP_FORMS, add_partial, add_reading, add_up, path, refuse_without
+from jaxsmw.cli.inputs import check_inputs, read_maps, read_meshes
+from jaxsmw.cli.outputs import check_outputs, is_page, write_comparison_page, write_figure
 from jaxsmw.errors import InputError
 
 HELP = "draw a mesh, or show a correspondence by colours"
@@ -39,35 +31,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="file to write: a picture (.png, .pdf or .svg), or an interactive page (.html) of a "
         "correspondence",
     )
-    add_partial(parser)
+    add_partial(parser, with_scale=False)
     add_up(parser)
-    add_weld(parser)
-    add_index_base(parser)
+    add_reading(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Draw a mesh or a correspondence, or write a page with one or several correspondences."""
     page = is_page(options.output)
     _check(options, page)
-    mesh_x = read_mesh_file(options.source, weld=options.weld)
-    if not options.map:
-        from jaxsmw.report.figures import draw_mesh, save_figure
+    from jaxsmw.report.figures import draw_correspondence, draw_mesh
 
-        save_figure(options.output, draw_mesh(mesh_x, up=options.up))
-        report_written(options.output)
+    if not options.map:
+        (mesh,) = read_meshes(options.source, weld=options.weld)
+        write_figure(options.output, draw_mesh(mesh, up=options.up))
         return
-    mesh_y = read_mesh_file(options.target, weld=options.weld)
+    mesh_x, mesh_y = read_meshes(options.source, options.target, weld=options.weld)
     maps = read_maps(options.map, mesh_x, mesh_y, index_base=options.index_base)
     if page:
         write_comparison_page(
             options.output, mesh_x, mesh_y, maps, {}, partial=options.partial, up=options.up
         )
         return
-    from jaxsmw.report.figures import draw_correspondence, save_figure
-
     (pointwise_map,) = maps.values()
-    save_figure(options.output, draw_correspondence(mesh_x, mesh_y, pointwise_map, up=options.up))
-    report_written(options.output)
+    write_figure(options.output, draw_correspondence(mesh_x, mesh_y, pointwise_map, up=options.up))
 
 
 def _check(options: argparse.Namespace, page: bool) -> None:
@@ -88,8 +75,4 @@ def _check(options: argparse.Namespace, page: bool) -> None:
     refuse_without(options, "a map", bool(options.map), "index_base")
     inputs = [options.source, options.target, *options.map]
     check_inputs(*inputs)
-    check_outputs(
-        inputs,
-        figures=[] if page else [output],
-        pages=[output] if page else [],
-    )
+    check_outputs(inputs, figures=[] if page else [output], pages=[output] if page else [])

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 
 from jaxsmw.choices import NUMBER_OF_EIGENVECTORS
-from jaxsmw.cli.arguments import add_eigenproblem, add_weld, path, refuse_without, whole_number
+from jaxsmw.cli.arguments import add_eigenproblem, add_paths, add_weld, path, refuse_without, whole_number
 from jaxsmw.cli.banks import add_bank, make_bank
 from jaxsmw.cli.console import show
 from jaxsmw.cli.inputs import check_inputs
-from jaxsmw.cli.outputs import check_outputs, report_written
+from jaxsmw.cli.outputs import check_outputs, report_written, write_figure
 
 HELP = "describe a mesh and compute its eigenbasis"
 
@@ -26,19 +26,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=NUMBER_OF_EIGENVECTORS,
         help="number of eigenvectors (default: %(default)s)",
     )
-    parser.add_argument(
-        "--output",
-        metavar="FILE",
-        type=path,
-        help="write the eigenbasis of the surface, scaled to area 1, to this file: a .npz file with the "
-        "arrays eigenvalues, eigenvectors and vertex_areas, or a .mat file with a struct S with the fields "
-        "evals, evecs, A and surface",
-    )
-    parser.add_argument(
-        "--figure",
-        metavar="FILE",
-        type=path,
-        help="draw the filters as functions of the eigenvalue to this file (.png, .pdf or .svg)",
+    add_paths(
+        parser,
+        {
+            "--output FILE": "write the eigenbasis of the surface, scaled to area 1, to this file: a .npz "
+            "file with the arrays eigenvalues, eigenvectors and vertex_areas, or a .mat file with a struct S "
+            "with the fields evals, evecs, A and surface",
+            "--figure FILE": "draw the filters as functions of the eigenvalue to this file (.png, .pdf or "
+            ".svg)",
+        },
     )
     add_bank(parser)
     add_eigenproblem(parser)
@@ -78,8 +74,6 @@ def run(options: argparse.Namespace) -> None:
             write_spectrum(options.output, as_spectrum(mesh, *pairs), mesh)
         report_written(options.output)
     if options.figure:
-        from jaxsmw.report.figures import save_figure
         from jaxsmw.report.summary import draw_bank
 
-        save_figure(options.figure, draw_bank(bank, eigenvalues))
-        report_written(options.figure)
+        write_figure(options.figure, draw_bank(bank, eigenvalues))

@@ -9,20 +9,19 @@ from typing import TYPE_CHECKING, get_args
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.cli.arguments import (
     MAP_FORMS,
-    add_index_base,
-    add_partial_of_any_scale,
+    add_partial,
+    add_paths,
+    add_reading,
     add_source_and_target,
     add_up,
-    add_weld,
-    path,
     positive_number,
     refuse_without,
 )
-from jaxsmw.cli.conclusion import show_quality, write_match_report
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.inputs import check_inputs, initial_map_files, read_maps, report_mesh
+from jaxsmw.cli.inputs import check_inputs, read_maps, report_mesh
+from jaxsmw.cli.measurement import show_quality
 from jaxsmw.cli.method import add_method, check_method, given_method, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_directories, report_written
+from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,31 +40,17 @@ HELP = "register the source on the target, and transfer landmarks and attributes
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add_source_and_target(parser)
-    parser.add_argument(
-        "--map",
-        metavar="FILE",
-        type=path,
-        help=f"map from the source to the target, instead of a match: {MAP_FORMS}",
-    )
-    parser.add_argument(
-        "--registered",
-        metavar="FILE",
-        type=path,
-        help="write the registered mesh to this file: the source with all its faces and attributes, and with "
-        "positions on the target. The suffix determines the format",
-    )
-    parser.add_argument(
-        "--landmarks",
-        metavar="FILE",
-        type=path,
-        help="landmarks on the source: .mrk.json and .fcsv of 3D Slicer, .pp of MeshLab, .mps of MITK, or "
-        ".csv and .txt with a name and a position per line",
-    )
-    parser.add_argument(
-        "--landmarks-output",
-        metavar="FILE",
-        type=path,
-        help="write the landmarks on the target to this file, in one of these formats except .mps",
+    add_paths(
+        parser,
+        {
+            "--map FILE": f"map from the source to the target, instead of a match: {MAP_FORMS}",
+            "--registered FILE": "write the registered mesh to this file: the source with all its faces and "
+            "attributes, and with positions on the target. The suffix determines the format",
+            "--landmarks FILE": "landmarks on the source: .mrk.json and .fcsv of 3D Slicer, .pp of MeshLab, "
+            ".mps of MITK, or .csv and .txt with a name and a position per line",
+            "--landmarks-output FILE": "write the landmarks on the target to this file, in one of these "
+            "formats except .mps",
+        },
     )
     parser.add_argument(
         "--coordinates",
@@ -73,13 +58,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="coordinate system of both meshes, to which landmarks are converted. By default, the coordinate "
         "system of the landmark file is assumed",
     )
-    parser.add_argument(
-        "--attributes",
-        metavar="FILE",
-        type=path,
-        help="write the target with the attributes of the source to this file: colours and other data of "
-        "vertices and faces, texture coordinates, blend shapes and skin weights. The suffix determines the "
-        "format",
+    add_paths(
+        parser,
+        {
+            "--attributes FILE": "write the target with the attributes of the source to this file: colours "
+            "and other data of vertices and faces, texture coordinates, blend shapes and skin weights. The "
+            "suffix determines the format",
+            "--report DIR": "write pictures, an interactive 3D page and a summary to this directory, like "
+            "match --report",
+        },
     )
     parser.add_argument(
         "--stiffness",
@@ -88,17 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="length below which noise of the map is smoothed, in units of the square root of the target's "
         "area (default: 0.005)",
     )
-    parser.add_argument(
-        "--report",
-        metavar="DIR",
-        type=path,
-        help="write pictures, an interactive 3D page and a summary to this directory, like match --report",
-    )
     add_up(parser)
-    add_partial_of_any_scale(parser)
+    add_partial(parser, with_scale=True)
     add_method(parser)
-    add_weld(parser)
-    add_index_base(parser)
+    add_reading(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -135,19 +115,8 @@ def run(options: argparse.Namespace) -> None:
             f"warning: {registered.flipped_faces.mean():.1%} of the triangles are flipped, so the map is "
             f"probably wrong: {cure}."
         )
-    if options.registered:
-        from jaxsmw.transfer.attributes import registered_data
-
-        _write(options.registered, registered_data(source, registered), stopwatch)
-    if options.attributes:
-        from jaxsmw.transfer.attributes import transfer_attributes
-
-        report_progress("attributes ...")
-        with stopwatch.step("attributes"):
-            carried = transfer_attributes(source, registered, target)
-        for note in carried.mesh.notes[len(target.mesh.notes) :]:
-            say(f"note: {note}")
-        _write(options.attributes, carried, stopwatch)
+    if options.registered or options.attributes:
+        _write_meshes(options, source, target, registered, stopwatch)
     transferred = None
     if landmarks:
         expected = None if correspondence is None else correspondence.expected_error()
@@ -182,10 +151,10 @@ def _check(options: argparse.Namespace) -> None:
         raise InputError("--report: describes a match, but --map gives a map: leave one of the two out.")
     refuse_without(options, "--partial", options.partial, "scale")
     refuse_without(options, "--report", bool(options.report), "up")
-    init_files = initial_map_files(options.init)
     check_method(options)
-    refuse_without(options, "--map or a file of --init", bool(options.map or init_files), "index_base")
-    from jaxsmw.io.landmarks import check_landmark_suffix, check_readable_suffix
+    reads_indices = bool(options.map or options.init.files)
+    refuse_without(options, "--map or a file of --init", reads_indices, "index_base")
+    from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
     from jaxsmw.io.meshes import check_attribute_suffix, check_mesh_suffix
 
     if options.registered:
@@ -196,7 +165,7 @@ def _check(options: argparse.Namespace) -> None:
         check_readable_suffix(options.landmarks)
     if options.landmarks_output:
         check_landmark_suffix(options.landmarks_output)
-    inputs = [options.source, options.target, options.map, options.landmarks, *init_files]
+    inputs = [options.source, options.target, options.map, options.landmarks, *options.init.files]
     check_inputs(*inputs)
     check_outputs(
         inputs,
@@ -208,7 +177,8 @@ def _check(options: argparse.Namespace) -> None:
 
 def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
     """Read the landmarks of the source, convert them to the coordinates of the meshes, and check them."""
-    from jaxsmw.io.landmarks import check_frame, check_known_system, read_landmark_file
+    from jaxsmw.io.landmark_files import check_known_system, read_landmark_file
+    from jaxsmw.io.landmarks import check_frame
 
     landmarks = read_landmark_file(options.landmarks)
     for note in landmarks.notes:
@@ -249,14 +219,7 @@ def _register(
     meshes, index_base = (source.mesh, target.mesh), options.index_base
     stiffness = options.stiffness or DEFAULT_STIFFNESS
     if not options.map:
-        correspondence = match_meshes(
-            options,
-            *meshes,
-            stopwatch,
-            partial=options.partial,
-            scale=options.scale,
-            index_base=index_base,
-        )
+        correspondence = match_meshes(options, *meshes, stopwatch)
         report_progress("registered mesh and expected error ...")
         with (
             stopwatch.step("registered mesh and expected error"),
@@ -284,7 +247,7 @@ def _transfer_landmarks(
     stopwatch: Stopwatch,
 ) -> Landmarks:
     """Transfer the landmarks, print their expected errors, write them if requested, and return them."""
-    from jaxsmw.io.landmarks import write_landmark_file
+    from jaxsmw.io.landmark_files import write_landmark_file
     from jaxsmw.transfer.landmarks import transfer_landmarks
 
     with stopwatch.step("landmarks"):
@@ -314,6 +277,27 @@ def _show_landmarks(found: TransferredLandmarks) -> None:
 
 # A landmark is marked if its expected error exceeds this multiple of the median expected error.
 _LARGE = 2
+
+
+def _write_meshes(
+    options: argparse.Namespace,
+    source: MeshData,
+    target: MeshData,
+    registered: RegisteredMesh,
+    stopwatch: Stopwatch,
+) -> None:
+    """Write the registered mesh, and the target with the attributes of the source."""
+    from jaxsmw.transfer.attributes import registered_data, transfer_attributes
+
+    if options.registered:
+        _write(options.registered, registered_data(source, registered), stopwatch)
+    if options.attributes:
+        report_progress("attributes ...")
+        with stopwatch.step("attributes"):
+            carried = transfer_attributes(source, registered, target)
+        for note in carried.mesh.notes[len(target.mesh.notes) :]:
+            say(f"note: {note}")
+        _write(options.attributes, carried, stopwatch)
 
 
 def _write(file: str, data: MeshData, stopwatch: Stopwatch) -> None:

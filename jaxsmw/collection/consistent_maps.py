@@ -12,7 +12,7 @@ from jaxsmw.collection.consistency import Edge, estimate_edge_errors
 from jaxsmw.collection.edges import EdgeMap
 from jaxsmw.collection.result import MatchedEdge
 from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
-from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.preparation import PreparedShape
 
 # Lengths are in units of the square root of the area of each shape. Table R26 is in `docs/research_log.md`.

@@ -22,7 +22,7 @@ from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.pairs import match_many, prepare_task
 from jaxsmw.collection.shapes import preset_key, shape_key
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.preparation import DescriptorAxes, PreparedShape
 from jaxsmw.matching.stages import Preset
@@ -103,7 +103,7 @@ def match_edges(
     provide a better initial map later.
     """
     prepared = (prepare_task(task.x, task.y, init=task.init, aligned=task.aligned) for task in tasks)
-    for found in match_many(prepared, preset, False, devices=devices):
+    for found in match_many(prepared, preset.without_alternatives(), devices=devices):
         try:
             yield found if isinstance(found, ArithmeticError) else EdgeMap.of(found)
         except ArithmeticError as error:

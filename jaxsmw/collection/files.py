@@ -20,7 +20,8 @@ from jaxsmw.collection.result import Collection
 from jaxsmw.collection.shape_models import ShapeModel
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.landmarks import Landmarks, write_landmark_file
+from jaxsmw.io.landmark_files import write_landmark_file
+from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.maps import write_pointwise_map
 from jaxsmw.io.mesh_data import MeshData
 from jaxsmw.io.meshes import write_mesh_data

@@ -34,7 +34,6 @@ def match_pairs(
     pairs: Iterable[tuple[int, int]],
     *,
     preset: PresetName | Preset = DEFAULT_PRESET,
-    alternatives: bool = True,
     batch_size: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[tuple[int, Correspondence]]:
@@ -49,8 +48,8 @@ def match_pairs(
     - `meshes`: the meshes of the shapes, each a `Mesh` or a mesh that `make_mesh` accepts. The meshes may
       have different units of length, because each shape is scaled to area 1.
     - `pairs`: a tuple (source X, target Y) for each pair, as 0-based positions in `meshes`.
-    - `preset`: `"accurate"` (the default), `"fast"`, `"paper"` or a `Preset`; see `match`.
-    - `alternatives`: whether repair tries alternative maps.
+    - `preset`: `"accurate"` (the default), `"fast"`, `"paper"` or a `Preset`; see `match`. Without
+      alternative maps (`Preset.without_alternatives`), suspicious maps take less time.
     - `batch_size`: the number of pairs that each device refines at the same time; see `refine_pairs`.
     - `devices`: the JAX devices. The default is all devices of the default backend.
 
@@ -70,7 +69,7 @@ def match_pairs(
 
     def results() -> Iterator[tuple[int, Correspondence]]:
         tasks = (prepare_task(shapes[i], shapes[j], given=Pair(uncut[i], uncut[j])) for i, j in checked)
-        matched = match_many(tasks, preset, alternatives, batch_size=batch_size, devices=devices)
+        matched = match_many(tasks, preset, batch_size=batch_size, devices=devices)
         for number, result in enumerate(matched):
             if isinstance(result, ArithmeticError):
                 raise result
@@ -112,7 +111,6 @@ def prepare_task(
 def match_many(
     tasks: Iterable[Task],
     preset: Preset,
-    alternatives: bool,
     *,
     batch_size: int | None = None,
     devices: Sequence[jax.Device] | None = None,
@@ -134,7 +132,7 @@ def match_many(
     if not batched:
         for own, prepared, starts in fitted():
             release_programs()
-            yield _matched(prepared, starts, own, (), alternatives)
+            yield _matched(prepared, starts, own)
         return
     # All pairs of a batch run the same stages.
     for own, group in itertools.groupby(fitted(), key=lambda task: task[0]):
@@ -144,17 +142,16 @@ def match_many(
             outcomes = iter(run_batches(own.judged, flat, batch_size=batch_size, devices=devices))
             for _, prepared, starts in waiting:
                 of_pair = list(itertools.islice(outcomes, len(starts)))
-                yield _matched(prepared, starts, own, of_pair, alternatives)
+                yield _matched(prepared, starts, own, of_pair)
 
 
 def _matched(
     prepared: PreparedPair,
     starts: Sequence[Start],
     preset: Preset,
-    outcomes: Sequence[Outcome],
-    alternatives: bool,
+    outcomes: Sequence[Outcome] = (),
 ) -> Correspondence | ArithmeticError:
     try:
-        return match_prepared(prepared, starts, preset, outcomes=outcomes, alternatives=alternatives)
+        return match_prepared(prepared, starts, preset, outcomes=outcomes)
     except ArithmeticError as error:
         return error

@@ -13,9 +13,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from jaxsmw.collection.consistency import Edge
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.runtime.batches import pad_rows, padded_size
 from jaxsmw.runtime.compilation import compiled
 

@@ -74,10 +74,7 @@ Side = TypeVar("Side")
 
 
 def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-    """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y).
-
-    **Raises:** `ValueError` for an unknown convention.
-    """
+    """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y)."""
     check_option("convention", convention, get_args(Convention))
     return (of_x, of_y) if convention == "pullback" else (of_y, of_x)
 
@@ -90,10 +87,9 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
     - `spectrum`: the `Spectrum` of a shape with n vertices and k eigenvectors.
     - `pseudo_inverse`: `"area"` computes `Phi^+ = Phi^T A`, where the diagonal matrix A contains the vertex
       areas. The MWP paper uses this matrix, which is the projection in the inner product of the surface.
-      `"least_squares"` computes `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. The MWP
-      authors' program uses `"least_squares"`. The two forms are nearly equal if the vertices are spread
-      evenly. The spectrum of samples (`Spectrum.sample`) needs `"least_squares"`, because its eigenvectors
-      are not orthonormal.
+      `"least_squares"` computes `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight, as in the
+      MWP authors' program. The two forms are nearly equal if the vertices are spread evenly. The eigenvectors
+      of samples (`Spectrum.sample`) are not orthonormal and need `"least_squares"`.
 
     **Returns:** The array (n, k), in units of length, where the eigenvectors are in units of 1 / length.
 
@@ -120,41 +116,36 @@ def encode(
 ) -> Float[Array, "k_out k_in"]:
     """Return the functional map C_0 of a pointwise map T: X -> Y, without any filtering.
 
-    Phi_X and Phi_Y contain the eigenvectors as columns, and `Phi^+` is a pseudo-inverse of Phi. P (m, n) is
-    the matrix of T: row x has a one in column T(x) and zeros elsewhere.
-
     **Arguments:**
 
-    - `pointwise_map`: the map T, as an integer array (m,) with one 0-based vertex of Y per vertex of X. T can
-      also be a `SoftMap` or a `SparseSoftMap` from X to Y.
+    - `pointwise_map`: the map T, as an integer array (m,) with one 0-based vertex of Y per vertex of X, or as
+      a `SoftMap` or a `SparseSoftMap` from X to Y.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
       vertices, k_Y eigenvectors). Both need the same scale, because a change of one shape's scale multiplies
       C_0 by a constant. Two full shapes need equal areas, such as the area 1 from `compute_spectrum`. The
       shapes of a partial pair need the same unit of length.
     - `convention`: the direction of C_0. `"pullback"` (the default) gives `Phi_X^+ P Phi_Y` (k_X, k_Y), which
       maps functions on Y to functions on X. `"pushforward"` gives `Phi_Y^+ P^T Phi_X` (k_Y, k_X), which maps
-      functions on X to functions on Y.
+      functions on X to functions on Y. P (m, n) is the matrix of T.
     - `pseudo_inverse`: `"area"` (the default) uses `Phi^+ = Phi^T A`, where the diagonal matrix A contains
-      the vertex areas. `"least_squares"` uses `Phi^+ = (Phi^T Phi)^-1 Phi^T`, in which all vertices have the
-      same weight.
+      the vertex areas. `"least_squares"` uses `Phi^+ = (Phi^T Phi)^-1 Phi^T`, which samples need.
 
-    **Returns:** C_0, a float array without unit. Its shape is (k_X, k_Y) in the pullback convention and
-    (k_Y, k_X) in the pushforward convention.
+    **Returns:** C_0, a float array without unit.
 
     **Raises:** `ValueError` for an unknown convention or pseudo-inverse.
     """
     spectrum_out, spectrum_in = out_and_in(convention, spectrum_x, spectrum_y)
     dual_out = dual_eigenvectors(spectrum_out, pseudo_inverse)
-    return _encode(pointwise_map, dual_out, spectrum_in.eigenvectors, convention)
+    return encode_by(dual_out, pointwise_map, spectrum_in.eigenvectors, convention)
 
 
-def _encode(
-    pointwise_map: PointwiseMap,
+def encode_by(
     dual_out: Float[Array, "n_out k_out"],
+    pointwise_map: PointwiseMap,
     eigenvectors_in: Float[Array, "n_in k_in"],
     convention: Convention,
 ) -> Float[Array, "k_out k_in"]:
-    """Compute the result of `encode` from dual eigenvectors."""
+    """Return the result of `encode` from the `dual_eigenvectors` of the shape that it maps to."""
     of_x, of_y = out_and_in(convention, dual_out, eigenvectors_in)
     dual_out, eigenvectors_in = out_and_in(convention, of_x, pull_back(pointwise_map, of_y))
     return product(dual_out.T, eigenvectors_in)
@@ -165,18 +156,9 @@ def multiscale_kernel(
 ) -> Float[Array, "k_out k_in"]:
     """Return the multiscale kernel K (k_out, k_in), which turns filtering into an elementwise product.
 
-    For a bank with filters g_l and any functional map C (k_out, k_in), the filtered map
-    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The diagonal matrix
-    Lambda_out contains the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains
-    the eigenvalues of the shape that C maps from.
-
-    The responses and the kernel are numbers without unit.
-
-    **Arguments:**
-
-    - `responses_out`: (filters, k_out), the responses g_l of the bank at the eigenvalues of the shape that C
-      maps to.
-    - `responses_in`: (filters, k_in), the responses at the eigenvalues of the shape that C maps from.
+    For a bank with filters g_l and any functional map C (k_out, k_in), the filtered map `sum_l
+    g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The responses g_l (filters, k)
+    at the eigenvalues of the shapes "out" and "in", and the kernel, are numbers without unit.
     """
     return product(responses_out.T, responses_in)
 
@@ -184,19 +166,15 @@ def multiscale_kernel(
 class QuadraticEnergy(eqx.Module):
     """A quadratic function of the functional map C: `E(C) = <C, C gram> - 2 <C, cross> + constant`.
 
-    Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares
-    `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the
-    energy of C (k_out, k_in) as an array of shape (), in the unit of `constant`. `energy.minimizer()` returns
-    the C of least energy, (k_out, k_in). If `gram` is singular, the returned matrix is NaN or meaningless,
-    and `energy.is_regular()` is False. `energy + other` adds two energies, and `weight * energy` multiplies
-    an energy by an array of shape ().
+    Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares `sum_i
+    ||C a_i - b_i||²` has this form. `energy(C)` returns the energy of C, `energy + other` adds two energies,
+    and `weight * energy` multiplies an energy by an array of shape ().
 
     **Attributes:**
 
     - `gram`: (k_in, k_in), `sum_i a_i a_i^T`, positive semi-definite.
     - `cross`: (k_out, k_in), `sum_i b_i a_i^T`.
-    - `constant`: (), `sum_i ||b_i||²`, which is the energy of C = 0. The unit depends on the vectors; the
-      energies of `WaveletProblem.energy` in the area norm have no unit.
+    - `constant`: (), `sum_i ||b_i||²`, which is the energy of C = 0. Its unit is that of the energy.
     """
 
     gram: Float[Array, "k_in k_in"]
@@ -209,10 +187,7 @@ class QuadraticEnergy(eqx.Module):
         return cls(jnp.zeros((k_in, k_in), dtype), jnp.zeros((k_out, k_in), dtype), jnp.zeros((), dtype))
 
     def __call__(self, functional_map: Float[Array, "k_out k_in"]) -> Float[Array, ""]:
-        """Return the energy of a functional map.
-
-        The energy is a difference of large sums, so rounding errors can make it slightly negative.
-        """
+        """Return the energy of a functional map. Rounding errors can make it slightly negative."""
         return jnp.sum(functional_map * (product(functional_map, self.gram) - 2 * self.cross)) + self.constant
 
     def __add__(self, other: QuadraticEnergy) -> QuadraticEnergy:
@@ -226,7 +201,7 @@ class QuadraticEnergy(eqx.Module):
     def minimizer(self) -> Float[Array, "k_out k_in"]:
         """Return the functional map of least energy, (k_out, k_in), by one Cholesky factorisation.
 
-        If the gram matrix is singular, the returned map is NaN or meaningless; `is_regular` detects this.
+        If the gram matrix is singular, the map is NaN or meaningless; `is_regular` detects this.
         """
         return solve_positive_definite(self.gram, self.cross.T).T
 
@@ -235,10 +210,7 @@ class QuadraticEnergy(eqx.Module):
         return is_regular(self.gram)
 
     def condition_number(self) -> Float[Array, ""]:
-        """Return the ratio of the largest to the smallest eigenvalue of the gram matrix.
-
-        The ratio is infinite if the matrix is singular.
-        """
+        """Return the ratio of the extreme eigenvalues of the gram matrix, infinite if it is singular."""
         eigenvalues = symmetric_eigenvalues(self.gram)
         return eigenvalues[-1] / jnp.maximum(eigenvalues[0], 0)
 
@@ -251,14 +223,13 @@ class WaveletProblem(eqx.Module):
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices). Both
-      have the same scale; see `encode`.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices), of the
+      same scale; see `encode`.
     - `responses_x`, `responses_y`: the responses of the filter bank, without unit, at the eigenvalues of X,
       (filters, k_x), and of Y, (filters, k_y).
-    - `convention`: `"pullback"` (the default) if C maps functions on Y to functions on X; `"pushforward"` if
-      C maps functions on X to functions on Y.
-    - `sampled`: whether the spectra contain only samples of the vertices, by default False. On samples, the
-      eigenvectors are not orthonormal.
+    - `convention`: the direction of C; see `encode`.
+    - `sampled`: whether the spectra contain only samples of the vertices. Their eigenvectors are not
+      orthonormal.
     """
 
     spectrum_x: Spectrum
@@ -269,10 +240,7 @@ class WaveletProblem(eqx.Module):
     sampled: bool = eqx.field(static=True, default=False)
 
     def out_and_in(self, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-        """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y).
-
-        **Raises:** `ValueError` for an unknown convention.
-        """
+        """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y)."""
         return out_and_in(self.convention, of_x, of_y)
 
     @property
@@ -285,40 +253,21 @@ class WaveletProblem(eqx.Module):
         """The responses on the two shapes in the order (out, in)."""
         return self.out_and_in(self.responses_x, self.responses_y)
 
-    def encode(
-        self, pointwise_map: PointwiseMap, dual_out: Float[Array, "n_out k_out"]
-    ) -> Float[Array, "k_out k_in"]:
-        """Return the functional map C_0 (k_out, k_in) of a pointwise map, without any filtering.
-
-        **Arguments:**
-
-        - `pointwise_map`: the map T, as in the function `encode`.
-        - `dual_out`: the `dual_eigenvectors` (n_out, k_out) of the shape that C maps to.
-        """
-        _, spectrum_in = self.spectra
-        return _encode(pointwise_map, dual_out, spectrum_in.eigenvectors, self.convention)
-
     def energy(self, pointwise_map: PointwiseMap, *, norm: Norm = "area") -> QuadraticEnergy:
         """Return the wavelet-preservation energy (equation (5) of the MWP paper) as a function of C.
 
-        For each functional map C, the energy is a weighted sum of squared distances over all filters and all
-        vertices x of X. In the pullback convention, C maps the wavelet at the match of x to a function on X.
-        Each summand is the squared distance between this function and the wavelet at x. The docstring of the
-        module `jaxsmw.core.functional_map` states the formula, which holds for every filter bank.
-
-        `problem.energy(T)(C)` is the energy of C. `problem.energy(T).minimizer()` is the C of least energy,
-        even if the frame is not tight. `problem.energy(T).constant` is the energy of C = 0. In the pullback
-        convention with the area norm, this constant is `sum_i G_X(lambda_i)`, where G_X is the frame function
-        on X, and lambda_i are the eigenvalues of X. For a Parseval frame this sum is k_X.
+        The energy is a weighted sum of squared distances over all filters and all vertices x of X. In the
+        pullback convention, a summand is the squared distance between the wavelet at x and the function to
+        which C maps the wavelet at the match of x. The module `jaxsmw.core.functional_map` states the
+        formula, which holds for every filter bank. In the pullback convention with the area norm, the energy
+        of C = 0 is `sum_i G_X(lambda_i)`, where G_X is the frame function on X. For a Parseval frame this sum
+        is k_X.
 
         **Arguments:**
 
         - `pointwise_map`: the map T, as in the function `encode`.
-        - `norm`: `"area"` (the default) weights each vertex of X by its area. `"frobenius"` gives all
-          vertices the same weight, as in equation (5) of the MWP paper.
-
-        **Returns:** A `QuadraticEnergy` with the attributes `gram` (k_in, k_in), `cross` (k_out, k_in) and
-        `constant` (). In the area norm, the energy has no unit.
+        - `norm`: `"area"` (the default) weights each vertex of X by its area; the energy then has no unit.
+          `"frobenius"` gives all vertices the same weight, as in equation (5) of the MWP paper.
         """
         weights, inputs, outputs = self._weights_inputs_outputs(pointwise_map, norm)
         responses_out, responses_in = self.responses

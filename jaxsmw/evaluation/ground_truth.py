@@ -18,8 +18,8 @@ from scipy.spatial import KDTree
 
 from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.io.maps import Table
 from jaxsmw.runtime.files import atomic_write
 

@@ -11,14 +11,9 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import GroundTruth
-from jaxsmw.geometry.geodesics import (
-    GeodesicMethod,
-    SurfacePoints,
-    check_indices,
-    check_points,
-    geodesic_distances_between,
-)
+from jaxsmw.geometry.geodesics import GeodesicMethod, geodesic_distances_between
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints, check_indices, check_points
 
 # Reports contain, for each of `THRESHOLDS`, the share of points with at most this error. Reported
 # correspondence quality curves end at `LARGEST_THRESHOLD`. Thresholds are in units of the square root of the

@@ -1,3 +1,4 @@
+from .landmark_files import read_landmark_file, write_landmark_file
 from .landmarks import (
     FrameDistances,
     LandmarkMatch,
@@ -5,8 +6,6 @@ from .landmarks import (
     check_frame,
     find_frame,
     match_landmarks,
-    read_landmark_file,
-    write_landmark_file,
 )
 from .maps import read_landmarks, read_pointwise_map, write_pointwise_map
 from .mesh_data import MeshData, Skin, Texture

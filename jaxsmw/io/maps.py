@@ -1,8 +1,7 @@
 """Readers and writers of pointwise maps, and readers of landmarks.
 
 A file has one of three formats: text with one row per line, NumPy's `.npy`, or MATLAB's `.mat`. Files do not
-say whether their indices count from 0 or from 1. By default, indices count from 1 in `.mat` files, as in
-MATLAB, and from 0 in all other files. The argument `index_base` overrides the default.
+say whether their indices count from 0 or from 1, so the argument `index_base` overrides the default.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.formats.mat import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
 from jaxsmw.io.formats.text import is_number
-from jaxsmw.io.landmarks import LANDMARK_SUFFIXES
+from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
 from jaxsmw.io.meshes import MESH_SUFFIXES, POINT_CLOUD_SUFFIXES
 from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
@@ -54,7 +53,7 @@ def read_pointwise_map(
     **Returns:** The target vertex of each source vertex, as an int64 array (m,), 0-based.
 
     **Raises:** `InputError` if the file cannot be read, does not have m rows, or contains a number that is
-    not a vertex of Y. The message names the file, the line and the fault.
+    not a vertex of Y.
     """
     table = Table(Path(path), columns=1)
     table.require_rows(mesh_x)
@@ -71,14 +70,13 @@ def read_landmarks(
     - `path`: a `.npy` file, a `.mat` file, or a text file with two vertices per line. A `.mat` file contains
       either a single matrix with two columns, or such a matrix called `T12` among other variables.
     - `mesh_x`, `mesh_y`: the source X and the target Y, each a `Mesh`.
-    - `index_base`: the index of the first vertex in the file, 0 or 1. The default None means 1 for `.mat`
-      files and 0 for all other files.
+    - `index_base`: the index of the first vertex in the file, as in `read_pointwise_map`.
 
     **Returns:** The l landmarks as an int64 array (l, 2), 0-based, with a vertex of X and its match on Y in
     each row.
 
     **Raises:** `InputError` if the file cannot be read, does not have two columns, or contains a number that
-    is not a vertex. The message names the file, the line and the fault.
+    is not a vertex.
     """
     table = Table(Path(path), columns=2)
     base = table.index_base(index_base)
@@ -138,8 +136,6 @@ class Table:
     Each row of the matrix is one line of a text file, or one row of an array in a file. In text files, spaces
     or tabs separate numbers. Commas are refused, because `3,5` could be a number with a decimal comma or the
     two vertices 3 and 5. `columns` is the required number of columns, or None for any number.
-
-    **Raises:** `InputError` if the file cannot be read, or does not contain such a matrix.
     """
 
     def __init__(self, path: Path, *, columns: int | None = None) -> None:
@@ -244,9 +240,9 @@ class Table:
             row = int(good.argmin())
             cure = "correct the number, or give the file for this pair"
             if base == 0 and numbers.min() >= 1 and numbers.max() == count:
-                cure = "the file looks 1-based: pass index_base=1 (--index-base 1)"
+                cure = "the file looks 1-based: pass index_base=1"
             elif base == 1 and numbers.min() == 0 and numbers.max() < count:
-                cure = "the file looks 0-based: pass index_base=0 (--index-base 0)"
+                cure = "the file looks 0-based: pass index_base=0"
             raise InputError(
                 f"{self.place(row)}: {self.word(row, column)} is not one of the {what}, which are "
                 f"numbered {base} to {count - 1 + base}: {cure}."

@@ -53,8 +53,7 @@ class Skin(NamedTuple):
 class MeshData:
     """A mesh together with everything that a file says about its vertices and faces.
 
-    Use `read_mesh_data` to read a `MeshData` from a file. The constructor checks all lengths, types and
-    indices, so a `MeshData` is always consistent.
+    The constructor checks all lengths, types and indices, so a `MeshData` is always consistent.
 
     **Attributes:**
 
@@ -66,12 +65,10 @@ class MeshData:
       are uint8, or floats from 0 to 1. Normals are called `normals`.
     - `face_data`: a dictionary from names to arrays (f,) or (f, c) with numbers for each triangle, of the
       same types.
-    - `texture`: a `Texture`, or None. A `Texture` is a pair of arrays: texture coordinates (t, 2), and the
-      0-based texture vertex of each corner (f, 3).
+    - `texture`: a `Texture`, or None.
     - `blend_shapes`: a dictionary from the names of blend shapes (morph targets) to displacements (n, 3) of
       the vertices, float64, in the unit of the vertices.
-    - `skin`: a `Skin`, or None. A `Skin` is a pair: the names of the joints, and the weight of each joint at
-      each vertex (n, joints), without unit.
+    - `skin`: a `Skin`, or None.
     - `label_names`: a dictionary for arrays of labels 0, 1, … in `vertex_data` or `face_data`. Its keys are
       the names of these arrays, and its values are tuples of the names of the labels. For example,
       `face_data["group"]` of an OBJ file contains the number of each triangle's group, and

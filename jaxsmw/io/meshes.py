@@ -3,8 +3,8 @@
 Vertices must keep their order, and a damaged file must cause one clear error message. Therefore this library
 has its own parsers, one per module of `jaxsmw.io.formats`, which is imported when such a file is opened. The
 reader of libigl accepts indices out of range and aborts the process on some invalid headers. The reader of
-trimesh splits and drops vertices of OBJ files. It also cannot read binary PLY files whose polygons have
-different numbers of corners. pygltflib parses only the JSON part of glTF files, and has no checks.
+trimesh splits and drops vertices of OBJ files, and cannot read binary PLY files of different polygons.
+pygltflib parses only the JSON part of glTF files, and has no checks.
 
 The other libraries were tried on the files of `tests/corpus`, with one to three damages of
 `tests/test_fuzzing.py` each. On 1000 damaged VTK legacy files, the reader of VTK 9.7.2 ended the process with
@@ -53,12 +53,10 @@ POINT_CLOUD_SUFFIXES = tuple(_ONLY_POINTS)
 def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     """Read a triangle mesh, or a point cloud, from a file in any format of `read_mesh_data`.
 
-    Vertices keep the order of the file. An STL file contains only the corners of triangles, so corners at
-    the same position become one vertex. The vertices of an STL file are numbered in the order in which their
-    positions first appear. Faces with more than three corners are split into fans of triangles, and triangle
-    strips into triangles. A glTF file duplicates vertices along texture seams, so these vertices are always
-    welded. The points of a point cloud become the vertices of a mesh, as in
-    `jaxsmw.geometry.triangulate_points`.
+    Vertices keep the order of the file. Corners of an STL file at the same position become one vertex, and
+    the vertices are numbered in the order in which their positions first appear. Faces with more than three
+    corners are split into fans of triangles, and triangle strips into triangles. The points of a point cloud
+    become the vertices of a mesh, as in `jaxsmw.geometry.triangulate_points`.
 
     **Arguments:**
 
@@ -66,21 +64,16 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
         `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.xyz`, `.pcd` or `.npy`.
     - `weld`: if True, vertices at the same position are merged, as in `make_mesh`. Faces then use only the
         lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so no vertex is
-        renumbered. Welding has no effect on an STL file, whose corners are always merged.
+        renumbered. The vertices of STL and glTF files are always welded.
 
-    **Returns:**
+    **Returns:** A `Mesh` whose `name` is the path, with positions (n, 3) in the unit of the file and 0-based
+    faces (f, 3). The `notes` of the mesh report changes such as dropped faces, and peculiarities such as
+    unreferenced vertices. They also report flaws that do not concern the surface, such as a damaged texture.
 
-    A `Mesh` whose `name` is the path, with positions (n, 3) in the unit of the file and 0-based faces (f, 3).
-    The `notes` of the mesh report changes such as dropped faces, and peculiarities such as unreferenced
-    vertices. Flaws that do not concern the surface are also noted there: faces with two corners, a damaged
-    texture, bytes behind the triangles of a binary STL file, or a text STL file without `endsolid`.
-
-    **Raises:**
-
-    `InputError` if the file cannot be read, does not have the format of its suffix, ends early, contains
-    lines but no faces, or continues after the declared end. `InputError` is also raised if `make_mesh`
-    refuses the mesh, for example because an index is out of range, the position of a corner is not finite, or
-    all faces are degenerate.
+    **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, ends early,
+    contains lines but no faces, or continues after the declared end. `InputError` is also raised if
+    `make_mesh` refuses the mesh, for example because an index is out of range, the position of a corner is
+    not finite, or all faces are degenerate.
     """
     return read_mesh_data(path, weld=weld).mesh
 
@@ -121,27 +114,21 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     If a file has no faces, `jaxsmw.geometry.triangulate_points` adds faces, with the help of `normals`.
 
     A glTF file duplicates vertices along texture seams. Duplicates that `write_mesh_data` recorded are
-    joined. `MeshData.mesh` keeps all other duplicates as vertices. However, the faces of `MeshData.mesh` use
-    only one vertex per position, as if `weld` were True.
-    The transforms of the nodes are applied, and all meshes of the scene are joined in the order of the nodes.
-    Skinned meshes stay in their bind pose. Buffers in other files are read only if these files are in the
-    folder of the glTF file or in its subfolders. Normals, tangents, animations and pictures in glTF files are
-    not read.
+    joined. All other duplicates are vertices, but the faces of `MeshData.mesh` use only one vertex per
+    position. The transforms of the nodes are applied, and all meshes of the scene are joined in the order of
+    the nodes. Skinned meshes stay in their bind pose. Buffers in other files are read only if these files are
+    in the folder of the glTF file or in its subfolders. Normals, tangents, animations and pictures in glTF
+    files are not read.
 
     **Arguments:**
 
     - `path`, `weld`: as for `read_mesh`. Welding changes `MeshData.mesh`, but not `MeshData.faces`.
 
-    **Returns:**
+    **Returns:** A `MeshData` with n vertices and f triangles, in the units of the file. Each triangle has the
+    data of the polygon or strip from which it comes.
 
-    A `MeshData` with n vertices and f triangles, in the units of the file. Its attributes are `mesh`, `faces`
-    (f, 3), `vertex_data`, `face_data`, `texture`, `blend_shapes`, `skin` and `label_names`. Each triangle has
-    the data of the polygon or strip from which it comes.
-
-    **Raises:**
-
-    `InputError` if `read_mesh` refuses the file, or if its data is damaged, for example because an array has
-    a wrong length. A damaged texture is left out with a note.
+    **Raises:** `InputError` if `read_mesh` refuses the file, or if its data is damaged, for example because
+    an array has a wrong length. A damaged texture is left out with a note.
     """
     path = Path(path)
     data = read_bytes(path)
@@ -153,8 +140,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
         )
     try:
         polygons = _parse(data, suffix, path.parent)
-        at, polygon = triangles_of(polygons.sizes, polygons.is_strip)
-        faces, notes = _triangles(polygons, at)
+        is_strip = np.zeros(len(polygons.sizes), bool) if polygons.strips is None else polygons.strips
+        at, polygon = triangles_of(polygons.sizes, is_strip)
+        faces = polygons.corners[at]
+        notes = [*polygons.notes, *_notes(polygons.sizes[~is_strip], polygons.lines, len(faces))]
         texture, lost = texture_or_note(lambda: _texture_at(polygons, at))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -195,21 +184,20 @@ def _parse(data: bytes, suffix: str, folder: Path) -> Polygons:
         return parse(data, folder) if suffix == ".gltf" else parse(data)
 
 
-def _triangles(polygons: Polygons, at: Int64[np.ndarray, "t 3"]) -> tuple[np.ndarray, list[str]]:
-    """Return the vertices of the triangles (t, 3), and the notes of the file."""
-    sizes = polygons.sizes[~polygons.is_strip]
-    notes = list(polygons.notes)
+def _notes(sizes: Int64[np.ndarray, " f"], lines: int, triangles: int) -> list[str]:
+    """Return notes on faces that are no triangles. Refuse a file that contains only lines."""
+    notes = []
     edges, large = int((sizes == 2).sum()), int((sizes > 3).sum())
-    if (edges or polygons.lines) and not len(at):
+    if (edges or lines) and not triangles:
         raise InputError(
-            f"contains {count_of(edges + polygons.lines, 'line')} (edges or faces with 2 corners), but no "
-            "triangles, so it describes no surface: export the mesh with its faces."
+            f"contains {count_of(edges + lines, 'line')} (edges or faces with 2 corners), but no triangles, "
+            "so it describes no surface: export the mesh with its faces."
         )
     if edges:
         notes.append(f"{count_of(edges, 'face')} with 2 corners ignored: lines are not part of a surface.")
     if large:
         notes.append(f"{count_of(large, 'face')} with more than three corners split into triangles.")
-    return polygons.corners[at], notes
+    return notes
 
 
 def _texture_at(polygons: Polygons, at: Int64[np.ndarray, "t 3"]) -> Texture | None:
@@ -256,8 +244,7 @@ def write_mesh(
     - `colors`: the red, green and blue components of the colour of each vertex (n, 3), as floats from 0 to 1
         or as uint8. None, the default, writes no colours. An OFF file with colours begins with COFF.
 
-    **Returns:** A tuple of sentences about what the format cannot hold, such as colours in an STL file. The
-    tuple is empty if the file contains everything.
+    **Returns:** A tuple of sentences about what the format cannot hold, such as colours in an STL file.
 
     **Raises:** `InputError` if `write_mesh_data` raises it, or `colors` has a wrong shape, type or range.
     """

@@ -28,7 +28,8 @@ from jaxsmw.io.formats.mat import (
     read_variables,
     write_variables,
 )
-from jaxsmw.runtime.files import atomic_write, largest_contents, size_of_file
+from jaxsmw.io.formats.npz import read_arrays
+from jaxsmw.runtime.files import atomic_write, read_bytes
 
 # The docstring of `make_spectrum` lists the accepted objects.
 SpectrumLike: TypeAlias = Any
@@ -162,8 +163,6 @@ def _real(values: Any, what: str, name: str) -> np.ndarray:
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     """Read the eigenbasis of a shape from a `.mat` file or a `.npz` file (see `write_spectrum`).
 
-    The surface is scaled to area 1, as `make_spectrum` explains. The unit of length in the file is arbitrary.
-
     **Arguments:**
 
     - `path`: the file.
@@ -172,12 +171,10 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
           (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are either
           `A`, which is the lumped mass matrix (n, n) or its diagonal, or a list `area` (n).
 
-    **Returns:** A `Spectrum` of a surface of area 1, with `eigenvalues` (k,), `eigenvectors` (n, k),
-    `vertex_areas` (n,) and `mask` (n,). It has no descriptors, positions or normals. Its arrays have JAX's
-    default float type (float32 unless `jax_enable_x64` is set).
+    **Returns:** A `Spectrum`, as from `make_spectrum`.
 
     **Raises:** `InputError` if the file cannot be read, has another suffix, is damaged, lacks a field, or
-    does not contain exactly one eigenbasis. The message names the file and the fault.
+    does not contain exactly one eigenbasis.
     """
     name = os.fspath(path)
     if is_mat_file(path):
@@ -191,23 +188,15 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
         raise InputError(
             f"{path}: spectra are read from .npz and .mat files: give a file of one of these types."
         )
-    fields = "eigenvalues", "eigenvectors", "vertex_areas"
-    limit = largest_contents(size_of_file(path))
+    data = read_bytes(path, largest=None)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if sum(member.file_size for member in file.zip.infolist()) > limit:
-                raise InputError(
-                    f"{path}: would take more than 1 GiB of memory and more than four times the size of the "
-                    "file: write the spectrum again, without other arrays."
-                )
-            arrays = [file[field] for field in fields]
-    except InputError:
-        raise
-    except Exception:  # NumPy can raise any exception for damaged files
-        raise InputError(
-            f"{path}: is damaged or lacks one of {', '.join(fields)}: write the spectrum again."
-        ) from None
-    return make_spectrum(*arrays, name=name)
+        arrays = read_arrays(data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    fields = "eigenvalues", "eigenvectors", "vertex_areas"
+    if missing := [field for field in fields if field not in arrays]:
+        raise InputError(f"{path}: lacks {', '.join(missing)}: write the spectrum again.")
+    return make_spectrum(*(arrays[field] for field in fields), name=name)
 
 
 def _areas_of(struct: Mapping[str, Any], name: str) -> Any:
@@ -298,12 +287,10 @@ def read_functional_map(
 
     **Returns:** The functional map C (k_X, k_Y), float64, with the values of the file. C fits the spectra of
     this library only if the eigenbases of the file belong to surfaces of area 1. Otherwise, C must be
-    multiplied by the factor that `make_spectrum` states. k_X and k_Y are at most the numbers of eigenvectors
-    of the spectra.
+    multiplied by the factor that `make_spectrum` states.
 
     **Raises:** `InputError` if the file cannot be read or contains no suitable matrix. `InputError` is also
-    raised if the matrix is too large for the spectra, or has entries that are not finite. The message names
-    the file and the fault.
+    raised if the matrix is too large for the spectra, or has entries that are not finite.
     """
     matrix = read_matrix(path, FUNCTIONAL_MAP)
     most = spectrum_x.eigenvalues.shape[0], spectrum_y.eigenvalues.shape[0]
@@ -324,8 +311,6 @@ def write_functional_map(
     path: str | os.PathLike[str], functional_map: Float[Array, "k_x k_y"] | Float[np.ndarray, "k_x k_y"]
 ) -> None:
     """Write a functional map as the matrix `C21` to a `.mat` file.
-
-    The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 

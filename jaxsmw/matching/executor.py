@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Int64
 
-from jaxsmw.core.refinement import Refinement, refine
-from jaxsmw.core.refiner import Problem, Refiner, Samples, State
-from jaxsmw.core.refiner import reverse_map as reverse_map_of_state
+from jaxsmw.core.refinement import Refinement, RefineSettings, refine
+from jaxsmw.core.refiner import Problem, Refiner, Samples, State, recover_reverse
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
@@ -210,7 +209,7 @@ def _run_one(stages: Sequence[Stage], seen: Sequence[SpectralPair], start: Start
             excluded = jnp.asarray(pad_rows(start.excluded, len(spectra.x.mask)))
             spectra = replace(spectra, x=spectra.x.excluding(excluded))
         x, y, samples, partial = spectra.x, spectra.y, spectra.samples, spectra.partial
-        settings = {**stage.settings, "partial": partial, "history": history}
+        settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
         found = compiled(refine)(x, y, matches, samples=samples, **settings)
         refinements.append(found)
         matches = found.pointwise_map
@@ -296,7 +295,7 @@ def compile_stage(
         x, y = (_outline(stage, size) for size in sizes)
         return (x, y, jnp.zeros(sizes[0], jnp.int32)), {"samples": samples}
 
-    settings = {**stage.settings, "partial": partial, "history": history}
+    settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
     compile_ahead(refine, arguments, **settings)
 
 
@@ -319,7 +318,7 @@ def reverse_map(refiner: Refiner, spectra: SpectralPair, state: State) -> Int64[
     - `spectra`: the spectra that the stage has seen, without padding; see `SpectralPair.seen_by`.
     - `state`: the `State` of the refiner.
     """
-    found = compiled(reverse_map_of_state)(refiner, _problem(spectra), state)
+    found = compiled(recover_reverse)(refiner, _problem(spectra), state)
     return np.asarray(found)[: spectra.y.mask.shape[0]].astype(np.int64)
 
 

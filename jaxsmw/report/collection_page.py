@@ -58,33 +58,32 @@ def write_collection_page(
 
     On the page, each point of the body has the same colour on every shape. A user can compare any two shapes,
     and deform the mean shape along the modes of the model. Plots show the matched pairs and the scores of the
-    shapes. The page is one file and needs no network.
+    shapes. The page is one file and needs no network. The viewer takes about 0.6 MB of it, and each shape
+    takes 8 bytes per vertex.
 
     **Arguments:**
 
-    - `path`: the HTML file. The viewer takes about 0.6 MB of the file. Each shape takes 8 bytes per vertex.
+    - `path`: the HTML file.
     - `names`: the names of the N shapes.
     - `faces`: the faces of the template (f, 3).
     - `registered`: the positions of the template's vertices on each shape, N arrays (n, 3).
     - `template`: the index of the template.
     - `edges`: the matched pairs of shapes.
-    - `model`: the shape model of the registered shapes; None for a page without mean shape, modes and scores.
-      The model must contain the shapes in the same order, and its reference must be the template.
+    - `model`: the shape model of the registered shapes, in the same order and with the template as reference;
+      None for a page without mean shape, modes and scores.
     - `title`: the heading of the page.
     - `notes`: sentences about decisions, such as the choice of the template.
-    - `left_out`: the shapes that the page does not show, as a dictionary from the name of a shape to the
-      reason.
+    - `left_out`: the reasons why the page does not show some shapes, by their names.
     - `warning`: a sentence below the heading, or an empty text.
-    - `up`: the axis of the template's coordinates that points up, such as `"y"` or `"-z"`. By default,
-      `jaxsmw.report.standing.guess_up` guesses the axis from several shapes.
+    - `up`: the axis of the template's coordinates that points up, such as `"y"` or `"-z"`; by default guessed
+      from several shapes (`jaxsmw.report.standing.guess_up`).
 
     A page shows at most 20 000 vertices per shape (`MOST_VERTICES`). If a manifold template has more
-    vertices, its triangulation is simplified, and all shapes are shown with the same vertices. The positions
-    on the page are rounded to 16 bits per coordinate.
+    vertices, its triangulation is simplified. Positions are rounded to 16 bits per coordinate.
 
-    **Raises:** `InputError` if there is no shape, or if names, faces, edges or the model do not fit the
-    shapes. `InputError` is also raised if a coordinate is not finite, the template has no area, `up` is not
-    an axis, or the file cannot be written.
+    **Raises:** `InputError` if there is no shape, if names, faces, edges or the model do not fit the shapes,
+    if a coordinate is not finite, the template has no area, `up` is not an axis, or the file cannot be
+    written.
     """
     _check(names, faces, registered, template, edges, model)
     corners = np.asarray(faces, dtype=np.int64)
@@ -147,18 +146,11 @@ def write_collection_page(
 
 
 def simplify(mesh: Mesh, most: int) -> tuple[Int64[np.ndarray, " q"], Int64[np.ndarray, "g 3"]]:
-    """Simplify a mesh: choose some of its vertices and triangulate them.
+    """Simplify a mesh to at most `most` of its n vertices, such that its picture hardly changes.
 
-    The picture of the mesh hardly changes. The shortest edges are collapsed first (`igl.decimate`). If the
-    mesh is not manifold, only its unreferenced vertices are removed.
-
-    **Arguments:**
-
-    - `mesh`: a mesh with n vertices.
-    - `most`: the largest number of vertices.
-
-    **Returns:** The indices of the chosen vertices (q,), and faces (g, 3) that refer to the chosen vertices.
-    A mesh with at most `most` vertices keeps all its vertices and faces.
+    The shortest edges are collapsed first (`igl.decimate`). If the mesh is not manifold, only its
+    unreferenced vertices are removed. Return the indices of the chosen vertices (q,), and faces (g, 3) that
+    refer to the chosen vertices. A mesh with at most `most` vertices keeps all its vertices and faces.
     """
     n, used = len(mesh.vertices), np.flatnonzero(mesh.referenced_vertices)
     if n <= most:
@@ -181,20 +173,13 @@ def simplify(mesh: Mesh, most: int) -> tuple[Int64[np.ndarray, " q"], Int64[np.n
 def layout(
     shapes: Float64[np.ndarray, "N n 3"], weights: Float64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "N 2"]:
-    """Place shapes as points in the plane. Similar shapes are close to each other.
+    """Place N aligned shapes (N, n, 3) as points in the plane (N, 2). Similar shapes are close to each other.
 
-    The distance between two aligned shapes is the weighted root mean square of the distances between
-    corresponding vertices. Classical multidimensional scaling gives the initial places (Torgerson 1952).
-    Majorisation then brings the distances in the plane closer to the distances between the shapes (de Leeuw,
-    "Applications of convex analysis to multidimensional scaling", 1977).
-
-    **Arguments:**
-
-    - `shapes`: aligned shapes (N, n, 3).
-    - `weights`: the weights of the vertices (n,), with the sum 1.
-
-    **Returns:** Places (N, 2), in the unit of the shapes. Both coordinates have the mean 0. The first
-    coordinate has the larger variance.
+    The distance between two shapes is the weighted root mean square of the distances between corresponding
+    vertices. The weights have the sum 1. Classical multidimensional scaling gives the initial places
+    (Torgerson 1952). Majorisation then brings the distances in the plane closer to the distances between the
+    shapes (de Leeuw, "Applications of convex analysis to multidimensional scaling", 1977). Both coordinates
+    have the mean 0. The first coordinate has the larger variance.
     """
     count = len(shapes)
     centered = (shapes - shapes.mean(axis=0)) * np.sqrt(weights)[:, None]

@@ -10,6 +10,7 @@ from jaxtyping import Float, Float64
 
 from jaxsmw.evaluation.metrics import THRESHOLDS
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.report.standing import visible
 
 ERROR_LIMIT = max(THRESHOLDS)
 """The error at which the colour scale ends, as a fraction of the square root of the target's area.
@@ -76,38 +77,28 @@ PLAIN = np.array([0.76, 0.77, 0.79])
 
 
 def linear_to_srgb(linear: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Convert linear RGB intensities (…, 3) to sRGB colours (…, 3) in [0, 1] (IEC 61966-2-1).
-
-    Intensities outside of [0, 1] are clipped.
-    """
+    """Convert linear RGB (…, 3), clipped to [0, 1], to sRGB (…, 3) in [0, 1] (IEC 61966-2-1)."""
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def srgb_to_linear(srgb: Float64[np.ndarray, "*shape 3"]) -> Float64[np.ndarray, "*shape 3"]:
-    """Convert sRGB colours (…, 3) in [0, 1] to linear RGB intensities (…, 3), which can be averaged."""
+    """Convert sRGB colours (…, 3) in [0, 1] to linear RGB (…, 3), which can be averaged."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
-    """Return a colour for every vertex. The colours vary smoothly with the position on the body.
+    """Return an sRGB colour (n, 3) for every vertex of an upright mesh, which shows its position on the body.
 
-    The right side of the body is green, and the left side is red. The hue changes from yellow to blue along
-    the height or the length of the body, whichever is larger. Along the shorter of the two axes, only the
-    lightness changes. Each limb of people and animals therefore has its own hue, and swapped limbs are
-    obvious.
+    The colours vary smoothly. The right side of the body is green, and the left side is red. The hue changes
+    from yellow to blue along the height or the length of the body, whichever is larger. Along the shorter of
+    the two axes, only the lightness changes. Each limb of people and animals therefore has its own hue, and
+    swapped limbs are obvious.
 
     Along each axis, the colour depends on the vertex's relative position in the bounding box and on its
     relative rank among all vertices. Without the rank, the trunk of a slender body would be uniformly grey.
-
-    **Arguments:**
-
-    - `mesh`: an upright mesh (`jaxsmw.report.standing.stand`) with n vertices: x runs across the body, y
-      points up and z points forward.
-
-    **Returns:** sRGB colours (n, 3) in [0, 1].
     """
-    used = mesh.vertices[mesh.referenced_vertices]
+    used = visible(mesh)
     low, high = used.min(axis=0), used.max(axis=0)
     # Coordinates are rounded to this grid. Without the grid, the ranks of vertices on a flat mesh would
     # depend on rounding errors, and the colours would be noisy.
@@ -115,10 +106,8 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     coordinates = np.empty_like(mesh.vertices)
     for axis in range(3):
         values = np.round(mesh.vertices[:, axis] / grid)
-        sorted_values = np.sort(values[mesh.referenced_vertices])
-        below = np.searchsorted(sorted_values, values, "left") + np.searchsorted(
-            sorted_values, values, "right"
-        )
+        ordered = np.sort(visible(mesh, values))
+        below = sum(np.searchsorted(ordered, values, side) for side in ("left", "right"))
         position = (mesh.vertices[:, axis] - low[axis]) / max(high[axis] - low[axis], grid)
         coordinates[:, axis] = np.clip(position, 0, 1) + below / (2 * len(used)) - 1
     lateral, up, forward = coordinates.T
@@ -129,15 +118,9 @@ def position_colors(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
 
 
 def error_colors(errors: Float[np.ndarray, " m"], limit: float = ERROR_LIMIT) -> Float64[np.ndarray, "m 3"]:
-    """Return the colours of errors on a scale from 0 to `limit`. Errors above `limit` have the last colour.
+    """Return the sRGB colours (m, 3) of non-negative errors (m,) on a scale from 0 to `limit`.
 
-    **Arguments:**
-
-    - `errors`: non-negative errors (m,); NaN where the error is unknown. Unknown errors have the colour
-      `PLAIN`.
-    - `limit`: the end of the scale, positive, in the unit of the errors.
-
-    **Returns:** sRGB colours (m, 3) in [0, 1].
+    Errors above `limit` have the last colour. Unknown errors (NaN) have the colour `PLAIN`.
     """
     known = ~np.isnan(errors)
     found = _on_scale(np.where(known, errors, 0), 0.0, limit, _ERROR_SCALE)
@@ -147,17 +130,9 @@ def error_colors(errors: Float[np.ndarray, " m"], limit: float = ERROR_LIMIT) ->
 def signed_colors(
     values: Float[np.ndarray, " m"], limit: float, *, on_dark: bool = False
 ) -> Float64[np.ndarray, "m 3"]:
-    """Return the colours of values on a scale from `-limit` (blue) to `limit` (red).
+    """Return the sRGB colours (m, 3) of values (m,) on a scale from `-limit` (blue) to `limit` (red).
 
-    **Arguments:**
-
-    - `values`: signed numbers (m,), such as the values of a function or the entries of a matrix. Values
-      outside of the scale are clipped.
-    - `limit`: the end of the scale, positive, in the unit of the values.
-    - `on_dark`: whether the background is dark. On a dark background, the colour for the value zero is dark.
-      On a light background, this colour is white.
-
-    **Returns:** sRGB colours (m, 3) in [0, 1].
+    Values outside of the scale are clipped. The colour for zero is dark on a dark background, else white.
     """
     return _on_scale(values, -limit, limit, _SIGNED_SCALE[on_dark])
 

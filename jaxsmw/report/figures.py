@@ -1,6 +1,7 @@
 """Figures for papers and talks, drawn by matplotlib without a display.
 
-The functions need the extra `jaxsmw[report]`. They return each figure as a `matplotlib.figure.Figure`.
+The functions need the extra `jaxsmw[report]`, and raise an `InputError` if matplotlib is missing. They return
+each figure as a `matplotlib.figure.Figure`.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ from jaxtyping import Array, Float, Float64, Int
 
 from jaxsmw.choices import Axis
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_number
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import check_pointwise_map
 from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, error_colors, position_colors
-from jaxsmw.report.inputs import check_error_limit, check_errors, check_functional_map, check_map
+from jaxsmw.report.inputs import check_errors, check_functional_map
 from jaxsmw.report.rendering import camera_axes, choose_azimuth, render
-from jaxsmw.report.standing import stand, stand_pair
+from jaxsmw.report.standing import stand, stand_pair, visible
 from jaxsmw.runtime.files import atomic_write, check_writable
 from jaxsmw.wording import printable, short_names
 
@@ -71,28 +73,25 @@ def draw_correspondence(
 
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices), each a `Mesh` in any unit of length.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `errors`: a dictionary from the name of each kind of error to an array (m,). The array contains the
-      error of each match as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array,
-      the figure contains a panel that shows the errors as colours on X.
+    - `errors`: a dictionary from the name of each kind of error to an array (m,), as in
+      `jaxsmw.report.page.ShownMap`. For each array, a panel shows the errors as colours on X.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two figures are comparable if their limits are equal.
-    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
-      `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
+    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`; by default guessed from each
+      mesh (`jaxsmw.report.standing.guess_up`).
     - `azimuth`: the direction from which the bodies are seen, in degrees from the front of the body towards
-      its left. By default, `jaxsmw.report.rendering.choose_azimuth` chooses the direction.
+      its left; by default chosen for the bodies (`jaxsmw.report.rendering.choose_azimuth`).
 
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if the map or the errors do not fit the meshes, if the limit is not positive, if
-    `up` is not an axis, or if matplotlib is missing.
+    **Raises:** `InputError` if the map or the errors do not fit the meshes, if the limit is not positive, or
+    if `up` is not an axis.
     """
-    indices = check_map(mesh_x, mesh_y, pointwise_map)
+    indices = check_pointwise_map(pointwise_map, mesh_x, mesh_y)
     shown_x, shown_y = stand_pair(mesh_x, mesh_y, up, indices)
     colors_y = position_colors(shown_y)
     panels = [_Panel("Source", shown_x, colors_y[indices]), _Panel("Target", shown_y, colors_y)]
     if not errors:
         return _draw_panels(panels, azimuth)
-    check_error_limit(error_limit)
+    check_number("error_limit", error_limit, positive=True)
     checked = check_errors(mesh_x, errors)
     for name, values in checked.items():
         panels.append(_Panel(f"{name} on the source", shown_x, error_colors(values, error_limit)))
@@ -108,18 +107,14 @@ def draw_mesh(
     up: Axis | None = None,
     azimuth: float | None = None,
 ) -> Figure:
-    """Draw one shaded mesh.
+    """Draw one shaded mesh, a `Mesh` with n vertices in any unit of length.
 
     **Arguments:**
 
-    - `mesh`: a surface with n vertices, a `Mesh` in any unit of length.
     - `colors`: one sRGB colour in [0, 1] per vertex (n, 3); by default, the mesh is grey.
     - `up`, `azimuth`: the axis that points up and the direction of view, as in `draw_correspondence`.
 
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if the colours do not fit the mesh, if `up` is not an axis, or if matplotlib is
-    missing.
+    **Raises:** `InputError` if the colours do not fit the mesh, or if `up` is not an axis.
     """
     n = len(mesh.vertices)
     if colors is None:
@@ -137,15 +132,10 @@ def draw_functional_map(
 ) -> Figure:
     """Draw a functional map C. Positive entries are red, and negative entries are blue.
 
-    **Arguments:**
+    C has the shape (k_X, k_Y) in the convention `"pullback"` and (k_Y, k_X) in the convention
+    `"pushforward"`, which determines the axis labels.
 
-    - `functional_map`: the functional map C, with shape (k_X, k_Y) in the pullback convention and shape
-      (k_Y, k_X) in the pushforward convention.
-    - `convention`: the convention of C, `"pullback"` or `"pushforward"`, which determines the axis labels.
-
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if C is not a matrix of finite numbers, or if matplotlib is missing.
+    **Raises:** `InputError` if C is not a matrix of finite numbers.
     """
     matrix = check_functional_map(functional_map)
     figure = new_figure(5.0, 4.3, plot=True)
@@ -175,14 +165,12 @@ def draw_filters(
 
     **Arguments:**
 
-    - `eigenvalue_grid`: the values of lambda at which the responses are given (p,), ascending.
-    - `responses`: the responses (filters, p). The first row belongs to the scaling function, and the other
-      rows belong to the wavelets, from the coarsest to the finest.
+    - `eigenvalue_grid`: the ascending values of lambda at which the responses are given (p,).
+    - `responses`: the responses (filters, p), first of the scaling function, then of the wavelets, from the
+      coarsest to the finest.
     - `eigenvalues`: the eigenvalues of a shape (k,), which the figure marks on the horizontal axis.
 
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if the responses do not fit the grid, or if matplotlib is missing.
+    **Raises:** `InputError` if the responses do not fit the grid.
     """
     grid, curves = np.asarray(eigenvalue_grid, dtype=float), np.asarray(responses, dtype=float)
     if grid.ndim != 1 or curves.ndim != 2 or curves.shape[1:] != grid.shape:
@@ -231,22 +219,16 @@ def draw_quality_curves(
     *,
     mean_errors: Mapping[str, float] = MappingProxyType({}),
 ) -> Figure:
-    """Draw correspondence quality curves.
-
-    A curve shows, for each threshold, the share of matches whose error is at most this threshold.
+    """Draw correspondence quality curves: the shares of matches with at most a given error.
 
     **Arguments:**
 
-    - `curves`: a dictionary from the name of each map to its curve. A curve is a pair of two arrays,
-      thresholds (p,) and shares (p,). The thresholds are fractions of sqrt(area of Y), in ascending order.
-      The shares are numbers in [0, 1].
-    - `mean_errors`: a dictionary from the name of a map to its mean error, as a fraction of sqrt(area of Y),
-      which the legend shows. The dictionary need not contain all maps.
+    - `curves`: a dictionary from the name of each map to a pair of arrays: ascending thresholds (p,), as
+      fractions of sqrt(area of Y), and shares (p,) in [0, 1].
+    - `mean_errors`: a dictionary from the names of some maps to their mean errors, as fractions of sqrt(area
+      of Y), for the legend.
 
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if there is no curve, if the arguments do not fit together, or if matplotlib is
-    missing.
+    **Raises:** `InputError` if there is no curve, or if the arguments do not fit together.
     """
     if not curves:
         raise InputError("there is no quality curve to draw; give at least one curve.")
@@ -316,10 +298,7 @@ def draw_functions(
     - `marked`: for each body, the 0-based vertex that the figure marks by a ring.
     - `up`, `azimuth`: the axis that points up and the direction of view, as in `draw_correspondence`.
 
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if the functions do not fit the meshes or the titles, if `up` is not an axis, or
-    if matplotlib is missing.
+    **Raises:** `InputError` if the functions do not fit the meshes or the titles, or if `up` is not an axis.
     """
     for mesh, values in zip(meshes, functions, strict=True):
         if np.shape(values) != (len(titles), len(mesh.vertices)):
@@ -328,12 +307,9 @@ def draw_functions(
                 f"{(len(titles), len(mesh.vertices))}: one row per title and one column per vertex."
             )
     standing = [stand(mesh, up) for mesh in meshes]
-    angle = choose_azimuth(standing) if azimuth is None else np.radians(azimuth)
+    angle, scale, sizes = _layout(standing, azimuth, (280, 420))
     axes = camera_axes(angle)[:2]
-    reach = [np.abs(mesh.vertices[mesh.referenced_vertices] @ axes.T).max(axis=0) for mesh in standing]
-    scale = np.min(np.divide((280, 420), 2 * np.max(reach, axis=0)))
-    cell_width = int(np.ceil(2 * scale * max(x for x, _ in reach)))
-    heights = [int(np.ceil(2 * scale * y)) for _, y in reach]
+    cell_width, heights = max(width for width, _ in sizes), [height for _, height in sizes]
     gap, header = 24, 60
     width = len(titles) * (cell_width + gap) + gap
     height = header + sum(heights) + gap * len(meshes)
@@ -364,14 +340,9 @@ def draw_functions(
 
 
 def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
-    """Write a figure as PNG, PDF or SVG. The file is written completely or not at all.
+    """Write a figure as PNG, PDF or SVG, as the suffix says. The file is written completely or not at all.
 
-    **Arguments:**
-
-    - `path`: the file to create or to replace. The suffix (`.png`, `.pdf` or `.svg`) determines the format.
-    - `figure`: a `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` for any other suffix, if the file cannot be written, or if matplotlib is missing.
+    **Raises:** `InputError` for any other suffix, or if the file cannot be written.
     """
     check_figure_path(path)
     suffix = Path(path).suffix.lower()
@@ -388,10 +359,7 @@ def save_figure(path: str | os.PathLike[str], figure: Figure) -> None:
 
 
 def check_drawable() -> None:
-    """Check that matplotlib is installed.
-
-    **Raises:** `InputError` if matplotlib is missing.
-    """
+    """Check that matplotlib is installed."""
     try:
         import matplotlib.backends.backend_agg  # noqa: F401
     except ImportError as error:
@@ -401,11 +369,7 @@ def check_drawable() -> None:
 
 
 def check_figure_path(path: str | os.PathLike[str]) -> None:
-    """Check that `save_figure` can write a file.
-
-    **Raises:** `InputError` if the suffix of the file is not `.png`, `.pdf` or `.svg`, if the file cannot be
-    written, or if matplotlib is missing.
-    """
+    """Check that `save_figure` can write a file."""
     if Path(path).suffix.lower() not in _METADATA:
         raise InputError(f"{path}: the suffix is not .png, .pdf or .svg; choose one of these suffixes.")
     check_drawable()
@@ -424,18 +388,27 @@ class _Panel(NamedTuple):
     colors: np.ndarray
 
 
+def _layout(
+    meshes: Sequence[Mesh], azimuth: float | None, largest: tuple[int, int]
+) -> tuple[float, float, list[tuple[int, int]]]:
+    """Return the azimuth in radians, the pixels per unit of length, and the size of each body in pixels.
+
+    `azimuth` is in degrees. The widest and the highest body fit into the size `largest`.
+    """
+    angle = choose_azimuth(meshes) if azimuth is None else np.radians(azimuth)
+    axes = camera_axes(angle)[:2]
+    extents = [2 * np.abs(visible(mesh) @ axes.T).max(axis=0) for mesh in meshes]
+    scale = float(np.min(np.divide(largest, np.max(extents, axis=0))))
+    return angle, scale, [(int(np.ceil(scale * x)), int(np.ceil(scale * y))) for x, y in extents]
+
+
 def _draw_panels(panels: Sequence[_Panel], azimuth: float | None, *, right_margin: int = 0) -> Figure:
     """Draw the bodies next to each other at the same scale, with an empty margin in pixels at the right."""
-    angle = choose_azimuth([panel.mesh for panel in panels]) if azimuth is None else np.radians(azimuth)
-    axes = camera_axes(angle)[:2]
-    reach = [
-        np.abs(panel.mesh.vertices[panel.mesh.referenced_vertices] @ axes.T).max(axis=0) for panel in panels
-    ]
-    scale = np.min(np.divide(_BODY_SIZE, 2 * np.max(reach, axis=0)))
+    angle, scale, sizes = _layout([panel.mesh for panel in panels], azimuth, _BODY_SIZE)
     captioned = bool(panels[0].role)
     gap, header, narrowest = (40, 135, _LONGEST_NAME * 12) if captioned else (40, 0, 0)
-    widths = [max(int(np.ceil(2 * scale * x)) + 2 * gap, narrowest) for x, _ in reach]
-    body_height = int(np.ceil(2 * scale * max(y for _, y in reach)))
+    widths = [max(width + 2 * gap, narrowest) for width, _ in sizes]
+    body_height = max(height for _, height in sizes)
     height, width = body_height + 2 * gap + header, sum(widths) + right_margin
 
     figure = new_figure(width / _DPI, height / _DPI)
@@ -503,8 +476,6 @@ def new_figure(width: float, height: float, *, plot: bool = False) -> Figure:
     """Return an empty white figure that opens no window. The width and the height are in inches.
 
     With `plot`, matplotlib chooses the positions of axes and labels automatically.
-
-    **Raises:** `InputError` if matplotlib is missing.
     """
     check_drawable()
     from matplotlib.backends.backend_agg import FigureCanvasAgg

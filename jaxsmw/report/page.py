@@ -16,11 +16,12 @@ from jaxsmw.choices import Axis
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_number
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import check_pointwise_map
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.report.colors import ERROR_LIMIT, position_colors
-from jaxsmw.report.inputs import check_error_limit, check_errors, check_map
+from jaxsmw.report.inputs import check_errors
 from jaxsmw.report.page_data import (
     encode,
     encode_basis,
@@ -32,7 +33,7 @@ from jaxsmw.report.page_data import (
     spectra_on_page,
 )
 from jaxsmw.report.rendering import choose_azimuth
-from jaxsmw.report.standing import stand_pair
+from jaxsmw.report.standing import stand_pair, visible
 from jaxsmw.report.template import facts, table, write_html
 from jaxsmw.wording import short_names
 
@@ -73,14 +74,11 @@ class ShownMap:
 
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
     - `errors`: a dictionary from the name of each kind of error to an array (m,). The array contains the
-      error of each match as a fraction of sqrt(area of Y), or NaN where the error is unknown. For each array,
-      the page has a mode that shows the errors as colours.
-    - `functional_map`: the functional map C, without unit, which the page shows as a picture. The shape is
-      (k_X, k_Y) in the pullback convention and (k_Y, k_X) in the pushforward convention. If C is None, the
-      page shows no functional map.
+      error of each match as a fraction of sqrt(area of Y), or NaN where the error is unknown.
+    - `functional_map`: the functional map C, (k_X, k_Y) in the pullback convention and (k_Y, k_X) in the
+      pushforward convention, or None.
     - `convention`: the convention of C, `"pullback"` or `"pushforward"`.
-    - `statistics`: a dictionary from labels to values as text. The page contains a table of these values,
-      with one row per map and one column per label.
+    - `statistics`: a dictionary from labels to values as text, for a table with one row per map.
     """
 
     pointwise_map: Int[np.ndarray | Array, " m"]
@@ -123,8 +121,8 @@ def write_page(
     **Arguments:**
 
     - `path`: the HTML file. Any browser with WebGL opens the file from disk. The viewer takes about 0.6 MB of
-      the file. The meshes take 50 bytes per vertex, and each map takes a few bytes per vertex. The spectra
-      take 133 bytes per vertex, but at most 8 MB in total.
+      the file, and the meshes take 50 bytes per vertex. The spectra take 133 bytes per vertex, but at most 8
+      MB in total.
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices), each a `Mesh` in any unit of length.
     - `maps`: a dictionary from the name of each map to a `ShownMap`. The page opens with the first map.
     - `title`: the heading of the page.
@@ -132,13 +130,12 @@ def write_page(
       `jaxsmw.report.page_data.eigenvectors_on_page` limits the number of eigenvectors on the page.
     - `refiner`: a `WaveletPreservation` refiner, whose filter bank defines the wavelets.
     - `statistics`: a dictionary from labels to values as text, which the page shows below the bodies.
-    - `error_meanings`: a dictionary from each name in `ShownMap.errors` to a sentence that explains this kind
-      of error on the page.
+    - `error_meanings`: a sentence on the page about each kind of error in `ShownMap.errors`, by its name.
     - `error_limit`: the error at which the colour scale ends, as a fraction of sqrt(area of Y). The colours
       of two pages are comparable if their limits are equal.
     - `figures`: the figures at the end of the page, each a pair of a caption and the bytes of a PNG file.
-    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
-      `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
+    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`; by default guessed from each
+      mesh (`jaxsmw.report.standing.guess_up`).
     - `registered`: the positions of X's vertices on Y (m, 3), in the coordinates of Y's file. With them, the
       page can draw X on top of Y, and a slider deforms X from its own shape to these positions.
     - `landmarks`: a pair of `Landmarks`, on X and on Y, with which the page opens, in the coordinates of the
@@ -150,22 +147,20 @@ def write_page(
     """
     if not maps:
         raise InputError("there is no map to show; give at least one map.")
-    check_error_limit(error_limit)
+    check_number("error_limit", error_limit, positive=True)
     encoded = [_encode_map(name, shown, mesh_x, mesh_y) for name, shown in maps.items()]
     error_names = list(dict.fromkeys(of for shown in maps.values() for of in shown.errors))
-    first = check_map(mesh_x, mesh_y, next(iter(maps.values())).pointwise_map)
+    first = check_pointwise_map(next(iter(maps.values())).pointwise_map, mesh_x, mesh_y)
     shown_x, shown_y = stand_pair(mesh_x, mesh_y, up, first)
     name_x, name_y = short_names([mesh_x.name, mesh_y.name])
-    reach = np.max(
-        [np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0) for mesh in (shown_x, shown_y)], axis=0
-    )
+    extent = np.max([np.ptp(visible(mesh), axis=0) for mesh in (shown_x, shown_y)], axis=0)
     data = {
         "x": encode_shape(name_x, mesh_x, shown_x),
         "y": encode_shape(name_y, mesh_y, shown_y),
         "maps": encoded,
         "colors": encode_colors(position_colors(shown_y)),
         "azimuth": choose_azimuth([shown_x, shown_y]),
-        "wide": bool(max(reach[0], reach[2]) > _WIDE * reach[1]),
+        "wide": bool(max(extent[0], extent[2]) > _WIDE * extent[1]),
         "limit": error_limit,
         "error_names": error_names,
         "expected": EXPECTED_ERROR,
@@ -206,7 +201,7 @@ def _encode_map(name: str, shown: ShownMap, mesh_x: Mesh, mesh_y: Mesh) -> dict[
     """Return the data that the viewer needs to show one map."""
     return {
         "name": name,
-        "map": encode(check_map(mesh_x, mesh_y, shown.pointwise_map), "<u4"),
+        "map": encode(check_pointwise_map(shown.pointwise_map, mesh_x, mesh_y), "<u4"),
         "errors": {of: encode(values, "<f4") for of, values in check_errors(mesh_x, shown.errors).items()},
         "functional": encode_functional_map(shown.functional_map, shown.convention),
     }

@@ -25,9 +25,8 @@ _EIGENVECTORS, _FEWEST, _VALUES = 100, 20, 6_000_000
 def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
     """Return the number of eigenvectors per shape on a page that shows two meshes.
 
-    The number depends on the total number of vertices of both meshes. Up to 60 000 vertices, the number of
-    eigenvectors is 100, as in the MWP paper. For more vertices, the number decreases. Above 300 000 vertices,
-    the number is 0.
+    Up to 60 000 vertices of both meshes together, the number is 100, as in the MWP paper. For more vertices,
+    the number decreases. Above 300 000 vertices, the number is 0.
     """
     room = _VALUES // (len(mesh_x.vertices) + len(mesh_y.vertices))
     return min(_EIGENVECTORS, room) if room >= _FEWEST else 0
@@ -36,10 +35,9 @@ def eigenvectors_on_page(mesh_x: Mesh, mesh_y: Mesh) -> int:
 def spectra_on_page(
     mesh_x: Mesh, mesh_y: Mesh, spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> tuple[Spectrum, Spectrum] | None:
-    """Return the spectra of both shapes, truncated to the eigenvectors that a page contains.
+    """Return the spectra of both shapes, truncated to the eigenvectors that a page contains, or None.
 
-    The spectra of a partial pair are also truncated to their common range of eigenvalues. The result is None
-    if the meshes are so large that a page contains no eigenvectors.
+    The spectra of a partial pair are also truncated to their common range of eigenvalues.
 
     **Raises:** `InputError` if a spectrum does not have one row per vertex of its mesh.
     """
@@ -85,7 +83,7 @@ def encode_shape(name: str, mesh: Mesh, standing: Mesh) -> dict[str, Any]:
 def encode_registered(
     registered: Float[np.ndarray, "m 3"], mesh_x: Mesh, mesh_y: Mesh, standing_y: Mesh
 ) -> str:
-    """Convert positions of X's vertices on Y from the file of Y to the page, and encode them as float32.
+    """Encode positions of X's vertices in the file of Y as float32 positions on the page.
 
     **Raises:** `InputError` if the positions are not three finite numbers for every vertex of X.
     """
@@ -141,12 +139,7 @@ def encode_rounded(rows: Float[np.ndarray, "k n"]) -> dict[str, str]:
 def encode_functional_map(
     functional_map: Float[np.ndarray | Array, "k_out k_in"] | None, convention: Convention
 ) -> dict[str, Any] | None:
-    """Encode the entries of a functional map C (k_out, k_in), row by row, as float32 in base64.
-
-    The result is None if C is None.
-
-    **Raises:** `InputError` if C is not a matrix of finite numbers.
-    """
+    """Encode the entries of a functional map C (k_out, k_in), row by row, as float32 in base64."""
     if functional_map is None:
         return None
     matrix = check_functional_map(functional_map)

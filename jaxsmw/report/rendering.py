@@ -34,20 +34,14 @@ _CHUNK = 100_000
 
 
 def choose_azimuth(meshes: Sequence[Mesh]) -> float:
-    """Return the azimuth from which a common camera shows all meshes well.
+    """Return the azimuth, in radians from forward (+z) towards +x, from which a camera shows all meshes well.
 
     The best direction of view is the horizontal direction in which the bodies are thin. This direction shows
-    people from the front and animals from the side. Directions close to a preferred direction r are favoured.
-    The direction r shows a body from the front and a little from the side. Let M be the sum of the horizontal
-    covariance matrices of all n meshes, each scaled to trace 1. The chosen direction is the eigenvector of
-    M - 0.8 n r r^T with the smallest eigenvalue. Its sign is chosen such that the viewer is in front of the
-    bodies, unless they are open surfaces whose outside faces the other way.
-
-    **Arguments:**
-
-    - `meshes`: upright meshes (`jaxsmw.report.standing.stand`).
-
-    **Returns:** The viewer's azimuth in radians, from forward (+z) towards +x.
+    people from the front and animals from the side. Directions close to a preferred direction r, from the
+    front and a little from the side, are favoured. Let M be the sum of the horizontal covariance matrices of
+    all n upright meshes, each scaled to trace 1. The chosen direction is the eigenvector of M - 0.8 n r r^T
+    with the smallest eigenvalue. Its sign is chosen such that the viewer is in front of the bodies, unless
+    they are open surfaces whose outside faces the other way.
     """
     preferred = np.array([np.sin(_PREFERRED_AZIMUTH), np.cos(_PREFERRED_AZIMUTH)])
     matrix = -0.8 * len(meshes) * np.outer(preferred, preferred)
@@ -63,14 +57,7 @@ def choose_azimuth(meshes: Sequence[Mesh]) -> float:
 
 
 def camera_axes(azimuth: float) -> Float64[np.ndarray, "3 3"]:
-    """Return the axes of the camera at an azimuth.
-
-    **Arguments:**
-
-    - `azimuth`: the viewer's azimuth in radians, from forward (+z) towards +x.
-
-    **Returns:** An orthogonal matrix (3, 3), whose rows point right, up and towards the viewer.
-    """
+    """Return an orthogonal matrix (3, 3), whose rows point right, up and towards the viewer at an azimuth."""
     sine, cosine = np.sin(azimuth), np.cos(azimuth)
     towards = np.array([sine * np.cos(ELEVATION), np.sin(ELEVATION), cosine * np.cos(ELEVATION)])
     right = np.array([cosine, 0, -sine])
@@ -80,7 +67,7 @@ def camera_axes(azimuth: float) -> Float64[np.ndarray, "3 3"]:
 def render(
     mesh: Mesh, colors: Float64[np.ndarray, "n 3"], *, azimuth: float, scale: float, width: int, height: int
 ) -> UInt8[np.ndarray, "height width 4"]:
-    """Render a mesh with coloured vertices and smooth shading on a transparent background.
+    """Render an upright mesh with coloured vertices and smooth shading on a transparent background.
 
     The projection is orthographic, with the origin at the centre of the picture. A depth buffer with 2 x 2
     samples per pixel prevents cracks and wrongly sorted triangles. A strong light comes from the upper left,
@@ -88,13 +75,8 @@ def render(
     Where one part of the body is in front of another part, the rear part is slightly darker near the outline
     of the front part.
 
-    **Arguments:**
-
-    - `mesh`: an upright mesh (`jaxsmw.report.standing.stand`) with n vertices.
-    - `colors`: one sRGB colour in [0, 1] per vertex (n, 3). The colours are interpolated over the faces.
-    - `azimuth`: the viewer's azimuth in radians; see `choose_azimuth`.
-    - `scale`: the number of pixels per unit of length.
-    - `width`, `height`: the size of the picture in pixels.
+    `colors` contains one sRGB colour in [0, 1] per vertex (n, 3). `azimuth` is in radians; see
+    `choose_azimuth`. `scale` is the number of pixels per unit of length.
 
     **Returns:** RGBA pixels (height, width, 4) with straight alpha, the top row first.
     """

@@ -61,14 +61,9 @@ def stand(mesh: Mesh, up: Axis | None = None) -> Mesh:
     """Turn a mesh upright, scale it to area 1, and centre its bounding box on the origin.
 
     Faces are reoriented such that their normals point outward. The numbering of the vertices does not change.
-
-    **Arguments:**
-
-    - `mesh`: a surface of positive area.
-    - `up`: the axis of the file that points up, such as `"y"` or `"-z"`; by default the result of `guess_up`.
-
-    **Returns:** A `Mesh` in which y points up. If the file follows one of the usual conventions (y up, z up
-    or y down), x runs across the body, and z points forward.
+    In the result, y points up. If the file follows one of the usual conventions (y up, z up or y down), x
+    runs across the body, and z points forward. `up` is the axis of the file that points up, such as `"y"` or
+    `"-z"`; by default the result of `guess_up`.
 
     **Raises:** `InputError` if the mesh has no area or `up` is not an axis.
     """
@@ -93,14 +88,10 @@ def _outward(mesh: Mesh) -> Mesh:
 
 
 def facing(mesh: Mesh) -> Float64[np.ndarray, " 3"]:
-    """Return the direction that the outside of an open surface faces.
+    """Return the direction that the outside of an open surface faces: the mean of its outward normals.
 
-    The result is the mean of the outward normals. For example, the result for a mask is the direction of the
-    nose, with a length near 0.6. The result for a closed surface is 0.
-
-    **Arguments:**
-
-    - `mesh`: a surface of positive area whose normals point outward.
+    For example, the result for a mask is the direction of the nose, with a length near 0.6. The result for a
+    closed surface is 0.
     """
     return mesh.area_vectors.sum(axis=0) / (2 * mesh.area)
 
@@ -113,22 +104,13 @@ def stand_pair(
 ) -> tuple[Mesh, Mesh]:
     """Turn both meshes upright, and scale them for a common picture; see `stand`.
 
-    If a map shows that both shapes are nearly rigid copies, such as two jaws, X is turned like Y instead.
-
     Y is scaled to area 1. The scale of X depends on the ratio of the smaller area to the larger area. If the
     ratio is between 1/16 and 0.6, one of the shapes seems to be partial, and X keeps its size relative to Y.
     Otherwise X is also scaled to area 1. A ratio above 0.6 suggests two full shapes, and a ratio below 1/16
     suggests different units of length.
 
-    **Arguments:**
-
-    - `mesh_x`, `mesh_y`: surfaces of positive area.
-    - `up`: the axis of both files that points up, such as `"y"` or `"-z"`. By default, `guess_up` guesses the
-      axis of each mesh.
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y. If it is None (the default), or if `up` is
-      given, X is not turned like Y.
-
-    **Returns:** The upright meshes X and Y.
+    If a map T: X -> Y (m,) shows that both shapes are nearly rigid copies, such as two jaws, X is turned like
+    Y, unless `up` is given.
 
     **Raises:** `InputError` if a mesh has no area, or if `up` is not an axis.
     """
@@ -157,48 +139,38 @@ def _turned_like(mesh: Mesh, matches: Float64[np.ndarray, "m 3"]) -> Mesh:
 
 def _centered(positions: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
     """Move new positions of a mesh such that the middle of the bounding box is the origin."""
-    used = positions[mesh.referenced_vertices]
+    used = visible(mesh, positions)
     return positions - (used.min(axis=0) + used.max(axis=0)) / 2
 
 
+def visible(mesh: Mesh, values: Float64[np.ndarray, "n ..."] | None = None) -> Float64[np.ndarray, "_ ..."]:
+    """Return the positions, or other values, of the vertices that faces use. Pictures show only these."""
+    return (mesh.vertices if values is None else values)[mesh.referenced_vertices]
+
+
 def placement(mesh: Mesh, standing: Mesh) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, " 3"]]:
-    """Return the similarity transformation from a standing mesh back to the mesh in its file.
+    """Return the similarity transformation from a mesh of `stand` or `stand_pair` back to its file.
 
-    The transformation is `file = standing @ matrix + offset`.
-
-    **Arguments:**
-
-    - `mesh`: the mesh as read from its file.
-    - `standing`: the result of `stand` or `stand_pair` for this mesh.
-
-    **Returns:** The matrix (3, 3), which is a rotation times the scale, and the offset (3,) in the unit of
-    the file.
+    The transformation is `file = standing @ matrix + offset`. The matrix (3, 3) is a rotation times the
+    scale, and the offset (3,) is in the unit of the file.
     """
-    used = mesh.referenced_vertices
     scale = np.sqrt(mesh.area / standing.area)
-    motion = rigid_fit(scale * standing.vertices[used], mesh.vertices[used])
+    motion = rigid_fit(scale * visible(mesh, standing.vertices), visible(mesh))
     return scale * motion.rotation.T, motion.offset
 
 
 def guess_up(mesh: Mesh) -> Axis:
-    """Guess which axis of the file points up, from the limbs on which the body stands.
+    """Guess which axis of the file points up (`"y"`, `"z"` or `"-y"`), from the limbs on which a body stands.
 
     The score of an axis is the sum of two terms. The first term measures the limbs that hang down along the
     axis. Legs and arms usually hang down, and only the head points up. The second term measures how stably
-    the body would stand. The usual axis is y for a body that is slender
-    along y, such as a person, and for an open surface that faces along z, such as a mask. For other bodies,
-    the usual axis is z. The usual axis is returned unless the score of another axis is clearly higher.
+    the body would stand. The usual axis is y for a body that is slender along y, such as a person, and for an
+    open surface that faces along z, such as a mask. For other bodies, the usual axis is z. The usual axis is
+    returned unless the score of another axis is clearly higher.
 
     The guesses for several data sets were checked by eye. The guess is right for all 70 FAUST bodies, 41 of
-    43 TOSCA bodies and 30 of 32 SMAL animals. The guess is also right for 17 of 19 people of SHREC'19 and all
-    16 bodies of SHREC'16 topology. The guess can be wrong for a body that leaps, crouches, lies down or is
-    cut in half.
-
-    **Arguments:**
-
-    - `mesh`: a surface of positive area.
-
-    **Returns:** The axis: `"y"`, `"z"` or `"-y"`.
+    43 TOSCA bodies, 30 of 32 SMAL animals, 17 of 19 people of SHREC'19 and all 16 bodies of SHREC'16
+    topology. The guess can be wrong for a body that leaps, crouches, lies down or is cut in half.
 
     **Raises:** `InputError` if the mesh has no area.
     """
@@ -234,7 +206,7 @@ def _suits_opening(mesh: Mesh, up: Axis) -> float:
 
 def _merge_vertices(mesh: Mesh, cell: float) -> tuple[Float64[np.ndarray, "c 3"], Int64[np.ndarray, "e 2"]]:
     """Return the mean of the vertices in each grid cell, and the pairs of cells that edges join."""
-    used = mesh.vertices[mesh.referenced_vertices]
+    used = visible(mesh)
     # The number of cells along a thin mesh may exceed the range of integers, so the keys remain floats.
     keys = np.floor((used - used.min(axis=0)) / cell)
     _, cells, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)

@@ -8,13 +8,14 @@ import logging
 import os
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsmw.choices import Axis
 from jaxsmw.core.banks import FilterBank
@@ -24,6 +25,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import check_pointwise_map
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.pair import Pair
@@ -35,7 +37,6 @@ from jaxsmw.report.figures import (
     draw_quality_curves,
     save_figure,
 )
-from jaxsmw.report.inputs import check_map
 from jaxsmw.report.page import EXPECTED_ERROR, ShownMap, write_page
 from jaxsmw.report.page_data import eigenvectors_on_page
 from jaxsmw.runtime.compilation import compiled
@@ -88,26 +89,24 @@ def write_report(
 ) -> list[Path]:
     """Write pictures of a match, an interactive page and a summary to a directory.
 
-    The report contains the expected error. If measured errors are given, the report also contains them.
+    The function writes `report.html`, an interactive page with both bodies, the map and the initial map. It
+    also writes `correspondence.png`, `functional_map.png` and `summary.json`, `filters.png` if a stage has
+    filters, and `quality.png` if errors are given. The report contains the expected error.
 
     **Arguments:**
 
-    - `directory`: the directory of the report, which is created if it does not exist. The function always
-      writes `report.html`, `correspondence.png`, `functional_map.png` and `summary.json`. The file
-      `report.html` is an interactive page with both bodies, the map and the initial map. The function writes
-      `filters.png` if a stage has filters, and `quality.png` if errors are given.
+    - `directory`: the directory of the report, which is created if it does not exist.
     - `correspondence`: the result of `match`, a `Correspondence`.
     - `errors`: a dictionary from the name of each map to its `GeodesicError`. The last entry must contain the
       errors of `correspondence.pointwise_map`. An entry named `initial` must contain the errors of
       `correspondence.initial_map`.
-    - `settings`: a dictionary of settings to include in `summary.json`. The settings must be serialisable as
-      JSON.
-    - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds. The
-      default is `correspondence.seconds`. The steps must not overlap, because the report adds its own steps
-      and prints the sum as the total time.
-    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
-      `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
-    - `registered`: the `RegisteredMesh` that the page shows. By default, the page shows the result of
+    - `settings`: a dictionary of settings to include in `summary.json`, serialisable as JSON.
+    - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds, by default
+      `correspondence.seconds`. The steps must not overlap, because the report adds its own steps and prints
+      the sum as the total time.
+    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`; by default guessed from each
+      mesh (`jaxsmw.report.standing.guess_up`).
+    - `registered`: the `RegisteredMesh` that the page shows, by default the result of
       `Correspondence.registered_mesh`.
     - `landmarks`: a pair of `Landmarks`, on X and on Y, with which the page opens; see
       `jaxsmw.report.page.write_page`.
@@ -161,25 +160,40 @@ def write_report(
 
 def _shown_maps(correspondence: Correspondence, errors: Mapping[str, GeodesicError]) -> dict[str, ShownMap]:
     """Return the refined map and the initial map, as the page shows them."""
-    m = len(correspondence.pointwise_map)
     spectra = correspondence.spectrum_x, correspondence.spectrum_y
     convention = correspondence.preset.stages[-1].refiner.convention
-    final, initial = list(errors.values())[-1] if errors else None, errors.get("initial")
-    refined = ShownMap(
-        correspondence.pointwise_map,
-        _named_errors(final, m) | {EXPECTED_ERROR: correspondence.expected_error()},
-        correspondence.functional_map,
-        convention,
-        _error_statistics(final),
-    )
-    before = ShownMap(
-        correspondence.initial_map,
-        _named_errors(initial, m),
-        _encoded(correspondence.initial_map, *spectra, convention),
-        convention,
-        _error_statistics(initial),
-    )
-    return {"refined": refined, "initial": before}
+    last = list(errors.values())[-1] if errors else None
+    refined = _shown_map(correspondence.pointwise_map, correspondence.functional_map, last, convention)
+    initial_map = correspondence.initial_map
+    encoded = _encoded(initial_map, *spectra, convention)
+    expected = {EXPECTED_ERROR: correspondence.expected_error()}
+    return {
+        "refined": replace(refined, errors={**refined.errors, **expected}),
+        "initial": _shown_map(initial_map, encoded, errors.get("initial"), convention),
+    }
+
+
+def _shown_map(
+    pointwise_map: Int[np.ndarray, " m"],
+    functional_map: Float[np.ndarray | Array, "k_out k_in"] | None,
+    error: GeodesicError | None,
+    convention: Convention = "pullback",
+) -> ShownMap:
+    """Return a map for a page with its functional map, and perhaps with its errors and their statistics."""
+    if error is None:
+        return ShownMap(pointwise_map, {}, functional_map, convention)
+    m = len(pointwise_map)
+    total = np.bincount(error.source_vertices, error.errors, minlength=m)
+    count = np.bincount(error.source_vertices, minlength=m)
+    mean = np.divide(total, count, out=np.full(m, np.nan), where=count > 0)
+    shares = {f"error at most {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
+    statistics = {
+        "mean error (√area)": f"{error.mean:.4f}",
+        "median error (√area)": f"{error.median:.4f}",
+        **shares,
+        "area under curve": f"{error.area_under_curve():.3f}",
+    }
+    return ShownMap(pointwise_map, {"Error": mean}, functional_map, convention, statistics)
 
 
 def _save_figures(
@@ -240,21 +254,19 @@ def write_comparison(
 
     - `path`: the HTML file.
     - `mesh_x`, `mesh_y`: source X (m vertices) and target Y (n vertices).
-    - `pointwise_maps`: a dictionary from the name of each map to the map T: X -> Y (m,), an array of 0-based
-      vertices of Y. The page lists the maps in the order of the dictionary.
-    - `errors`: a dictionary from the same names to the `GeodesicError` of each map. The page shows these
-      errors as colours. The page also contains the correspondence quality curves, and a table of statistics
-      such as the mean errors.
-    - `partial`: whether one mesh is a partial shape and the other mesh the full shape. If True, both meshes
-      must have the same unit of length.
-    - `up`: the axis of the mesh files that points up, such as `"y"` or `"-z"`. By default,
-      `jaxsmw.report.standing.guess_up` guesses the axis of each mesh.
+    - `pointwise_maps`: a dictionary from the name of each map to the map T: X -> Y (m,), in the order of the
+      page.
+    - `errors`: a dictionary from the same names to the `GeodesicError` of each map. The page shows them as
+      colours, as correspondence quality curves, and in a table of statistics.
+    - `partial`: whether one mesh is a partial shape and the other mesh the full shape, in the same unit of
+      length.
+    - `up`: the axis of the mesh files that points up, as in `write_report`.
 
     **Raises:** `InputError` if the maps do not fit the meshes, if the file cannot be written, if `up` is not
     an axis, or if errors are given and matplotlib is missing.
     """
     errors = errors or {}
-    maps = {name: check_map(mesh_x, mesh_y, pointwise_map) for name, pointwise_map in pointwise_maps.items()}
+    maps = {name: check_pointwise_map(targets, mesh_x, mesh_y) for name, targets in pointwise_maps.items()}
     spectra = _spectra_on_page(mesh_x, mesh_y, partial)
     figures = []
     if errors:
@@ -262,13 +274,8 @@ def write_comparison(
         draw_errors(errors).savefig(curves, format="png", metadata={})
         figures = [(_QUALITY_CAPTION, curves.getvalue())]
     shown = {
-        name: ShownMap(
-            pointwise_map,
-            _named_errors(errors.get(name), len(pointwise_map)),
-            _encoded(pointwise_map, *spectra) if spectra else None,
-            statistics=_error_statistics(errors.get(name)),
-        )
-        for name, pointwise_map in maps.items()
+        name: _shown_map(targets, _encoded(targets, *spectra) if spectra else None, errors.get(name))
+        for name, targets in maps.items()
     }
     write_page(
         path,
@@ -314,27 +321,10 @@ def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
     return " to ".join(short_names([mesh_x.name, mesh_y.name]))
 
 
-def _error_statistics(error: GeodesicError | None) -> dict[str, str]:
-    """Return the statistics of errors as text, by label."""
-    if error is None:
-        return {}
-    shares = {f"error at most {threshold}": f"{share:.1%}" for threshold, share in error.within.items()}
-    area = f"{error.area_under_curve():.3f}"
-    mean, median = f"{error.mean:.4f}", f"{error.median:.4f}"
-    return {"mean error (√area)": mean, "median error (√area)": median, **shares, "area under curve": area}
-
-
 def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
     """Draw the filters of a bank and their frame function, as functions of the eigenvalue.
 
-    **Arguments:**
-
-    - `eigenvalues`: the eigenvalues of a shape (k,), ascending. The figure marks these eigenvalues and ends
-      at the last eigenvalue.
-
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if matplotlib is missing.
+    The figure marks the ascending eigenvalues of a shape (k,), and ends at the last eigenvalue.
     """
     spectrum = jnp.asarray(eigenvalues)
     grid = jnp.linspace(0, spectrum[-1], 1000)
@@ -342,16 +332,7 @@ def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
 
 
 def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
-    """Draw the correspondence quality curves of maps, with the mean error of each map in the legend.
-
-    **Arguments:**
-
-    - `errors`: a dictionary from the name of each map to its `GeodesicError`, with at least one entry.
-
-    **Returns:** A `matplotlib.figure.Figure`.
-
-    **Raises:** `InputError` if there are no errors, or if matplotlib is missing.
-    """
+    """Draw the correspondence quality curves of maps by their names, with mean errors in the legend."""
     thresholds = np.linspace(0, LARGEST_THRESHOLD, 251)
     return draw_quality_curves(
         {
@@ -367,16 +348,9 @@ def summarize(
     errors: Mapping[str, GeodesicError],
     seconds: Mapping[str, float] | None = None,
 ) -> dict[str, str]:
-    """Describe the sizes, errors and times of a match as text.
+    """Describe the sizes, errors and times of a match as text, by labels in the order of display.
 
-    **Arguments:**
-
-    - `correspondence`: the result of `match`.
-    - `errors`: a dictionary from the name of each map to its `GeodesicError`.
-    - `seconds`: a dictionary from the names of the completed steps to their wall times in seconds. The
-      default is `correspondence.seconds`.
-
-    **Returns:** A dictionary from the label of each value to the value as text, in the order of display.
+    `errors` and `seconds` are those of `write_report`.
     """
     facts = {
         "vertices": f"{len(correspondence.mesh_x.vertices)} to {len(correspondence.mesh_y.vertices)}",
@@ -410,12 +384,3 @@ def summarize(
 def provenance() -> dict[str, str]:
     """Return a dictionary of the facts on which results depend: package versions, machine and device."""
     return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
-
-
-def _named_errors(error: GeodesicError | None, m: int) -> dict[str, Float64[np.ndarray, " m"]]:
-    """Return the mean error of each source vertex, NaN if unknown, by the label on the page."""
-    if error is None:
-        return {}
-    total = np.bincount(error.source_vertices, error.errors, minlength=m)
-    count = np.bincount(error.source_vertices, minlength=m)
-    return {"Error": np.divide(total, count, out=np.full(m, np.nan), where=count > 0)}

@@ -30,16 +30,11 @@ _COLOR_SCALES = {
 def write_html(
     path: str | os.PathLike[str], template: str, data: Mapping[str, Any], fragments: Mapping[str, str]
 ) -> None:
-    """Write a page: a template, filled with the viewer, its data and HTML fragments.
+    """Write a page: a template in `report/assets`, filled with the viewer, its data and HTML fragments.
 
-    Question marks replace bytes of file names that are not valid UTF-8.
-
-    **Arguments:**
-
-    - `template`: the name of a file in `report/assets`.
-    - `data`: the data of the viewer, which JSON must be able to represent. The colour scales and the
-      elevation of the camera are added.
-    - `fragments`: a dictionary from each placeholder of the template to its HTML.
+    `data` is represented as JSON, with the colour scales and the elevation of the camera. `fragments` maps
+    each placeholder of the template to its HTML. Question marks replace bytes of file names that are not
+    valid UTF-8.
     """
     assets = files("jaxsmw.report") / "assets"
     viewer = (assets / "viewer.js").read_text("utf-8")

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float64
 from matplotlib.image import imsave
 
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
+from jaxsmw.report.standing import visible
 from jaxsmw.runtime.files import atomic_write
 
 TEXTURE_FILES = ("texture.png", "texture.mtl", "target.obj", "source.obj")
@@ -28,15 +29,8 @@ def write_textured_pair(
 
     The picture is projected onto the target along the shortest principal axis of the target. The projection
     has no seams, and the front and the back of the target look the same. Each source vertex receives the
-    texture coordinates of its match on the target.
-
-    **Arguments:**
-
-    - `directory`: an existing directory, to which `TEXTURE_FILES` are written. Existing files with these
-      names are replaced. Each file is replaced completely or not at all.
-    - `mesh_x`, `mesh_y`: source X (m vertices) and target Y.
-    - `points`: one `SurfacePoints` with m points on Y, which are the matches of the vertices of X. The result
-      of `Correspondence.surface_points()` is an example.
+    texture coordinates of its match in `points`, m points on Y. Each of the `TEXTURE_FILES` in the existing
+    directory is replaced completely or not at all.
 
     **Raises:** `InputError` if a file cannot be written.
     """
@@ -54,7 +48,7 @@ def write_textured_pair(
 
 def _projection(mesh: Mesh) -> Float64[np.ndarray, "n 2"]:
     """Return coordinates (n, 2) along the two longest principal axes, in [0, 1] for referenced vertices."""
-    used = mesh.vertices[mesh.referenced_vertices]
+    used = visible(mesh)
     _, _, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
     # The sign of a singular vector is arbitrary. Here, the component with the largest absolute value is
     # positive.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple, TypedDict, TypeVar
+from typing import NamedTuple, TypeVar, Unpack
 
 import equinox as eqx
 import jax
@@ -15,10 +15,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, Int32, Shaped
 
-from jaxsmw.choices import ITERATIONS
-from jaxsmw.core.refinement import Refinement, refine
-from jaxsmw.core.refiner import Refiner
-from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.checks import check_pointwise_map
+from jaxsmw.core.refinement import Refinement, RefineSettings, refine
 from jaxsmw.core.search import BLOCK, queries_per_block
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
@@ -90,17 +88,11 @@ def refine_pairs(
     pairs: Sequence[tuple[int, int]],
     pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     *,
-    refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
-    iterations: int = ITERATIONS,
     samples: Sequence[Int[Array, " _"]] | None = None,
-    starts_on_samples: bool = False,
-    ends_on_samples: bool = False,
-    partial: bool = False,
-    stop_when_unchanged: bool = False,
-    history: bool = False,
     batch_size: int | None = None,
     memory: int | None = None,
     devices: Sequence[jax.Device] | None = None,
+    **settings: Unpack[RefineSettings],
 ) -> Iterator[tuple[int, Refinement]]:
     """Refine many pairs of shapes, of equal or different sizes, in batches on all devices.
 
@@ -119,14 +111,14 @@ def refine_pairs(
       several times with different initial maps.
     - `pointwise_maps`: for each pair, the initial map T: X -> Y (m,), 0-based vertices of Y.
     - `samples`: for each shape, the samples (s,), as 0-based vertices; s must be the same for all shapes.
-    - `refiner`, `iterations`, `starts_on_samples`, `ends_on_samples`, `partial`, `stop_when_unchanged`,
-      `history`: see `refine`.
     - `batch_size`: the number of pairs that each device receives at the same time. The default on CPUs is 1,
       because larger batches save no time there. On other devices, it is the number of pairs that fit into
       `memory`, but at most 64.
     - `memory`: the memory in bytes that a batch may use on each device if `batch_size` is None. The default
       is half of the device's memory.
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
+    - `settings`: the arguments of `refine` that all pairs share: `refiner`, `iterations`,
+      `starts_on_samples`, `ends_on_samples`, `partial`, `stop_when_unchanged` and `history`.
 
     **Returns:** An iterator over tuples of the 0-based index of a pair in `pairs` and its `Refinement`. Pairs
     are grouped by their padded sizes, so their order differs from the order in `pairs`. Numerical failures
@@ -139,14 +131,6 @@ def refine_pairs(
     check_devices(devices)
     if batch_size is not None and batch_size < 1:
         raise InputError(f"batch_size is {batch_size}, but a batch needs at least 1 pair")
-    settings = _Settings(
-        iterations=iterations,
-        starts_on_samples=starts_on_samples,
-        ends_on_samples=ends_on_samples,
-        partial=partial,
-        stop_when_unchanged=stop_when_unchanged,
-        history=history,
-    )
     devices = jax.devices() if devices is None else devices
     mesh = Mesh(np.array(devices), ("pairs",))
 
@@ -173,7 +157,7 @@ def refine_pairs(
                     jax.device_put(maps.astype(np.int32), NamedSharding(mesh, _DIVIDED)),
                 )
                 with one_blas_thread():
-                    refined = compiled(_refine_batch)(refiner, batch, mesh, settings)
+                    refined = compiled(_refine_batch)(batch, mesh, settings)
                     refined = multihost_utils.process_allgather(refined, tiled=True)
                 for row, position in enumerate(of_batch):
                     of_pair = jax.tree.map(lambda leaf, row=row: jnp.asarray(leaf[row]), refined)
@@ -209,28 +193,7 @@ def _check_pairs(
                 f"pair {position} is {tuple(pair)}, but there are {len(spectra)} shapes: give the indices of "
                 "two shapes, counted from 0"
             )
-        if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
-            raise InputError(
-                f"the initial map of pair {position} has type {pointwise_map.dtype}: give integer vertex "
-                "indices"
-            )
-        vertices = spectra[pair[0]].mask.shape
-        if pointwise_map.shape != vertices:
-            raise InputError(
-                f"the initial map of pair {position} has shape {pointwise_map.shape}, but X has "
-                f"{vertices[0]} vertices: give one vertex of Y for each vertex of X"
-            )
-
-
-class _Settings(TypedDict):
-    """The arguments of `refine` that are the same for all pairs."""
-
-    iterations: int
-    starts_on_samples: bool
-    ends_on_samples: bool
-    partial: bool
-    stop_when_unchanged: bool
-    history: bool
+        check_pointwise_map(f"initial map of pair {position}", pointwise_map, len(spectra[pair[0]].mask))
 
 
 class _Sizes(NamedTuple):
@@ -298,11 +261,11 @@ def _take(tree: Tree, places: Int[Array, " batch"], mesh: Mesh) -> Tree:
     return lax.with_sharding_constraint(taken, NamedSharding(mesh, _DIVIDED))
 
 
-def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settings) -> Refinement:
+def _refine_batch(batch: _Batch, mesh: Mesh, settings: RefineSettings) -> Refinement:
     def one(pair: _Batch) -> Refinement:
         (spectrum_x, samples_x), (spectrum_y, samples_y), initial_map = pair
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
-        return refine(spectrum_x, spectrum_y, initial_map, refiner=refiner, samples=samples, **settings)
+        return refine(spectrum_x, spectrum_y, initial_map, samples=samples, **settings)
 
     each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
     if mesh.size == 1:

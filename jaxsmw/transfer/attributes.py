@@ -11,6 +11,7 @@ from jaxtyping import Float64, Int64, Shaped
 from scipy.sparse import csr_array
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.arrays import ratio
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, Skin, Texture
@@ -215,7 +216,7 @@ def _interpolated(values: Shaped[np.ndarray, "n ..."], corners: _Corners) -> Flo
     if finite.all():
         return matrix @ values
     total, share = matrix @ np.where(finite, values, 0), matrix @ finite.astype(np.float64)
-    means = np.divide(total, share, out=np.zeros_like(total), where=share > 0)
+    means = ratio(total, share)
     heaviest = values[corners.rows[np.arange(len(corners.rows)), corners.weights.argmax(axis=1)]]
     return np.where(np.isfinite(heaviest), means, heaviest)
 
@@ -230,7 +231,7 @@ def _mixed_skin(skin: Skin, matrix: csr_array) -> Skin:
         omitted = np.argsort(-weights, axis=1, kind="stable")[:, most:]
         np.put_along_axis(weights, omitted, 0, axis=1)
     totals = weights.sum(axis=1, keepdims=True)
-    return Skin(skin.joints, np.divide(weights, totals, out=np.zeros_like(weights), where=totals > 0))
+    return Skin(skin.joints, ratio(weights, totals))
 
 
 def _without(values: Mapping[str, _Value], names: Collection[str]) -> dict[str, _Value]:

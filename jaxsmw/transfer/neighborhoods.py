@@ -12,6 +12,7 @@ from jaxtyping import Float64, Int64
 from scipy.sparse import csr_array, diags_array
 
 from jaxsmw.geometry.alignment import nearest_rotations
+from jaxsmw.geometry.arrays import ratio
 from jaxsmw.geometry.mesh import Mesh
 
 # Values at vertices are averaged over neighbouring vertices _AVERAGINGS times. More averagings enlarge the
@@ -112,8 +113,8 @@ class Neighborhoods:
     def averaging(self) -> csr_array:
         """The matrix (n, n) that averages each vertex with its weighted neighbours."""
         totals = self.laplacian.diagonal()
-        inverse = np.divide(1, totals, out=np.zeros_like(totals), where=totals > 0)
-        return csr_array(diags_array(np.ones(len(totals))) - 0.5 * diags_array(inverse) @ self.laplacian)
+        inverse = diags_array(ratio(1, totals))
+        return csr_array(diags_array(np.ones(len(totals))) - 0.5 * inverse @ self.laplacian)
 
     def _averaged(self, values: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n ..."]:
         """Average the values at each vertex with those of its neighbourhood."""
@@ -137,8 +138,7 @@ class Neighborhoods:
         largest = ((moments**2).sum(axis=(1, 2)) ** 1.5).sum()
         hand = -1.0 if determinants.sum() < -_FLAT * largest else 1.0
         rotations, traces = nearest_rotations(hand * moments)
-        lengths = self.squared_lengths
-        scales = np.divide(traces, lengths, out=np.ones(len(lengths)), where=lengths > 0)
+        scales = ratio(traces, self.squared_lengths, otherwise=1.0)
         return Similarities(hand * rotations, np.clip(scales, 1 / _SCALE_RANGE, _SCALE_RANGE))
 
     def divergence(self, similarities: Similarities) -> Float64[np.ndarray, "n 3"]:

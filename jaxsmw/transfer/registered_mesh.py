@@ -14,9 +14,10 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import cg
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
+from jaxsmw.geometry.arrays import ratio
 from jaxsmw.geometry.mesh import Mesh, connected_components
 from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_facing_points, nearest_surface_points
+from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, check_surface_points
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.transfer.coverage import Attraction, UncoveredVertices, at_slits
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
@@ -150,7 +151,7 @@ class RegisteredMesh:
         ratio is 1.
         """
         own = self.mesh_x.face_areas / self.mesh_x.area
-        return np.divide(self.mesh.face_areas / self.mesh.area, own, out=np.ones(len(own)), where=own > 0)
+        return ratio(self.mesh.face_areas / self.mesh.area, own, otherwise=1.0)
 
     @cached_property
     def angle_distortions(self) -> Float64[np.ndarray, " f"]:
@@ -301,8 +302,7 @@ def register_mesh(
         )
     root = np.sqrt(mesh_y.area)
     # Positions are relative to the middle of Y, because large coordinates would lose digits.
-    middle = mesh_y.vertices[mesh_y.referenced_vertices].mean(axis=0)
-    target = replace(mesh_y, vertices=mesh_y.vertices - middle)
+    target = replace(mesh_y, vertices=mesh_y.vertices - mesh_y.middle)
     mapped = points.positions(target)
     around = Neighborhoods(mesh_x, root / np.sqrt(mesh_x.area) if scale is None else scale)
     areas = around.size**2 * mesh_x.vertex_areas
@@ -350,7 +350,7 @@ def register_mesh(
                 near = around.averaging @ near
             weights = np.where(near > 0, of_round.factor * weights, weights)
     similarities = Similarities(similarities.rotations, around.size * similarities.scales)
-    positions, similarities, *_ = follow_surroundings(mesh_x, mesh_y, positions + middle, similarities)
+    positions, similarities, *_ = follow_surroundings(mesh_x, mesh_y, positions + mesh_y.middle, similarities)
     bridged = float(mesh_x.average(bridging))
     if bridged > _MUCH_BRIDGED:
         warnings.warn(
@@ -364,8 +364,7 @@ def register_mesh(
 def _bridging(mesh_x: Mesh, mesh_y: Mesh, points: SurfacePoints, width: float) -> Bool[np.ndarray, " m"]:
     """Return a mask of the vertices of X that are matched to lips of slits which X does not have."""
     at_lips = at_slits(mesh_y, width)[mesh_y.faces[points.faces]].any(axis=1)
-    own = np.zeros(len(at_lips), bool)
-    own[mesh_x.boundary_edges] = True
+    own = mesh_x.boundary_vertices.copy()
     own[mesh_x.faces[own[mesh_x.faces].any(axis=1)]] = True
     return at_lips & ~own
 
@@ -415,7 +414,7 @@ def points_of_map(
 
     **Raises:** `InputError` if the map does not fit the meshes.
     """
-    vertices = check_indices(pointwise_map, len(mesh_y.vertices), f"map to {mesh_y.name}: vertex")
+    vertices = check_pointwise_map(pointwise_map, mesh_x, mesh_y)
     # An unreferenced vertex of Y is replaced by the nearest point of the surface.
     points, _ = nearest_surface_points(mesh_y.vertices[vertices], mesh_y)
     smooth = register_mesh(mesh_x, mesh_y, points, stiffness=_STIFFNESS_OF_MAPS, scale=scale)
@@ -474,7 +473,7 @@ def _halfway(
     offsets = mapped - positions
     along = (offsets * normals).sum(axis=1, keepdims=True)
     # A triangle without area has no normal, so the offsets of its points are not projected.
-    offsets -= normals * np.divide(along, squares, out=np.zeros_like(along), where=squares > 0)
+    offsets -= normals * ratio(along, squares)
     return positions + 0.5 * offsets
 
 

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 from scipy.spatial import KDTree
 
 from jaxsmw.geometry.alignment import nearest_rotations
-from jaxsmw.geometry.mesh import Mesh, connected_components, extend_from
+from jaxsmw.geometry.mesh import Mesh, components_of_faces, extend_from
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 
 # A component of Y can be the counterpart of a moved component of X if they differ by at most the diameter of
@@ -28,7 +28,7 @@ class _Components:
     def __init__(self, mesh: Mesh) -> None:
         faces, n = mesh.small_faces, len(mesh.vertices)
         self.rows = np.unique(faces)
-        labels = connected_components(np.concatenate([faces[:, :2], faces[:, 1:]]), n)[1][self.rows]
+        labels = components_of_faces(faces, n)[1][self.rows]
         numbers, self.of_row = np.unique(labels, return_inverse=True)
         of_corners = np.repeat(Mesh(mesh.vertices, faces).face_areas / 3, 3)
         areas = np.bincount(faces.ravel(), of_corners, n)[self.rows].astype(np.float64)
@@ -95,9 +95,8 @@ def follow_surroundings(
     of_rows = Similarities(rotations[of_row], scales[of_row])
     positions[rows] = centers[of_row] + of_rows.of_vectors(mesh_x.vertices[rows] - parts.centers[of_row])
     similarities.rotations[rows], similarities.scales[rows] = of_rows
-    body = np.flatnonzero(mesh_y.referenced_vertices)
     alone = ~paired[of_row]
-    matches[rows[alone]] = _nearest(mesh_y, body, positions[rows[alone]])
+    matches[rows[alone]] = _nearest(mesh_y, mesh_y.used_vertices, positions[rows[alone]])
     for number in np.flatnonzero(paired):
         own, candidates = rows[of_row == number], others.rows[others.of_row == counterparts[number]]
         matches[own] = _nearest(mesh_y, candidates, positions[own])
@@ -125,8 +124,7 @@ def match_small_components(
     if not len(mesh_x.small_faces):
         return pointwise_map, 0.0
     # Positions are relative to the middle of Y, because large coordinates would lose digits.
-    middle = mesh_y.vertices[mesh_y.referenced_vertices].mean(axis=0)
-    target = replace(mesh_y, vertices=mesh_y.vertices - middle)
+    target = replace(mesh_y, vertices=mesh_y.vertices - mesh_y.middle)
     mapped = target.vertices[pointwise_map]
     similarities = Neighborhoods(mesh_x, scale).similarities(mapped)
     similarities = Similarities(similarities.rotations, scale * similarities.scales)

@@ -31,7 +31,7 @@ from jaxsmw.benchmark.opponents.base import MOST_SAMPLES, Method, MethodInput, P
 from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
-from jaxsmw.core.refinement import refine
+from jaxsmw.core.refinement import RefineSettings, refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import Filtering, NearestOrthogonal
@@ -120,8 +120,8 @@ class Refined(Method):
             number_of_samples=self.number_of_samples,
         )
         seen, start = pair.spectra.seen_by(stage), pair.initial_map
-        options = {"samples": seen.samples, "partial": seen.partial, **stage.settings}
-        refinement = compiled(refine)(*seen.both, start, **options)
+        settings: RefineSettings = {**stage.settings, "partial": seen.partial}
+        refinement = compiled(refine)(*seen.both, start, samples=seen.samples, **settings)
         return successful(refinement.pointwise_map, refinement.result)
 
 

@@ -14,10 +14,7 @@ from jaxsmw.core.checks import as_parameter, check_between, check_integer
 
 
 class _UniformTranslates(FilterBank):
-    """A bank of evenly spaced translates of one window.
-
-    Each point of [0, lambda_max] is covered by `overlap` windows.
-    """
+    """Evenly spaced translates of one window, of which `overlap` cover each point of [0, lambda_max]."""
 
     filters: int = eqx.field(static=True, default=6)
     overlap: int = eqx.field(static=True, default=2)
@@ -44,18 +41,14 @@ class Itersine(_UniformTranslates):
 
     Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
     width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
-
-    The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on
-    graphs", 2014. The squared windows sum to a constant because `overlap` is even.
+    The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs",
+    2014. The squared windows sum to a constant because `overlap` is even.
 
     **Arguments:**
 
-    - `filters`: the number of filters, at least `overlap`. The default is 6.
-    - `overlap`: the number of windows that overlap at each eigenvalue, an even number of at least 2. The
-      default is 2.
-
-    **Raises:** `TypeError` if `filters` or `overlap` is not an integer; `ValueError` if `filters` is below
-    `overlap`, or if `overlap` is odd or below 2.
+    - `filters`: the number of filters, at least `overlap`, by default 6.
+    - `overlap`: the number of windows that overlap at each eigenvalue, an even number of at least 2, by
+      default 2.
     """
 
     def __check_init__(self) -> None:
@@ -67,22 +60,16 @@ class Itersine(_UniformTranslates):
 
 
 class HalfCosine(_UniformTranslates):
-    """A Parseval frame of evenly spaced translates of the Hann window `cos²(pi u)`.
-
-    Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
-    width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
+    """A Parseval frame of evenly spaced translates of the Hann window `cos²(pi u)`, with u as in `Itersine`.
 
     The filters are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
-    tight graph wavelet and vertex-frequency frames", 2015. The squared filters of that paper sum to
-    `3 overlap / 8`. Here the filters are scaled so that their squares sum to one.
+    tight graph wavelet and vertex-frequency frames", 2015. The squared filters of that paper sum to `3
+    overlap / 8`. Here the filters are scaled so that their squares sum to one.
 
     **Arguments:**
 
-    - `filters`: the number of filters, at least `overlap`. The default is 6.
-    - `overlap`: the number of windows that overlap at each eigenvalue, at least 3. The default is 3.
-
-    **Raises:** `TypeError` if `filters` or `overlap` is not an integer; `ValueError` if `filters` is below
-    `overlap`, or if `overlap` is below 3.
+    - `filters`: the number of filters, at least `overlap`, by default 6.
+    - `overlap`: the number of windows that overlap at each eigenvalue, at least 3, by default 3.
     """
 
     overlap: int = eqx.field(static=True, default=3)
@@ -104,12 +91,9 @@ class Gabor(FilterBank):
 
     **Arguments:**
 
-    - `filters`: the number of filters, at least 2. The default is 6.
-    - `width`: the standard deviation of the Gaussians, in units of the spacing between their centres. The
-      value is a single positive number, or an array of shape (). The default is 0.5.
-
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
-    `width` is not a single positive, finite number.
+    - `filters`: the number of filters, at least 2, by default 6.
+    - `width`: the standard deviation of the Gaussians, in units of the spacing between their centres,
+      positive, by default 0.5.
     """
 
     filters: int = eqx.field(static=True, default=6)

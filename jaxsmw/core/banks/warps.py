@@ -15,25 +15,15 @@ from jaxsmw.core.checks import as_parameter, check_between
 class Warp(eqx.Module):
     """The base class of warps: monotone maps of the eigenvalue axis, for use in `Warped(bank, warp)`.
 
-    A `Warped` bank evaluates another filter bank on the warped eigenvalue axis. Ready subclasses of `Warp`
-    are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
+    Ready subclasses are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
     `__call__(points, eigenvalues)`. The warped points must be non-negative and increase with the points, but
-    these conditions are not checked.
-
-    A constant factor in a warp has no effect on the banks of `jaxsmw.banks`, because these banks depend only
-    on ratios of eigenvalues.
+    these conditions are not checked. A constant factor in a warp has no effect on the banks of
+    `jaxsmw.banks`, because these banks depend only on ratios of eigenvalues.
     """
 
     @abc.abstractmethod
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
-        """Return the warped points (p,), in any unit.
-
-        **Arguments:**
-
-        - `points`: (p,), points in [0, lambda_max], in any order.
-        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit as the points. The
-          last eigenvalue is lambda_max.
-        """
+        """Return the warped points (p,), in any unit; `FilterBank` describes the arguments."""
 
 
 class Warped(FilterBank):
@@ -46,9 +36,8 @@ class Warped(FilterBank):
     **Arguments:**
 
     - `bank`: any `FilterBank` with filters g_l.
-    - `warp`: a `Warp`, such as `Logarithm()`, `Power()` or `SpectralDistribution()`. `Logarithm` widens the
-      bands of `Itersine` and `HalfCosine` at higher eigenvalues, as in a bank of wavelets.
-      `SpectralDistribution` gives these bands equal numbers of eigenvalues.
+    - `warp`: a `Warp`. `Logarithm` widens the bands of `Itersine` and `HalfCosine` at higher eigenvalues, as
+      in a bank of wavelets. `SpectralDistribution` gives these bands equal numbers of eigenvalues.
     """
 
     bank: FilterBank
@@ -64,13 +53,7 @@ class Logarithm(Warp):
     """The warp `log(1 + strength lambda / lambda_max)` of the eigenvalues lambda, for `Warped`.
 
     The warp is nearly linear for eigenvalues below `lambda_max / strength` and nearly logarithmic for larger
-    eigenvalues.
-
-    **Arguments:**
-
-    - `strength`: a single positive number, or an array of shape (). The default is 10.
-
-    **Raises:** `ValueError` if the strength is not a single positive, finite number.
+    eigenvalues. The `strength` is a positive number, by default 10; others raise `ValueError`.
     """
 
     strength: Float[Array, ""] = eqx.field(converter=as_parameter, default=10.0)
@@ -83,14 +66,10 @@ class Logarithm(Warp):
 
 
 class Power(Warp):
-    """The warp `(lambda / lambda_max)^exponent` of the eigenvalue axis, for use in `Warped(bank, Power())`.
+    """The warp `(lambda / lambda_max)^exponent` of the eigenvalues lambda, for `Warped`.
 
-    **Arguments:**
-
-    - `exponent`: a single positive number, or an array of shape (). The default is 0.5: the square root turns
-      eigenvalues into frequencies.
-
-    **Raises:** `ValueError` if the exponent is not a single positive, finite number.
+    The `exponent` is a positive number; others raise `ValueError`. With the default of 0.5, the square root
+    turns eigenvalues into frequencies.
     """
 
     exponent: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.5)
@@ -109,14 +88,13 @@ class SpectralDistribution(Warp):
     """The warp that maps each eigenvalue to its index in the spectrum, for `Warped`.
 
     Between eigenvalues, the warp is linear. With this warp, the windows of `Itersine` and `HalfCosine` pass
-    equal numbers of eigenvalues. Only the windows at both ends of the spectrum pass fewer eigenvalues. The
-    warp is that of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and
-    vertex-frequency frames", 2015. It has no parameters.
+    equal numbers of eigenvalues, except at both ends of the spectrum. The warp is that of Shuman, Wiesmeyr,
+    Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and vertex-frequency frames", 2015. The
+    eigenvalues of a surface grow nearly linearly with their index (Weyl's law), so this warp has little
+    effect on surfaces.
 
-    An eigenvalue that occurs once is mapped to its index, counted from 0. A repeated eigenvalue is mapped to
-    the mean of its indices, so a bank treats all functions of an eigenspace equally. If no eigenvalue is
-    repeated, the responses at the eigenvalues depend only on the eigenvalues' indices. The eigenvalues of a
-    surface grow nearly linearly with their index (Weyl's law), so this warp has little effect on surfaces.
+    A repeated eigenvalue is mapped to the mean of its indices, so a bank treats all functions of an
+    eigenspace equally.
     """
 
     def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:

@@ -19,7 +19,7 @@ from jaxsmw.core.functional_map import Norm, QuadraticEnergy, WaveletProblem
 from jaxsmw.core.linear_algebra import cholesky, product, rounding, solve_lower
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap
-from jaxsmw.core.solutions.base import Solution
+from jaxsmw.core.solutions.closed_form import Solution
 from jaxsmw.core.solutions.descriptors import DescriptorPair, ProjectedDescriptors
 
 Weight = Float[Array, ""] | None
@@ -43,10 +43,9 @@ class RegularizedLeastSquares(Solution[None]):
     The functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
     - Wavelet preservation is the energy of equation (5) of the MWP paper.
-    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrix Lambda_out contains
-      the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains the eigenvalues of
-      the shape that C maps from. Both matrices are divided by the same number, the largest eigenvalue in the
-      two matrices.
+    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrices Lambda_out and
+      Lambda_in contain the eigenvalues of the shapes "out" and "in", divided by the largest eigenvalue of
+      both.
     - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This is the
       only term that is not quadratic in C.
     - Descriptor preservation is `||C F_in - F_out||²`, where F_in and F_out contain the coefficients of the
@@ -59,36 +58,30 @@ class RegularizedLeastSquares(Solution[None]):
     frame. `F_out` and `F_in` are scaled by a common factor so that the squared norm of `F_out` is k_out. All
     operators are scaled by a common factor so that the squared norms of the operators `D_out` sum to k_out.
 
-    The terms for wavelet preservation and descriptor preservation are sums over thousands of columns. First,
-    these columns are replaced by k_in equivalent columns. Then `optimistix.least_squares` takes Gauss–Newton
-    steps. The linear system of each step is solved by conjugate gradients, without a matrix of size k² x k².
-    The solver starts from the functional map of the previous iteration; in the first iteration, it starts
-    from an estimate. C is differentiable: its derivatives are computed by implicit differentiation at the
-    minimum.
-
-    The status code is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
-    `RESULTS.singular_system`, `RESULTS.nonfinite_functional_map` and `RESULTS.solver_not_converged`.
+    The sums over thousands of columns in the quadratic terms are replaced by sums over k_in equivalent
+    columns. Then `optimistix.least_squares` takes Gauss–Newton steps. The linear system of each step is
+    solved by conjugate gradients, without a matrix of size k² x k². The solver starts from the functional map
+    of the previous iteration; in the first iteration, it starts from an estimate. The derivatives of C are
+    computed by implicit differentiation at the minimum.
 
     **Arguments:**
 
     - `wavelet_preservation`, `laplacian_commutativity`, `orthogonality`, `descriptor_preservation`,
-      `descriptor_commutativity`: the weights of the five terms. Each weight is a single positive number or an
-      array of shape (), or None to omit the term. The defaults are 1, 1, 0.1, None and None, in this order.
+      `descriptor_commutativity`: the weights of the five terms. Each weight is a positive number, or None to
+      omit the term. The defaults are 1, 1, 0.1, None and None, in this order.
     - `descriptors`: a `DescriptorPair`, which the two descriptor terms need; None (the default) if neither
-      term has a weight. Descriptor commutativity needs the result of
-      `DescriptorPair.project(..., operators=True)`.
-    - `norm`: the weights of the vertices of X in the wavelet term. `"area"` (the default) weights each vertex
-      by its area. `"frobenius"` gives all vertices the same weight.
-    - `tolerance`: a positive number, by default 1e-3. This number is both the relative and the absolute
-      tolerance of `optimistix.GaussNewton`.
+      term has a weight. Descriptor commutativity needs the result of `DescriptorPair.project(...,
+      operators=True)`.
+    - `norm`: the weights of the vertices of X in the wavelet term, `"area"` (the default) or `"frobenius"`;
+      see `WaveletProblem.energy`.
+    - `tolerance`: the relative and absolute tolerance of `optimistix.GaussNewton`, positive, by default 1e-3.
     - `max_steps`: the maximum number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
-      reach the tolerance, `solve` returns the status code `RESULTS.solver_not_converged`.
+      reach the tolerance, the status code is `RESULTS.solver_not_converged`.
 
     **Raises:** `ValueError` if a weight is not a single positive number, the tolerance is not positive,
     `max_steps` is below 1, or `norm` is unknown. `ValueError` if neither `wavelet_preservation` nor
-    `descriptor_preservation` has a weight. `ValueError` if `descriptors` is given but neither descriptor term
-    has a weight, or if a descriptor term has a weight but `descriptors` is None. `ValueError` if
-    `descriptor_commutativity` has a weight, but the descriptors on X or Y have no operators.
+    `descriptor_preservation` has a weight, or if the descriptors or their operators do not fit the weights of
+    the descriptor terms.
     """
 
     wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
@@ -141,8 +134,6 @@ class RegularizedLeastSquares(Solution[None]):
     ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
         """Return the minimiser C (k_out, k_in) of the weighted terms, and a status code (`RESULTS`).
 
-        The solver starts from `previous`, or from an estimate if `previous` is None.
-
         **Raises:** `ValueError` if the descriptors and the functional map have different numbers of
         eigenvectors.
         """
@@ -170,13 +161,12 @@ class RegularizedLeastSquares(Solution[None]):
 
         **Arguments:**
 
-        - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`. The
-          energy must be None if this weight is None. Otherwise the energy is required.
+        - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`; None if
+          this weight is None.
         - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to (k_out,), and of
           the shape that C maps from (k_in,), in the same unit. `descriptors.x` must belong to the shape that
           C maps to, as in the pullback convention.
-        - `initial`: the functional map (k_out, k_in) from which the solver starts. By default, the solver
-          starts from an estimate.
+        - `initial`: the functional map (k_out, k_in) from which the solver starts, by default an estimate.
 
         **Returns:** The minimiser C (k_out, k_in), without unit, and a status code, which is a member of
         `RESULTS`.
@@ -225,7 +215,6 @@ class RegularizedLeastSquares(Solution[None]):
         shape: tuple[int, int],
         dtype: DTypeLike,
     ) -> QuadraticEnergy:
-        """Return the weighted sum of the given energy and the descriptor-preservation term."""
         if (energy is None) != (self.wavelet_preservation is None):
             raise ValueError(
                 "an energy needs the weight wavelet_preservation, and the weight needs an energy: "
@@ -254,7 +243,7 @@ class RegularizedLeastSquares(Solution[None]):
         eigenvalues_in: Float[Array, " k_in"],
         descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
     ) -> list[_Term]:
-        """Return all terms of the objective that have a weight. The first term is the quadratic energy."""
+        """Return the terms of the objective that have a weight, the quadratic energy first."""
         dtype = eigenvalues_in.dtype
         terms = [_energy_term(quadratic)]
         if self.laplacian_commutativity is not None:
@@ -323,7 +312,6 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
 def _laplacian_term(
     weight: Float[Array, ""], eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"]
 ) -> _Term:
-    """Return the weighted term of Laplacian commutativity."""
     largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
     gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
     gaps = gaps * jnp.sqrt(weight)
@@ -331,7 +319,6 @@ def _laplacian_term(
 
 
 def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Term:
-    """Return the weighted term of orthogonality."""
     root, identity = jnp.sqrt(weight), jnp.eye(min(k_out, k_in), dtype=weight.dtype)
     return _Term(lambda c: root * ((product(c.T, c) if k_in <= k_out else product(c, c.T)) - identity), None)
 
@@ -339,7 +326,6 @@ def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Ter
 def _operator_term(
     weight: Float[Array, ""], d_out: Float[Array, "d k_out k_out"], d_in: Float[Array, "d k_in k_in"]
 ) -> _Term:
-    """Return the weighted term of descriptor commutativity."""
     scale = jnp.sqrt(weight * d_out.shape[1] / jnp.sum(d_out**2))
     diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
     squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]

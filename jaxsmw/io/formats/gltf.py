@@ -6,7 +6,6 @@ The specification is https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html.
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import re
 from dataclasses import dataclass, field
@@ -17,36 +16,36 @@ from urllib.parse import unquote
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import first_equal_rows
-from jaxsmw.io.formats.polygons import DAMAGED, Polygons, unique_name, unique_names
-from jaxsmw.io.formats.text import excerpt
+from jaxsmw.geometry.arrays import first_equal_rows
+from jaxsmw.io.formats.polygons import Polygons, unique_name, unique_names
+from jaxsmw.io.formats.text import DAMAGED, excerpt
 from jaxsmw.io.mesh_data import COLORS, Skin
 from jaxsmw.runtime.files import read_bytes
 from jaxsmw.wording import count_of
 
 TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+RECORD = "jaxsmw"
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # Files may require these extensions, which do not change how positions, faces and attributes are read.
 _HARMLESS = re.compile(r"KHR_mesh_quantization|(KHR|EXT)_(materials|texture|lights|animation|xmp).*")
+_NOT_DATA = re.compile(r"POSITION|NORMAL|TANGENT|TEXCOORD_0|(JOINTS|WEIGHTS)_\d+")
 # The largest accepted numbers of vertices, triangle corners, displacements and weights. There is one
 # displacement per vertex and blend shape, and one weight per vertex and joint.
-LARGEST_VERTICES, LARGEST_CORNERS, LARGEST_SHAPES, LARGEST_WEIGHTS = 10**7, 6 * 10**7, 2**24, 2**25
-RECORD = "jaxsmw"
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6
-_IGNORED = re.compile(r"POSITION|NORMAL|TANGENT|TEXCOORD_0|(JOINTS|WEIGHTS)_\d+")
+_MOST_VERTICES, _MOST_CORNERS, _MOST_DISPLACEMENTS, _MOST_WEIGHTS = 10**7, 6 * 10**7, 2**24, 2**25
 
 
 def parse_gltf(data: bytes, folder: Path) -> Polygons:
     """Parse a `.gltf` file, which is JSON. The buffers are data URIs, or files in `folder` or below."""
-    return _Scene(Document(data, folder)).polygons()
+    return _Scene(_Document(data, folder)).polygons()
 
 
 def parse_glb(data: bytes) -> Polygons:
     """Parse a `.glb` file, which is binary and contains the buffer."""
     if data[:4] != b"glTF":
         raise InputError("does not begin with glTF: export the mesh again as a .glb file.")
-    return _Scene(Document(data, None)).polygons()
+    return _Scene(_Document(data, None)).polygons()
 
 
 @dataclass
@@ -67,74 +66,67 @@ class _Part:
 class _Scene:
     """All parts of the scene of a document, in the order of its nodes."""
 
-    def __init__(self, document: Document) -> None:
+    def __init__(self, document: _Document) -> None:
         self.document = document
         self.parts: list[_Part] = []
         self.vertices = self.corners = self.ignored = 0
         self.notes: list[str] = []
         self.record: dict[str, Any] = {}
-        nodes = self._nodes()
-        for node, matrix in nodes:
+        for node, matrix in self._nodes():
             if "mesh" in node:
                 self._add_mesh(node, matrix)
-        if "nodes" not in document.json:
-            for number in range(len(document.list_of(document.json, "meshes"))):
-                self._add_mesh({"mesh": number}, np.eye(4))
 
     def _nodes(self) -> list[tuple[dict[str, Any], np.ndarray]]:
         """Return the nodes of the scene with their global transforms, parents before children."""
         document = self.document
         nodes = document.list_of(document.json, "nodes")
         if "scenes" in document.json:
-            scene = document.item("scenes", document.json.get("scene", 0))
-            roots = document.list_of(scene, "nodes")
+            roots = document.list_of(document.item("scenes", document.json.get("scene", 0)), "nodes")
         else:
             children = [document.list_of(document.item("nodes", i), "children") for i in range(len(nodes))]
             below = {str(child) for some in children for child in some}
             roots = [i for i in range(len(nodes)) if str(i) not in below]
-        found: list[tuple[dict[str, Any], np.ndarray]] = []
-        visited: set[int] = set()
+        in_scene: dict[int, tuple[dict[str, Any], np.ndarray]] = {}
         pending = [(root, np.eye(4)) for root in reversed(roots)]
         while pending:
             number, above = pending.pop()
             node = document.item("nodes", number)
-            if number in visited:
+            if number in in_scene:
                 raise InputError(f"node {number} has several parents, {DAMAGED}")
-            visited.add(number)
-            with np.errstate(over="ignore", invalid="ignore"):
-                matrix = above @ self._matrix(node)
-            found.append((node, matrix))
+            matrix = above @ self._matrix(node)
+            in_scene[number] = node, matrix
             pending += [(child, matrix) for child in reversed(document.list_of(node, "children"))]
-        return found
+        if "nodes" not in document.json:
+            return [({"mesh": i}, np.eye(4)) for i in range(len(document.list_of(document.json, "meshes")))]
+        return list(in_scene.values())
 
     def _matrix(self, node: dict[str, Any]) -> np.ndarray:
         """Return the transform of a node relative to its parent (4, 4)."""
         numbers = self.document.numbers
-        given = numbers(node, "matrix", 16)
-        if given is not None:
-            return given.reshape(4, 4).T
+        if (columns := numbers(node, "matrix", 16)) is not None:
+            return columns.reshape(4, 4).T
         matrix = np.eye(4)
-        rotation = numbers(node, "rotation", 4)
-        if rotation is not None:
+        if (rotation := numbers(node, "rotation", 4)) is not None:
             x, y, z, w = rotation
             matrix[:3, :3] = [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
                 [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
                 [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
             ]
-        scale, translation = numbers(node, "scale", 3), numbers(node, "translation", 3)
-        matrix[:3, :3] *= 1 if scale is None else scale
-        matrix[:3, 3] = 0 if translation is None else translation
+        if (scale := numbers(node, "scale", 3)) is not None:
+            matrix[:3, :3] *= scale
+        if (translation := numbers(node, "translation", 3)) is not None:
+            matrix[:3, 3] = translation
         return matrix
 
     def _add_mesh(self, node: dict[str, Any], matrix: np.ndarray) -> None:
         """Add the primitives of a node's mesh. Primitives with the same attributes share their vertices."""
         document = self.document
         mesh = document.item("meshes", node["mesh"])
-        extras, names = mesh.get("extras"), []
-        if isinstance(extras, dict):  # extras may have any type
-            listed = extras.get("targetNames")
-            names = [str(name) for name in listed] if isinstance(listed, list) else []
+        shape_names: list[str] = []
+        if isinstance(extras := mesh.get("extras"), dict):  # extras may have any type
+            if isinstance(listed := extras.get("targetNames"), list):
+                shape_names = [str(name) for name in listed]
             record = extras.get(RECORD)
             self.record = record if isinstance(record, dict) else {}
         nodes_of_joints = None
@@ -154,84 +146,81 @@ class _Scene:
                 )
             key = repr((primitive.get("attributes"), primitive.get("targets")))
             if key not in parts:
-                parts[key] = self._part(primitive, matrix, names, nodes_of_joints)
+                parts[key] = self._part(primitive, matrix, shape_names, nodes_of_joints)
                 self.parts.append(parts[key])
-            part = parts[key]
-            with np.errstate(over="ignore", invalid="ignore"):
-                is_mirrored = bool(np.linalg.det(matrix[:3, :3]) < 0)
-            part.faces.append(self._faces(primitive, part, is_mirrored))
-            part.names.append(str(node.get("name", mesh.get("name", f"mesh {node['mesh']}"))))
+            faces = self._faces(primitive, parts[key])
+            is_mirrored = np.linalg.det(matrix[:3, :3]) < 0
+            parts[key].faces.append(faces[:, [0, 2, 1]] if is_mirrored else faces)
+            parts[key].names.append(str(node.get("name", mesh.get("name", f"mesh {node['mesh']}"))))
 
     def _part(
-        self, primitive: dict[str, Any], matrix: np.ndarray, names: list[str], nodes: list[Any] | None
+        self, primitive: dict[str, Any], matrix: np.ndarray, shape_names: list[str], nodes: list[Any] | None
     ) -> _Part:
         """Return the vertices of a primitive, with their data."""
         document = self.document
         attributes = document.dict_of(primitive, "attributes")
-        vertices = as_floats(*document.accessor(attributes.get("POSITION"), (3,)))
+        vertices = document.floats(attributes.get("POSITION"), 3)
         n = len(vertices)
         self.vertices += n
-        if self.vertices > LARGEST_VERTICES:
-            raise InputError(f"describes more than {LARGEST_VERTICES} vertices: decimate the mesh.")
-        data: dict[str, np.ndarray] = {}
-        for name, index in attributes.items():
-            if _IGNORED.fullmatch(name):
-                continue
-            if str(document.item("accessors", index).get("type")) in COLUMNS:
-                columns = (3, 4) if name.startswith("COLOR_") else (1, 2, 3, 4)
-                values, is_fraction = document.accessor(index, columns, n)
-                if is_fraction and not (name == "COLOR_0" and values.dtype == np.uint8):
-                    values = as_floats(values, is_fraction).astype(np.float32)
-                chosen = COLORS if name == "COLOR_0" else name.removeprefix("_") or name
-                data[unique_name(chosen, data)] = values[:, 0] if values.shape[1] == 1 else values
-            else:
-                self.notes.append(f"The vertex data {name[:40]!a} were ignored, because they are matrices.")
+        if self.vertices > _MOST_VERTICES:
+            raise InputError(f"describes more than {_MOST_VERTICES} vertices: decimate the mesh.")
+        data = self._vertex_data(attributes, n)
         coordinates = None
         if "TEXCOORD_0" in attributes:
-            coordinates = as_floats(*document.accessor(attributes["TEXCOORD_0"], (2,), n))
+            coordinates = document.floats(attributes["TEXCOORD_0"], 2, n)
             coordinates[:, 1] = 1 - coordinates[:, 1]  # glTF counts v from the top of the picture
         shapes: dict[str, np.ndarray] = {}
         targets = document.list_of(primitive, "targets")
-        names = names[: len(targets)] + [f"target {number}" for number in range(len(names), len(targets))]
-        for name, target in zip(unique_names(names), targets, strict=True):
+        unnamed = [f"target {number}" for number in range(len(shape_names), len(targets))]
+        for name, target in zip(unique_names(shape_names[: len(targets)] + unnamed), targets, strict=True):
             if not isinstance(target, dict):
                 document.refuse("targets")
-            if self.vertices * (len(shapes) + 1) > LARGEST_SHAPES:
-                raise InputError("has too many blend shapes for its vertices: export fewer blend shapes.")
-            moves = np.zeros((n, 3))
-            if "POSITION" in target:
-                moves = as_floats(*document.accessor(target["POSITION"], (3,), n))
+            _check_shapes(self.vertices * (len(shapes) + 1))
+            moves = document.floats(target["POSITION"], 3, n) if "POSITION" in target else np.zeros((n, 3))
             shapes[name] = _times(moves, matrix)
         joints, weights = self._skin(attributes, nodes, n)
-        with np.errstate(over="ignore", invalid="ignore"):
-            vertices = _times(vertices, matrix) + matrix[:3, 3]
+        vertices = _times(vertices, matrix) + matrix[:3, 3]
         return _Part(vertices, self.vertices - n, data, coordinates, shapes, joints, weights)
+
+    def _vertex_data(self, attributes: dict[str, Any], n: int) -> dict[str, np.ndarray]:
+        document = self.document
+        data: dict[str, np.ndarray] = {}
+        for name, index in attributes.items():
+            if _NOT_DATA.fullmatch(name):
+                continue
+            if str(document.item("accessors", index).get("type")) not in COLUMNS:
+                self.notes.append(f"The vertex data {name[:40]!a} were ignored, because they are matrices.")
+                continue
+            columns = (3, 4) if name.startswith("COLOR_") else (1, 2, 3, 4)
+            values, is_fraction = document.accessor(index, columns, n)
+            if is_fraction and not (name == "COLOR_0" and values.dtype == np.uint8):
+                values = _as_floats(values, is_fraction).astype(np.float32)
+            own_name = COLORS if name == "COLOR_0" else name.removeprefix("_") or name
+            data[unique_name(own_name, data)] = values
+        return data
 
     def _skin(
         self, attributes: dict[str, Any], nodes: list[Any] | None, n: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the joints of each vertex (n, 4 s), as numbers of nodes, and their weights, from s sets."""
         document = self.document
-        sets: list[tuple[np.ndarray, np.ndarray]] = []
-        while nodes is not None and f"JOINTS_{len(sets)}" in attributes:
-            number = len(sets)
+        sets: list[tuple[np.ndarray, np.ndarray]] = [(np.empty((n, 0), np.int64), np.empty((n, 0)))]
+        while nodes is not None and f"JOINTS_{len(sets) - 1}" in attributes:
+            number = len(sets) - 1
             joints, _ = document.accessor(attributes[f"JOINTS_{number}"], (4,), n)
-            weights = as_floats(*document.accessor(attributes.get(f"WEIGHTS_{number}"), (4,), n))
-            is_valid = joints.dtype.kind == "u"
-            joints = joints.astype(np.int64)
-            if not is_valid or (joints[weights != 0] >= len(nodes)).any():
+            weights = document.floats(attributes.get(f"WEIGHTS_{number}"), 4, n)
+            if joints.dtype.kind != "u" or (joints[weights != 0] >= len(nodes)).any():
                 raise InputError(f"a vertex uses a joint that the skin does not have, {DAMAGED}")
             for node in nodes:
                 document.item("nodes", node)
             sets.append((np.array([*nodes, 0])[np.minimum(joints, len(nodes))], weights))
-        if not sets:
-            return np.empty((n, 0), np.int64), np.empty((n, 0))
         joints, weights = (np.hstack(parts) for parts in zip(*sets, strict=True))
         return joints, weights
 
-    def _faces(self, primitive: dict[str, Any], part: _Part, is_mirrored: bool) -> np.ndarray:
+    def _faces(self, primitive: dict[str, Any], part: _Part) -> np.ndarray:
         """Return the triangles of a primitive (f, 3), as vertex indices of the joined mesh."""
         n, mode = len(part.vertices), primitive.get("mode", _TRIANGLES)
+        indices = np.arange(n)
         if "indices" in primitive:
             values, _ = self.document.accessor(primitive["indices"], (1,))
             indices = values[:, 0].astype(np.int64)
@@ -239,24 +228,16 @@ class _Scene:
                 raise InputError(
                     f"a triangle uses a vertex that does not exist among {count_of(n, 'vertex')}, {DAMAGED}"
                 )
-        else:
-            indices = np.arange(n)
         self.corners += len(indices) if mode == _TRIANGLES else 3 * len(indices)
-        if self.corners > LARGEST_CORNERS:
-            raise InputError(
-                f"describes more than {LARGEST_CORNERS} corners of triangles: decimate the mesh."
-            )
+        if self.corners > _MOST_CORNERS:
+            raise InputError(f"describes more than {_MOST_CORNERS} corners of triangles: decimate the mesh.")
         if mode == _TRIANGLES:
             if len(indices) % 3:
                 raise InputError(f"has {len(indices)} corners, which do not form triangles, {DAMAGED}")
-            faces = indices.reshape(-1, 3)
-        else:
-            i = np.arange(max(len(indices) - 2, 0))
-            second, third = (i + 1 + i % 2, i + 2 - i % 2) if mode == _STRIP else (i + 1, i + 2)
-            faces = np.stack(
-                [indices[i if mode == _STRIP else 0 * i], indices[second], indices[third]], axis=1
-            )
-        return part.first + (faces[:, [0, 2, 1]] if is_mirrored else faces)
+            return part.first + indices.reshape(-1, 3)
+        i = np.arange(max(len(indices) - 2, 0))
+        odd, first = (i % 2, i) if mode == _STRIP else (0, 0 * i)
+        return part.first + indices[np.stack([first, i + 1 + odd, i + 2 - odd], axis=1)]
 
     def polygons(self) -> Polygons:
         """Join all parts."""
@@ -266,7 +247,7 @@ class _Scene:
         if not groups:
             raise InputError("contains no triangles: export the mesh again as triangles.")
         vertices = np.concatenate([part.vertices for part in self.parts])
-        faces = np.concatenate([faces for faces, _ in groups])
+        corners = np.concatenate([faces for faces, _ in groups]).ravel()
         notes = [f"{count_of(self.ignored, 'primitive')} of points or lines ignored."] if self.ignored else []
         notes += dict.fromkeys(self.notes)
         data = {}
@@ -285,103 +266,99 @@ class _Scene:
             label_names["group"] = tuple(number)
         polygons = Polygons(
             vertices,
-            faces.ravel(),
-            np.full(len(faces), 3),
+            corners,
+            np.full(len(corners) // 3, 3),
             tuple(notes),
             data,
             face_data,
-            self._texture(faces.ravel(), len(vertices)),
+            self._texture(corners),
             self._shapes(len(vertices)),
             self._joined_skin(len(vertices)),
             label_names,
         )
         if self.record and len(self.parts) == 1:
             polygons = _without_copies(polygons, self.record, self.document)
-        return polygons._replace(weld=_has_copies(polygons.vertices))
+        equal = first_equal_rows(polygons.vertices)
+        return polygons._replace(weld=bool((equal != np.arange(len(equal))).any()))
 
-    def _texture(self, corners: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray] | None:
-        known = [part for part in self.parts if part.coordinates is not None]
-        if not known:
+    def _texture(self, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        coordinates = [part.coordinates for part in self.parts if part.coordinates is not None]
+        if not coordinates:
             return None
-        number = np.full(n, -1)
-        first = 0
-        for part in known:
-            count = len(part.vertices)
-            number[part.first : part.first + count] = np.arange(first, first + count)
-            first += count
-        coordinates = np.concatenate([part.coordinates for part in known if part.coordinates is not None])
-        return coordinates, number[corners]
+        has_texture = np.repeat(
+            [part.coordinates is not None for part in self.parts], [len(part.vertices) for part in self.parts]
+        )
+        return np.concatenate(coordinates), np.where(has_texture, np.cumsum(has_texture) - 1, -1)[corners]
 
     def _shapes(self, n: int) -> dict[str, np.ndarray]:
         """Return all blend shapes. A blend shape that a part lacks does not displace the part's vertices."""
-        names = list(dict.fromkeys(name for part in self.parts for name in part.shapes))
-        if len(names) * n > LARGEST_SHAPES:
-            raise InputError("has too many blend shapes for its vertices: export fewer blend shapes.")
-        shapes = {name: np.zeros((n, 3)) for name in names}
-        for part in self.parts:
-            for name, moves in part.shapes.items():
-                shapes[name][part.first : part.first + len(moves)] = moves
-        return shapes
+        names = dict.fromkeys(name for part in self.parts for name in part.shapes)
+        _check_shapes(len(names) * n)
+        return {
+            name: np.concatenate(
+                [part.shapes.get(name, np.zeros(part.vertices.shape)) for part in self.parts]
+            )
+            for name in names
+        }
 
     def _joined_skin(self, n: int) -> Skin | None:
         used = [part.joints[part.weights != 0] for part in self.parts]
-        nodes = sorted(set(np.concatenate(used).tolist())) if used else []
+        nodes = sorted(set(np.concatenate(used).tolist()))
         if not nodes:
             return None
-        if len(nodes) * n > LARGEST_WEIGHTS:
+        if len(nodes) * n > _MOST_WEIGHTS:
             raise InputError("has too many joints for its vertices: export a skin with fewer joints.")
-        found = [(node, self.document.item("nodes", node).get("name")) for node in nodes]
-        names = unique_names(
-            [name if isinstance(name, str) and name else f"node {node}" for node, name in found]
+        names = [self.document.item("nodes", node).get("name") for node in nodes]
+        joints = unique_names(
+            name if isinstance(name, str) and name else f"node {node}"
+            for node, name in zip(nodes, names, strict=True)
         )
         weights = np.zeros((n, len(nodes)))
         for part in self.parts:
             column = np.minimum(np.searchsorted(nodes, part.joints), len(nodes) - 1)
             row = np.broadcast_to(part.first + np.arange(len(part.joints))[:, None], column.shape)
             np.add.at(weights, (row, column), part.weights)  # the weights at unused joints are 0
-        return Skin(tuple(names), weights)
+        return Skin(tuple(joints), weights)
+
+
+def _check_shapes(displacements: int) -> None:
+    if displacements > _MOST_DISPLACEMENTS:
+        raise InputError("has too many blend shapes for its vertices: export fewer blend shapes.")
 
 
 def _times(vectors: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return vectors if np.array_equal(matrix[:3, :3], np.eye(3)) else vectors @ matrix[:3, :3].T
+    """Apply the linear part of a transform to vectors (n, 3)."""
+    return vectors if np.array_equal(matrix[:3, :3], np.eye(3)) else vectors @ matrix[:3, :3].T
 
 
-def _has_copies(vertices: np.ndarray) -> bool:
-    return bool((first_equal_rows(vertices) != np.arange(len(vertices))).any())
-
-
-def _without_copies(polygons: Polygons, record: dict[str, Any], document: Document) -> Polygons:
+def _without_copies(polygons: Polygons, record: dict[str, Any], document: _Document) -> Polygons:
     """Join the vertices that `format_gltf` duplicated along texture seams, and listed in `record`."""
-    n = len(polygons.vertices)
     original, texture = (
-        document.view(record.get(key), 0, n, "i4", 1)[:, 0].astype(np.int64)
+        document.view(record.get(key), 0, len(polygons.vertices), "i4", 1)[:, 0].astype(np.int64)
         for key in ("vertices", "texture")
     )
-    known = texture >= 0
     vertices, first = np.unique(original, return_index=True)
-    textures, first_texture = np.unique(texture[known], return_index=True)
-    if (
-        not np.array_equal(vertices, np.arange(len(vertices)))
-        or not np.array_equal(textures, np.arange(len(textures)))
-        or (texture < -1).any()
+    # The number -1 marks vertices without a texture vertex.
+    textures, first_texture = np.unique(np.append(texture, -1), return_index=True)
+    textures, first_texture = textures[1:], first_texture[1:]
+    if (texture < -1).any() or any(
+        not np.array_equal(distinct, np.arange(len(distinct))) for distinct in (vertices, textures)
     ):
         raise InputError(f"the record of duplicate vertices is not valid, {DAMAGED}")
-    coordinates = (
-        None if polygons.texture is None else polygons.texture[0][np.flatnonzero(known)[first_texture]]
-    )
     skin = polygons.skin
     return polygons._replace(
         vertices=polygons.vertices[first],
         corners=original[polygons.corners],
         vertex_data={name: values[first] for name, values in polygons.vertex_data.items()},
-        texture=None if coordinates is None else (coordinates, texture[polygons.corners]),
+        texture=None
+        if polygons.texture is None
+        else (polygons.texture[0][first_texture], texture[polygons.corners]),
         blend_shapes={name: moves[first] for name, moves in polygons.blend_shapes.items()},
         skin=None if skin is None else Skin(skin.joints, skin.weights[first]),
     )
 
 
-class Document:
+class _Document:
     """The parts of a glTF file, with checks of all indices and sizes. Other files are in `folder`."""
 
     def __init__(self, data: bytes, folder: Path | None) -> None:
@@ -397,9 +374,7 @@ class Document:
             ) from None
         asset = self.json.get("asset") if isinstance(self.json, dict) else None
         asset = asset if isinstance(asset, dict) else {}
-        version, least = (
-            str(asset.get(key, default)) for key, default in (("version", ""), ("minVersion", "2.0"))
-        )
+        version, least = str(asset.get("version", "")), str(asset.get("minVersion", "2.0"))
         if not re.fullmatch(r"2\.\d{1,3}", version, re.ASCII) or least != "2.0":
             raise InputError("does not have the version 2.0 of glTF: export the mesh again as glTF 2.0.")
         for name in self.list_of(self.json, "extensionsRequired"):
@@ -434,17 +409,18 @@ class Document:
             self.binary = chunks[1][1]
         return chunks[0][1]
 
+    def refuse(self, key: str) -> NoReturn:
+        raise InputError(f"the value of {key!a} is not valid, {DAMAGED}")
+
     def list_of(self, parent: dict[str, Any], key: str) -> list[Any]:
         """Return the list under a key of an object, or an empty list if the key is missing."""
-        value = parent.get(key, [])
-        if not isinstance(value, list):
+        if not isinstance(value := parent.get(key, []), list):
             self.refuse(key)
         return value
 
     def dict_of(self, parent: dict[str, Any], key: str) -> dict[str, Any]:
         """Return the object under a key of another object, or an empty object if the key is missing."""
-        value = parent.get(key, {})
-        if not isinstance(value, dict):
+        if not isinstance(value := parent.get(key, {}), dict):
             self.refuse(key)
         return value
 
@@ -460,12 +436,9 @@ class Document:
         if key not in parent:
             return None
         values = self.list_of(parent, key)
-        if len(values) != count or not all(type(value) in (int, float) for value in values):
+        if len(values) != count or not all(type(v) in (int, float) and abs(v) < 1e300 for v in values):
             self.refuse(key)
-        array = np.array([float(value) if abs(value) < 1e300 else np.inf for value in values])
-        if not np.isfinite(array).all():
-            self.refuse(key)
-        return array
+        return np.array(values, dtype=np.float64)
 
     def item(self, key: str, index: Any) -> dict[str, Any]:
         """Return an element of a list at the top level, such as an accessor."""
@@ -476,9 +449,6 @@ class Document:
         if not isinstance(items[index], dict):
             self.refuse(key)
         return items[index]
-
-    def refuse(self, key: str) -> NoReturn:
-        raise InputError(f"the value of {key!a} is not valid, {DAMAGED}")
 
     def buffer(self, index: int) -> bytes:
         """Return the bytes of a buffer, which is in the file itself, in a data URI or in another file."""
@@ -503,30 +473,20 @@ class Document:
     def _external(self, uri: str) -> bytes:
         """Return the contents of a file in the folder of the glTF file or below."""
         name = unquote(uri)
-        parts = name.split("/")
-        if (
-            self.folder is None
-            or re.search(r"[:\\\0]", name)
-            or name.startswith("/")
-            or {"", ".", ".."} & {*parts}
-        ):
-            raise InputError(
-                f"uses the buffer {excerpt(uri)}, which is not a file in the folder of this file: put the "
-                "buffer into the same folder, or export a .glb file."
-            )
-        path = self.folder / name
-        if not path.resolve().is_relative_to(self.folder.resolve()):
-            raise InputError(
-                f"uses the buffer {excerpt(uri)}, which links to another folder: put the buffer into the "
-                "same folder, or export a .glb file."
-            )
-        try:
-            return read_bytes(path)
-        except InputError:
-            raise InputError(
-                f"uses the buffer {excerpt(uri)}, which cannot be read: put the buffer into the same folder, "
-                "or export a .glb file."
-            ) from None
+        is_relative = not re.search(r"[:\\\0]", name) and not {"", ".", ".."} & {*name.split("/")}
+        fault = "is not a file in the folder of this file"
+        if self.folder is not None and is_relative:
+            path = self.folder / name
+            fault = "links to another folder"
+            if path.resolve().is_relative_to(self.folder.resolve()):
+                try:
+                    return read_bytes(path)
+                except InputError:
+                    fault = "cannot be read"
+        raise InputError(
+            f"uses the buffer {excerpt(uri)}, which {fault}: put the buffer into the same folder, or export "
+            "a .glb file."
+        )
 
     def view(self, index: Any, offset: int, count: int, kind: str, columns: int) -> np.ndarray:
         """Return `count` rows of a buffer view as numbers (count, columns). The rows start at `offset`."""
@@ -537,29 +497,24 @@ class Document:
             )
         buffer = self.buffer(self.integer(description, "buffer"))
         start, length = self.integer(description, "byteOffset", 0), self.integer(description, "byteLength")
-        row = np.dtype(kind).itemsize * columns
-        stride = self.integer(description, "byteStride", row)
-        if stride < row or start + length > len(buffer):
+        size = np.dtype(kind).itemsize
+        stride = self.integer(description, "byteStride", size * columns)
+        if stride < size * columns or start + length > len(buffer):
             raise InputError(f"buffer view {index} does not fit its buffer, {DAMAGED}")
-        if count and offset + stride * (count - 1) + row > length:
-            raise InputError(f"an accessor needs more bytes than buffer view {index} has, {DAMAGED}")
         if not count:
             return np.empty((0, columns), kind)
-        return np.ndarray(
-            (count, columns), "<" + kind, buffer, start + offset, (stride, np.dtype(kind).itemsize)
-        ).astype(kind)
+        if offset + stride * (count - 1) + size * columns > length:
+            raise InputError(f"an accessor needs more bytes than buffer view {index} has, {DAMAGED}")
+        rows = np.ndarray((count, columns), f"<{kind}", buffer, start + offset, (stride, size))
+        return rows.astype(kind)
 
     def accessor(
         self, index: Any, columns: tuple[int, ...], rows: int | None = None
     ) -> tuple[np.ndarray, bool]:
         """Return the numbers of an accessor (rows, columns), and whether these numbers represent fractions.
 
-        A fraction is stored as an integer, which `as_floats` divides by the largest integer of its type.
-
-        **Arguments:**
-
-        - `columns`: the permitted numbers of columns.
-        - `rows`: the necessary number of rows, or None for any number.
+        `columns` lists the permitted numbers of columns. The argument `rows` is the necessary number of rows,
+        or None for any number.
         """
         description = self.item("accessors", index)
         kind = TYPES.get(self.integer(description, "componentType"))
@@ -594,8 +549,12 @@ class Document:
         offset = self.integer(what, "byteOffset", 0)
         values[indices] = self.view(what.get("bufferView"), offset, count, kind, values.shape[1])
 
+    def floats(self, index: Any, columns: int, rows: int | None = None) -> np.ndarray:
+        """Return the numbers of an accessor (rows, columns), or the fractions that they represent."""
+        return _as_floats(*self.accessor(index, (columns,), rows))
 
-def as_floats(values: np.ndarray, is_fraction: bool) -> np.ndarray:
+
+def _as_floats(values: np.ndarray, is_fraction: bool) -> np.ndarray:
     """Return numbers as float64. Fractions are integers, divided by the largest integer of their type."""
     if not is_fraction:
         return values.astype(np.float64)
@@ -613,5 +572,5 @@ def _decoded(uri: str) -> bytes:
         if not comma or not head.endswith(";base64"):
             raise ValueError
         return base64.b64decode(content, validate=True)
-    except (ValueError, binascii.Error):
+    except ValueError:
         raise InputError(f"contains a data URI that is not valid base64, {DAMAGED}") from None

@@ -11,13 +11,13 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.gltf import RECORD, TYPES
-from jaxsmw.io.formats.polygons import Formatted, is_color, omissions
+from jaxsmw.io.formats.gltf import COLUMNS, RECORD, TYPES
+from jaxsmw.io.formats.polygons import Formatted, is_color, omissions, width_of
 from jaxsmw.io.mesh_data import MeshData
 
 _VERTICES, _INDICES = 34962, 34963
 _COMPONENTS = {kind: number for number, kind in TYPES.items()}
-_SHAPES = ("SCALAR", "VEC2", "VEC3", "VEC4")
+_SHAPES = {columns: name for name, columns in COLUMNS.items()}
 _LARGEST_EXACT = 2**24  # float32 represents all integers up to this number
 
 
@@ -111,14 +111,11 @@ class _Writer:
         columns = -order.shape[1] % 4
         joints = np.pad(np.where(largest != 0, order, 0), ((0, 0), (0, columns)))
         largest = np.pad(largest, ((0, 0), (0, columns)))
+        joints, largest = joints[self.original].astype(np.uint16), largest[self.original].astype(np.float32)
         for number in range(joints.shape[1] // 4):
             part = slice(4 * number, 4 * number + 4)
-            attributes[f"JOINTS_{number}"] = self.accessor(
-                joints[self.original, part].astype(np.uint16), _VERTICES
-            )
-            attributes[f"WEIGHTS_{number}"] = self.accessor(
-                largest[self.original, part].astype(np.float32), _VERTICES
-            )
+            attributes[f"JOINTS_{number}"] = self.accessor(joints[:, part], _VERTICES)
+            attributes[f"WEIGHTS_{number}"] = self.accessor(largest[:, part], _VERTICES)
         nodes = list(range(2, 2 + len(names)))
         self.json["nodes"][0]["skin"] = 0
         self.json["nodes"] += [{"name": "joints", "children": nodes}, *({"name": name} for name in names)]
@@ -149,12 +146,11 @@ class _Writer:
         self, values: np.ndarray, target: int, *, limits: bool = False, is_fraction: bool = False
     ) -> int:
         """Add an accessor and its buffer view."""
-        columns = values.shape[1] if values.ndim == 2 else 1
         accessor: dict[str, Any] = {
             "bufferView": self.view(values, target),
             "componentType": _COMPONENTS[values.dtype.str[1:]],
             "count": len(values),
-            "type": _SHAPES[columns - 1],
+            "type": _SHAPES[width_of(values)],
         }
         if limits:
             accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
@@ -209,14 +205,13 @@ def _semantic(name: str, values: np.ndarray) -> str:
     """Return the name of the attribute. The names of other programs' data begin with an underscore."""
     if is_color(name, values):
         return "COLOR_0"
-    columns = values.shape[1] if values.ndim == 2 else 1
-    is_texture = re.fullmatch(r"TEXCOORD_[1-9]", name) and columns == 2
+    is_texture = re.fullmatch(r"TEXCOORD_[1-9]", name) and width_of(values) == 2
     return name if is_texture and values.dtype == np.float32 else f"_{name}"
 
 
 def _storable(name: str, values: np.ndarray) -> np.ndarray | None:
     """Return values in a type of glTF that represents them, or None. Floats become float32."""
-    if values.ndim == 2 and values.shape[1] > 4:
+    if width_of(values) > 4:
         return None
     if values.dtype.kind == "f":
         with np.errstate(over="ignore"):
@@ -224,8 +219,5 @@ def _storable(name: str, values: np.ndarray) -> np.ndarray | None:
         return stored if np.isfinite(stored).all() else None
     if values.dtype.itemsize <= 2:
         return values
-    return (
-        values.astype(np.float32)
-        if -_LARGEST_EXACT <= values.min() <= values.max() <= _LARGEST_EXACT
-        else None
-    )
+    is_exact = values.min() >= -_LARGEST_EXACT and values.max() <= _LARGEST_EXACT
+    return values.astype(np.float32) if is_exact else None

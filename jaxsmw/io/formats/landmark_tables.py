@@ -11,10 +11,14 @@ import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.text import is_number
-from jaxsmw.io.landmarks import SYSTEMS, Landmarks, check_count, landmarks_of, left_out
+from jaxsmw.io.landmarks import Landmarks, PointList, check_count
 from jaxsmw.wording import count_of
+
+SYSTEMS: dict[str, CoordinateSystem] = {"LPS": "LPS", "1": "LPS", "RAS": "RAS", "0": "RAS"}
+"""The names of coordinate systems in files of 3D Slicer, which used numbers before version 4.11."""
 
 _NAME_COLUMNS = ("name", "label", "landmark", "id", "point", "")
 _LONGEST_LINE = 2**16
@@ -23,15 +27,16 @@ _FCSV_COLUMNS += ["associatedNodeID"]
 
 
 class _Columns(NamedTuple):
-    """The columns of a table of landmarks.
+    """The number of columns of a table, the 0-based columns of x, y and z, and that of the names if any."""
 
-    `positions` contains the 0-based columns of x, y and z. `name` is the 0-based column of the names, or None
-    if the table has no names. `total` is the number of columns.
-    """
-
+    total: int
     positions: list[int]
     name: int | None
-    total: int
+
+    def add_to(self, points: PointList, line: int, cells: list[str]) -> None:
+        """Add the point in a row of the table."""
+        name = "" if self.name is None else cells[self.name]
+        points.add(name, [cells[column] for column in self.positions], line)
 
 
 def parse_table(text: str) -> Landmarks:
@@ -52,22 +57,15 @@ def parse_table(text: str) -> Landmarks:
         raise InputError("is empty: give a file with one landmark per line.")
     has_header = not any(_is_value(cell) for cell in cells[-3:])
     columns = _named_columns(number, cells) if has_header else _usual_columns(number, cells)
-    names: list[str] = []
-    words: list[str] = []
-    numbers: list[int] = []
-    x, y, z = columns.positions
-    if not has_header:
-        rows = _rows(lines, separator)
-    for number, cells in rows:
+    points = PointList("line")
+    for number, cells in rows if has_header else _rows(lines, separator):
         if len(cells) != columns.total:
             raise InputError(
                 f"line {number} has {count_of(len(cells), 'value')} instead of {columns.total}: correct the "
                 "line, and put names that contain the separator in double quotes."
             )
-        numbers.append(number)
-        words += (cells[x], cells[y], cells[z])
-        names.append((cells[columns.name] if columns.name is not None else "") or str(len(numbers)))
-    return landmarks_of(names, words, "line", numbers)
+        columns.add_to(points, number, cells)
+    return points.landmarks()
 
 
 def _is_value(cell: str) -> bool:
@@ -114,7 +112,7 @@ def _usual_columns(number: int, cells: list[str]) -> _Columns:
             f"line {number} has {count_of(count, 'value')}: give x, y and z, or a name, x, y and z, and put "
             "names that contain the separator in double quotes."
         )
-    return _Columns([count - 3, count - 2, count - 1], 0 if count == 4 else None, count)
+    return _Columns(count, [count - 3, count - 2, count - 1], 0 if count == 4 else None)
 
 
 def _named_columns(number: int, cells: list[str]) -> _Columns:
@@ -133,7 +131,7 @@ def _named_columns(number: int, cells: list[str]) -> _Columns:
             "column of names: give the landmarks of one mesh in only these columns."
         )
     name = titles.index(others[0]) if others else None
-    return _Columns([titles.index(axis) for axis in "xyz"], name, len(titles))
+    return _Columns(len(titles), [titles.index(axis) for axis in "xyz"], name)
 
 
 def format_csv(landmarks: Landmarks) -> str:
@@ -162,36 +160,27 @@ def parse_fcsv(text: str) -> Landmarks:
     lines = _lines(text)
     stated = dict(_setting(line) for line in lines if line.startswith("#"))
     columns, order = _fcsv_columns(stated)
-    names: list[str] = []
-    words: list[str] = []
-    numbers: list[int] = []
-    undefined: list[int] = []
-    x, y, z = columns.positions
-    rows = _rows(["" if line.startswith("#") else line for line in lines], ",")
-    for place, (number, cells) in enumerate(rows, start=1):
+    points = PointList("line")
+    for number, cells in _rows(["" if line.startswith("#") else line for line in lines], ","):
         if len(cells) < columns.total:
             raise InputError(
                 f"line {number} has {count_of(len(cells), 'value')} instead of {columns.total}, so the file "
                 "is truncated or damaged: export the markups again."
             )
         if order == _FCSV_COLUMNS and cells[len(order) : len(order) + 1] in (["0"], ["1"]):
-            undefined.append(place)
-            continue
-        numbers.append(number)
-        words += (cells[x], cells[y], cells[z])
-        names.append((cells[columns.name] if columns.name is not None else "") or str(place))
-    notes = left_out(undefined, len(undefined) + len(names), "Slicer has no defined position for them")
-    coordinates = None
-    if "coordinatesystem" in stated:
-        coordinates = SYSTEMS.get(stated["coordinatesystem"])
-        if coordinates is None:
-            raise InputError(
-                f"the coordinate system {stated['coordinatesystem'][:40]!a} is neither LPS (1) nor RAS (0): "
-                "export the markups again."
-            )
-    else:
-        notes += ("The file states no coordinate system.",)
-    return landmarks_of(names, words, "line", numbers, coordinates=coordinates, notes=notes)
+            points.leave_out()
+        else:
+            columns.add_to(points, number, cells)
+    system = stated.get("coordinatesystem")
+    if system is not None and system not in SYSTEMS:
+        raise InputError(
+            f"the coordinate system {system[:40]!a} is neither LPS (1) nor RAS (0): export the markups again."
+        )
+    return points.landmarks(
+        None if system is None else SYSTEMS[system],
+        notes=("The file states no coordinate system.",) if system is None else (),
+        why_left_out="Slicer has no defined position for them",
+    )
 
 
 def _setting(line: str) -> tuple[str, str]:
@@ -216,7 +205,7 @@ def _fcsv_columns(stated: dict[str, str]) -> tuple[_Columns, list[str]]:
             "the line '# columns = …' does not name x, y and z once each: export the markups again."
         )
     name = order.index("label") if "label" in order else None
-    return _Columns([order.index(axis) for axis in "xyz"], name, len(order)), order
+    return _Columns(len(order), [order.index(axis) for axis in "xyz"], name), order
 
 
 def format_fcsv(landmarks: Landmarks) -> str:

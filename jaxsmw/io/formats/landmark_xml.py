@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NoReturn
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.text import is_number
-from jaxsmw.io.landmarks import Landmarks, check_count, landmarks_of, left_out
+from jaxsmw.io.landmarks import Landmarks, PointList, check_count
 
 # These limits are far above what any file of points needs. They prevent a malicious file from using gigabytes
 # of memory.
@@ -76,28 +76,26 @@ def _check_doctype(name: str, system: str | None, public: str | None, has_declar
 
 def parse_picked_points(text: str) -> Landmarks:
     """Parse a `.pp` file of MeshLab (PickedPoints), without the points that nobody has placed."""
-    names: list[str] = []
-    words: list[str] = []
-    numbers: list[int] = []
-    inactive: list[int] = []
+    points = PointList("point")
 
     def on_start(path: list[str], attributes: dict[str, str]) -> None:
         if path[1:] != ["point"]:
             return
-        number = len(numbers) + len(inactive) + 1
         if attributes.get("active", "1").strip() == "0":
-            inactive.append(number)
+            points.leave_out()
             return
-        for axis in "xyz":
-            if axis not in attributes:
-                _refuse(number, f"has no {axis}")
-            words.append(attributes[axis].strip())
-        numbers.append(number)
-        names.append(attributes.get("name", "").strip() or str(number))
+        _check_keys(attributes, "xyz", points.next)
+        position = [attributes[axis].strip() for axis in "xyz"]
+        points.add(attributes.get("name", "").strip(), position)
 
     _parse_xml(text, "PickedPoints", on_start)
-    notes = left_out(inactive, len(numbers) + len(inactive), "they are not active in MeshLab")
-    return landmarks_of(names, words, "point", numbers, notes=notes)
+    return points.landmarks(why_left_out="they are not active in MeshLab")
+
+
+def _check_keys(point: dict[str, str], keys: Iterable[str], number: int) -> None:
+    for key in keys:
+        if key not in point:
+            _refuse(number, f"has no {key}")
 
 
 def _refuse(number: int, fault: str) -> NoReturn:
@@ -141,26 +139,18 @@ def parse_point_set(text: str) -> Landmarks:
     _parse_xml(text, "point_set_file", on_start, on_text)
     if max(sets.values()) > 1:
         raise InputError("contains several point sets or time steps: save each in its own file.")
-    names = [_point_name(point, number) for number, point in enumerate(points, start=1)]
-    numbers = range(1, len(points) + 1)
-    words = [point[axis] for point in points for axis in "xyz"]
-    landmarks = landmarks_of(names, words, "point", numbers, coordinates="LPS")
+    named = PointList("point")
+    for number, point in enumerate(points, start=1):
+        _check_keys(point, ("id", "x", "y", "z"), number)
+        if not re.fullmatch("[0-9]{1,9}", point["id"]):
+            _refuse(number, f"has the id {point['id'][:40]!a}, which is not a whole number")
+        named.add(str(int(point["id"]) + 1), [point[axis] for axis in "xyz"])
     if not geometry:
-        return landmarks
+        return named.landmarks("LPS")
     matrix, offset = _index_to_world(geometry)
     with np.errstate(all="ignore"):
-        positions = landmarks.positions @ matrix.T + offset
-    return landmarks_of(names, positions, "point", numbers, coordinates="LPS")
-
-
-def _point_name(point: dict[str, str], number: int) -> str:
-    """Check that a point of an `.mps` file is complete, and return its name."""
-    for key in ("id", "x", "y", "z"):
-        if key not in point:
-            _refuse(number, f"has no {key}")
-    if not re.fullmatch("[0-9]{1,9}", point["id"]):
-        _refuse(number, f"has the id {point['id'][:40]!a}, which is not a whole number")
-    return str(int(point["id"]) + 1)
+        positions = named.positions() @ matrix.T + offset
+    return named.landmarks("LPS", positions=positions)
 
 
 def _index_to_world(

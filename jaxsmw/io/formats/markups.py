@@ -9,11 +9,10 @@ from __future__ import annotations
 import json
 from typing import Any, NoReturn
 
-import numpy as np
-
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
-from jaxsmw.io.landmarks import SYSTEMS, Landmarks, landmarks_of, left_out
+from jaxsmw.io.formats.landmark_tables import SYSTEMS
+from jaxsmw.io.landmarks import Landmarks, PointList
 from jaxsmw.wording import count_of
 
 _SCHEMA = (
@@ -27,20 +26,18 @@ def parse_markups(text: str) -> Landmarks:
     """Parse the control points of a Markups file. The file must contain a single list of points."""
     markup = _single_list(_parse_json(text))
     coordinates, notes = _coordinate_system(markup)
-    unit, ignored = _unit(markup)
-    notes += ignored
-    points = markup.get("controlPoints", [])
-    if not isinstance(points, list):
+    unit = markup.get("coordinateUnits")
+    if unit is not None and not isinstance(unit, str):
+        unit, notes = None, (*notes, "The unit of the coordinates was ignored, because it is not text.")
+    control_points = markup.get("controlPoints", [])
+    if not isinstance(control_points, list):
         raise InputError("controlPoints is not a list: export the markups again.")
-    names: list[str] = []
-    positions: list[list[float]] = []
-    numbers: list[int] = []
-    undefined: list[int] = []
-    for number, point in enumerate(points, start=1):
+    points = PointList("control point")
+    for number, point in enumerate(control_points, start=1):
         if not isinstance(point, dict):
             _refuse(number, "is not an object")
         if not _is_defined(point, number):
-            undefined.append(number)
+            points.leave_out()
             continue
         label, position = point.get("label", ""), point.get("position")
         if not isinstance(label, str):
@@ -48,13 +45,9 @@ def parse_markups(text: str) -> Landmarks:
         # All numbers are floats here, because `_parse_json` also parses integers as floats.
         if not isinstance(position, list) or [type(value) for value in position] != [float] * 3:
             _refuse(number, "has a position that is not a list of three numbers")
-        numbers.append(number)
-        positions.append(position)
-        names.append(label.strip() or str(number))
-    notes += left_out(undefined, len(points), "Slicer has no defined position for them")
-    table = np.array(positions, dtype=np.float64).reshape(-1, 3)
-    return landmarks_of(
-        names, table, "control point", numbers, coordinates=coordinates, notes=notes, unit=unit
+        points.add(label.strip(), position)
+    return points.landmarks(
+        coordinates, notes=notes, why_left_out="Slicer has no defined position for them", unit=unit
     )
 
 
@@ -110,14 +103,6 @@ def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[
             "again."
         )
     return SYSTEMS[stated], ()
-
-
-def _unit(markup: dict[str, Any]) -> tuple[str | None, tuple[str, ...]]:
-    """Return the unit of length of a markup, and notes. A missing or invalid unit becomes None."""
-    stated = markup.get("coordinateUnits")
-    if stated is None or isinstance(stated, str):
-        return stated, ()
-    return None, ("The unit of the coordinates was ignored, because it is not text.",)
 
 
 def _is_defined(point: dict[str, Any], number: int) -> bool:

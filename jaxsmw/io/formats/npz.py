@@ -19,21 +19,12 @@ _FOLDERS = "vertex_data", "face_data", "blend_shapes", "label_names"
 
 def parse_npz(data: bytes) -> Polygons:
     """Parse the arrays that `format_npz` writes. Other arrays are ignored."""
-    try:
-        arrays = _arrays(data)
-    except InputError:
-        raise
-    except Exception:  # NumPy and zipfile can raise any exception for damaged files
-        raise InputError("is damaged or not a .npz file: write the file again.") from None
+    arrays = read_arrays(data)
     missing = [name for name in ("vertices", "faces") if name not in arrays]
     if missing:
         raise InputError(f"contains no array called {missing[0]}: save the vertices and the faces.")
     vertices, faces = arrays["vertices"], arrays["faces"]
-    if (
-        vertices.shape[1:] != (3,)
-        or faces.shape[1:] != (3,)
-        or {vertices.dtype.kind, faces.dtype.kind} - {*"iuf"}
-    ):
+    if any(array.shape[1:] != (3,) or array.dtype.kind not in "iuf" for array in (vertices, faces)):
         raise InputError(
             f"vertices have the shape {vertices.shape} and faces the shape {faces.shape}: save numbers with "
             "three columns."
@@ -76,21 +67,26 @@ def _texture(arrays: list[np.ndarray], shape: tuple[int, ...]) -> tuple[np.ndarr
     return coordinates, corners.ravel()
 
 
-def _arrays(data: bytes) -> dict[str, np.ndarray]:
-    """Check the sizes of all arrays of the file, and return the arrays."""
-    with zipfile.ZipFile(io.BytesIO(data)) as file:
-        members = [member for member in file.infolist() if member.filename.endswith(".npy")]
-        if sum(member.file_size for member in members) > largest_contents(len(data)):
-            raise InputError(
-                "would take more than 1 GiB of memory and more than four times the size of the file: write "
-                "the file again, without other arrays."
-            )
-        arrays = {}
-        for member in members:
-            with file.open(member) as stream:
-                check_header(stream, member.file_size)
-            with file.open(member) as stream:
-                arrays[member.filename.removesuffix(".npy")] = np.lib.format.read_array(stream)
+def read_arrays(data: bytes) -> dict[str, np.ndarray]:
+    """Check the sizes of all arrays of a `.npz` file, and return the arrays by their names."""
+    arrays = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as file:
+            members = [member for member in file.infolist() if member.filename.endswith(".npy")]
+            if sum(member.file_size for member in members) > largest_contents(len(data)):
+                raise InputError(
+                    "would take more than 1 GiB of memory and more than four times the size of the file: "
+                    "write the file again, without other arrays."
+                )
+            for member in members:
+                with file.open(member) as stream:
+                    check_header(stream, member.file_size)
+                with file.open(member) as stream:
+                    arrays[member.filename.removesuffix(".npy")] = np.lib.format.read_array(stream)
+    except InputError:
+        raise
+    except Exception:  # NumPy and zipfile can raise any exception for damaged files
+        raise InputError("is damaged or not a .npz file: write the file again.") from None
     return arrays
 
 

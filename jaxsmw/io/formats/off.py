@@ -8,15 +8,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.polygons import Formatted, Polygons, is_color, omissions
-from jaxsmw.io.formats.text import numbers, polygon_lines, text
+from jaxsmw.io.formats.polygons import Formatted, Polygons, are_vertices, is_color, omissions
+from jaxsmw.io.formats.text import filled_lines, numbers, polygon_lines
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData
 from jaxsmw.wording import count_of
 
 
 def parse_off(data: bytes) -> Polygons:
     """Parse a text file, with the colours, normals and texture coordinates that its keyword announces."""
-    lines = [line for line in text(data).split("\n") if line and not line.isspace()]
+    lines = filled_lines(data)
     # Some programs write the numbers of vertices and faces on the line of the keyword, sometimes without a
     # space after the keyword.
     keyword = re.match(r"\s*((?:ST)?C?N?)OFF\s*(.*)", lines[0]) if lines else None
@@ -42,7 +42,7 @@ def parse_off(data: bytes) -> Polygons:
     corners, sizes = polygon_lines(rows)
     vertex_data, coordinates = _vertex_data(lines[:n], keyword[1])
     texture = None
-    if coordinates is not None and _within(corners, n):
+    if coordinates is not None and are_vertices(corners, n):
         texture = coordinates, corners.astype(np.int64)
     return Polygons(
         vertices,
@@ -52,10 +52,6 @@ def parse_off(data: bytes) -> Polygons:
         face_data=_face_data(rows, sizes),
         texture=texture,
     )
-
-
-def _within(corners: np.ndarray, n: int) -> bool:
-    return bool(((corners >= 0) & (corners < n) & (corners == np.floor(corners))).all())
 
 
 def _vertex_data(lines: list[str], keyword: str) -> tuple[dict[str, np.ndarray], np.ndarray | None]:

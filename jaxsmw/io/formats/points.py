@@ -11,7 +11,7 @@ from jaxtyping import Float64, Shaped
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.npz import check_header
 from jaxsmw.io.formats.polygons import Polygons
-from jaxsmw.io.formats.text import is_number, numbers, text
+from jaxsmw.io.formats.text import filled_lines, is_number, numbers
 from jaxsmw.io.mesh_data import NORMALS
 
 # Columns 4 to 6 are normals if the length of every vector differs from 1 by less than this number.
@@ -29,8 +29,7 @@ def parse_xyz(data: bytes) -> Polygons:
     """
     if b"\0" in data[:4096]:
         raise InputError("is not a text file in ASCII or UTF-8: save the points as text.")
-    content = text(data)
-    lines = [line for line in content.split("\n") if line and not line.isspace()]
+    lines = filled_lines(data)
     if lines and not any(map(is_number, _words(lines[0]))):
         lines = lines[1:]
     if lines and re.fullmatch(r"\s*\d{1,18}\s*", lines[0]):
@@ -74,17 +73,15 @@ def parse_npy(data: bytes) -> Polygons:
 
 def points_of_table(table: Shaped[np.ndarray, "n columns"]) -> Polygons:
     """Return points without faces from a table. Columns 4 to 6 become normals if they are unit vectors."""
-    with np.errstate(over="ignore"):  # `triangulate_points` reports coordinates that are not finite
-        table = table.astype(np.float64)
-    found = {NORMALS: table[:, 3:6]} if table.shape[1] >= 6 and _are_unit(table[:, 3:6]) else {}
-    used = 6 if found else 3
+    table = table.astype(np.float64)
+    normals = {NORMALS: table[:, 3:6]} if table.shape[1] >= 6 and _are_unit(table[:, 3:6]) else {}
+    used = 6 if normals else 3
     notes: tuple[str, ...] = ()
     if table.shape[1] > used:
         rest = f"{used + 1} to {table.shape[1]}" if table.shape[1] > used + 1 else str(used + 1)
         notes = (f"Columns ignored: {rest}, which are not unit normals.",)
-    return Polygons(table[:, :3], np.empty(0), np.empty(0, np.int64), notes=notes, vertex_data=found)
+    return Polygons(table[:, :3], notes=notes, vertex_data=normals)
 
 
 def _are_unit(vectors: Float64[np.ndarray, "n 3"]) -> bool:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return bool((np.abs(np.linalg.norm(vectors, axis=1) - 1) < _UNIT).all())
+    return bool((np.abs(np.linalg.norm(vectors, axis=1) - 1) < _UNIT).all())

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from jaxsmw.errors import InputError
+from jaxsmw.io.formats.text import DAMAGED
 from jaxsmw.io.mesh_data import COLORS, MeshData, Skin
 from jaxsmw.wording import count_of
 
-DAMAGED = "so the file is damaged: export the mesh again."
 TEXTURE_OF_CORNERS = "texcoord"
 """The name of the data of faces that contain texture coordinates with seams."""
 
@@ -26,13 +26,14 @@ class Polygons(NamedTuple):
     """The polygons of a file, and the data on them.
 
     `corners` lists the corners of all faces, one face after another. `sizes` contains the number of corners
-    of each face, and `strips` marks the faces that are triangle strips. `face_data` has one row per face.
-    `weld` is True if the format duplicates vertices at seams. `lines` counts lines besides the faces.
+    of each face. `strips` marks the faces that are triangle strips; None means none. `face_data` has one row
+    per face. `weld` is True if the format duplicates vertices at seams. `lines` counts lines besides the
+    faces.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
-    corners: np.ndarray
-    sizes: Int64[np.ndarray, " f"]
+    corners: np.ndarray = np.empty(0)
+    sizes: Int64[np.ndarray, " f"] = np.empty(0, np.int64)
     notes: tuple[str, ...] = ()
     vertex_data: Mapping[str, np.ndarray] = {}
     face_data: Mapping[str, np.ndarray] = {}
@@ -43,10 +44,6 @@ class Polygons(NamedTuple):
     weld: bool = False
     lines: int = 0
     strips: Bool[np.ndarray, " f"] | None = None
-
-    @property
-    def is_strip(self) -> Bool[np.ndarray, " f"]:
-        return np.zeros(len(self.sizes), bool) if self.strips is None else self.strips
 
 
 def triangles_of(
@@ -98,15 +95,13 @@ def omissions(data: MeshData, form: str, **holds: Any) -> tuple[str, ...]:
     `holds` maps attributes of `MeshData` that the format called `form` can hold to True, or to a function
     that receives the name and the value of an entry, and returns whether the format can hold it.
     """
-    skin = dict.fromkeys(data.skin[0]) if data.skin is not None else {}
-    texture = {} if data.texture is None else {"coordinates": data.texture}
     kinds: dict[str, tuple[str, Mapping[str, Any]]] = {
         "vertex_data": ("the vertex data", data.vertex_data),
         "face_data": ("the face data", data.face_data),
         "blend_shapes": ("the blend shapes", data.blend_shapes),
-        "skin": ("the joints", skin),
+        "skin": ("the joints", {} if data.skin is None else dict.fromkeys(data.skin[0])),
         "label_names": ("the names of the labels", data.label_names),
-        "texture": ("texture", texture),
+        "texture": ("texture", {} if data.texture is None else {"coordinates": data.texture}),
     }
     notes = []
     for attribute, (what, values) in kinds.items():
@@ -127,6 +122,11 @@ def is_color(name: str, values: np.ndarray) -> bool:
     return values.dtype == np.uint8 or in_range
 
 
+def width_of(values: np.ndarray) -> int:
+    """Return the number of columns of an array (rows,) or (rows, columns)."""
+    return values.shape[1] if values.ndim == 2 else 1
+
+
 def is_texture_of_vertices(data: MeshData) -> bool:
     """Return whether texture vertex i belongs to vertex i for all i, so that there is no seam."""
     return (
@@ -138,21 +138,21 @@ def is_texture_of_vertices(data: MeshData) -> bool:
 
 def unique_name(name: str, taken: Collection[str]) -> str:
     """Return a name that is not taken: the name itself, or the name with a number in parentheses."""
-    chosen, number = name, len(taken)  # a search from number 1 is slow if many names are equal
-    while chosen in taken:
+    free, number = name, len(taken)  # a search from number 1 is slow if many names are equal
+    while free in taken:
         number += 1
-        chosen = f"{name} ({number})"
-    return chosen
+        free = f"{name} ({number})"
+    return free
 
 
 def unique_names(names: Iterable[str]) -> list[str]:
     """Return the names, with numbers in parentheses after repeated names."""
-    chosen: dict[str, None] = {}
+    unique: dict[str, None] = {}
     numbers: dict[str, int] = {}
     for name in names:
-        one = name
-        while one in chosen:
+        free = name
+        while free in unique:
             numbers[name] = numbers.get(name, 1) + 1
-            one = f"{name} ({numbers[name]})"
-        chosen[one] = None
-    return list(chosen)
+            free = f"{name} ({numbers[name]})"
+        unique[free] = None
+    return list(unique)

@@ -7,7 +7,8 @@ import re
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import coincident_vertices, first_equal_rows
+from jaxsmw.geometry.arrays import first_equal_rows
+from jaxsmw.geometry.mesh import coincident_vertices
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions
 from jaxsmw.io.formats.text import numbers, text
 from jaxsmw.io.mesh_data import MeshData
@@ -29,8 +30,7 @@ def parse_stl(data: bytes) -> Polygons:
     has_more = not is_text and count > 0 and behind > 0 and behind % _FACET.itemsize > 0
     if len(data) >= header and (behind == 0 or has_more):
         corners = np.frombuffer(data, _FACET, count, offset=header)["corners"].reshape(-1, 3)
-        with np.errstate(invalid="ignore"):  # some bit patterns of NaN cause a warning
-            corners = corners.astype(np.float64)
+        corners = corners.astype(np.float64)
         if behind:
             notes.append(f"{count_of(behind, 'byte')} behind the last of {count} declared triangles ignored.")
     elif is_text:

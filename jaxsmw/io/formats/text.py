@@ -11,6 +11,7 @@ from jaxtyping import Float64, Int64
 from jaxsmw.errors import InputError
 from jaxsmw.wording import count_of
 
+DAMAGED = "so the file is damaged: export the mesh again."
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
 
@@ -29,6 +30,11 @@ def text(data: bytes) -> str:
     # Latin-1 can decode every byte, and the parsers need only ASCII characters.
     text = data.removeprefix(codecs.BOM_UTF8).replace(b"\r", b"\n").decode("latin-1")
     return re.sub("#[^\n]*", "", text) if "#" in text else text
+
+
+def filled_lines(data: bytes) -> list[str]:
+    """Return the lines of `text` that are not blank."""
+    return [line for line in text(data).split("\n") if line and not line.isspace()]
 
 
 def numbers(lines: list[str], columns: int) -> Float64[np.ndarray, "lines columns"]:
@@ -52,6 +58,27 @@ def _starts_with_numbers(line: str, columns: int) -> bool:
     return len(words) == columns and all(is_number(word, finite=False) for word in words)
 
 
+def numbers_of(words: list[str], kind: str) -> np.ndarray:
+    """Convert words such as `1.5` to an array of numbers of a type such as `f4`."""
+    text = " ".join(words)
+    try:
+        if re.search(r"[^\x20-\x7e]|_", text):  # NumPy would read 1_0 as 10
+            raise ValueError
+        if kind in ("i8", "u8"):
+            return np.array([int(word) for word in words], kind)
+        values = np.array(words, np.float64) if words else np.empty(0)
+        if kind[0] in "iu" and words:
+            limits = np.iinfo(kind)
+            if not ((values >= limits.min) & (values <= limits.max) & (values == np.floor(values))).all():
+                raise ValueError
+        return values.astype(kind)
+    except (ValueError, OverflowError):
+        culprit = next((word for word in words if not is_number(word, finite=False)), words[0])
+        raise InputError(
+            f"{excerpt(culprit)} is written among numbers of the type {np.dtype(kind).name}, {DAMAGED}"
+        ) from None
+
+
 def excerpt(line: str) -> str:
     """Return the first 40 characters of a line, escaped for a message."""
     return ascii(" ".join(line.split())[:40])
@@ -69,9 +96,9 @@ def polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], In
         )
     sizes = sizes.astype(np.int64)
     starts = np.cumsum(sizes) - sizes
-    rows_of_size = {size: np.flatnonzero(sizes == size) for size in np.unique(sizes).tolist()}
-    tables = {size: numbers([lines[i] for i in rows], size + 1) for size, rows in rows_of_size.items()}
     corners = np.empty(sizes.sum())
-    for size, rows in rows_of_size.items():
-        corners[starts[rows][:, None] + np.arange(size)] = tables[size][:, 1:]
+    for size in np.unique(sizes).tolist():
+        rows = np.flatnonzero(sizes == size)
+        table = numbers([lines[i] for i in rows], size + 1)
+        corners[starts[rows][:, None] + np.arange(size)] = table[:, 1:]
     return corners, sizes

@@ -8,10 +8,9 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.polygons import DAMAGED, Formatted, Polygons, omissions
-from jaxsmw.io.formats.text import excerpt
+from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, width_of
+from jaxsmw.io.formats.text import DAMAGED, excerpt, numbers_of
 from jaxsmw.io.formats.vtk_cells import (
-    LARGEST_COLUMNS,
     LINE,
     POLYGON,
     STRIP,
@@ -20,8 +19,8 @@ from jaxsmw.io.formats.vtk_cells import (
     add_array,
     arrays_of,
     cells_of,
+    check_array,
     joined,
-    numbers_of,
     polygons_of,
 )
 from jaxsmw.io.mesh_data import MeshData
@@ -185,14 +184,7 @@ class _Reader:
 
     def take(self, rows: int, columns: int, name: str) -> np.ndarray:
         """Return the next numbers as an array (rows, columns). `name` is the VTK type of the numbers."""
-        kind = _TYPES.get(name.lower())
-        if kind is None:
-            raise InputError(
-                f"contains numbers of the unknown type {excerpt(name)}: save the mesh with floats and "
-                "integers."
-            )
-        if not 1 <= columns <= LARGEST_COLUMNS:
-            raise InputError(f"declares an array with {count_of(columns, 'column')}, {DAMAGED}")
+        kind = check_array(_TYPES, name.lower(), columns)
         count = rows * columns
         values = self.take_bytes(count, kind) if self.binary else self.take_words(count, kind)
         return values.reshape(rows, columns)
@@ -302,8 +294,7 @@ def _field(arrays: dict[str, np.ndarray]) -> list[bytes]:
     """Return the lines and bytes of a FIELD that contains the arrays."""
     parts = [f"FIELD FieldData {len(arrays)}\n".encode()] if arrays else []
     for name, values in arrays.items():
-        columns = values.shape[1] if values.ndim == 2 else 1
         kind = values.dtype.str[1:]
-        parts.append(f"{quote(name)} {columns} {len(values)} {_NAMES[kind]}\n".encode())
+        parts.append(f"{quote(name)} {width_of(values)} {len(values)} {_NAMES[kind]}\n".encode())
         parts += [values.astype(">" + kind).tobytes(), b"\n"]
     return parts

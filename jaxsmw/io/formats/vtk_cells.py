@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -11,13 +10,13 @@ from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import (
-    DAMAGED,
     TEXTURE_OF_CORNERS,
     Polygons,
+    are_vertices,
     is_texture_of_vertices,
     unique_name,
 )
-from jaxsmw.io.formats.text import excerpt, is_number
+from jaxsmw.io.formats.text import DAMAGED, excerpt
 from jaxsmw.io.mesh_data import MeshData, texture_at_corners, texture_of_corners
 from jaxsmw.wording import count_of
 
@@ -26,7 +25,7 @@ VERTEX, LINE, STRIP, POLYGON = 1, 3, 6, 7
 _POINTS, _LINES = (0, VERTEX, 2), (LINE, 4)
 _SURFACE = 5, STRIP, POLYGON, 9
 
-LARGEST_COLUMNS = 2**16
+_MOST_COLUMNS = 2**16
 
 
 class Cells(NamedTuple):
@@ -55,26 +54,15 @@ def joined(groups: list[Cells]) -> Cells:
     return Cells(*(np.concatenate(parts) for parts in zip(*groups, strict=True)))
 
 
-def numbers_of(words: list[str], kind: str) -> np.ndarray:
-    """Convert texts such as `1.5` to an array of numbers of a type such as `f4`."""
-    text = " ".join(words)
-    try:
-        if re.search(r"[^\x20-\x7e]|_", text):  # NumPy would read 1_0 as 10
-            raise ValueError
-        if kind in ("i8", "u8"):
-            return np.array([int(word) for word in words], kind)
-        values = np.array(words, np.float64) if words else np.empty(0)
-        if kind[0] in "iu" and words:
-            limits = np.iinfo(kind)
-            if not ((values >= limits.min) & (values <= limits.max) & (values == np.floor(values))).all():
-                raise ValueError
-        with np.errstate(over="ignore"):
-            return values.astype(kind)
-    except (ValueError, OverflowError):
-        wrong = next((word for word in words if not is_number(word, finite=False)), words[0])
+def check_array(types: Mapping[str, str], name: str, columns: int) -> str:
+    """Return the NumPy type of an array with the VTK type `name`. Refuse unknown types and bad widths."""
+    if name not in types:
         raise InputError(
-            f"{excerpt(wrong)} is written among numbers of the type {np.dtype(kind).name}, {DAMAGED}"
-        ) from None
+            f"contains numbers of the unknown type {excerpt(name)}: save the mesh with floats and integers."
+        )
+    if not 1 <= columns <= _MOST_COLUMNS:
+        raise InputError(f"declares an array with {count_of(columns, 'column')}, {DAMAGED}")
+    return types[name]
 
 
 def polygons_of(
@@ -86,10 +74,7 @@ def polygons_of(
 ) -> Polygons:
     """Return the polygons and strips among the cells. Points and lines are ignored.
 
-    **Arguments:**
-
-    - `point_data`, `cell_data`: arrays with one row per point or per cell.
-    - `coordinates`: the texture coordinates of the points (n, 2 or more), or None.
+    `coordinates` contains the texture coordinates of the points (n, 2 or more).
     """
     for data, count, what in ((point_data, len(points), "point"), (cell_data, len(cells.sizes), "cell")):
         for name, values in data.items():
@@ -109,7 +94,7 @@ def polygons_of(
     notes = (f"{count_of(ignored, 'cell')} ignored: points and lines are not part of a surface.",)
     sizes, corners = cells.sizes[used], cells.corners[np.repeat(used, cells.sizes)]
     texture = None
-    if coordinates is not None and _within(corners, len(points)):
+    if coordinates is not None and are_vertices(corners, len(points)):
         texture = coordinates[:, :2].astype(np.float64), corners
     of_corners = cell_data.get(TEXTURE_OF_CORNERS)
     face_data = {name: values[used] for name, values in cell_data.items()}
@@ -129,23 +114,19 @@ def polygons_of(
     )
 
 
-def _within(corners: np.ndarray, n: int) -> bool:
-    return not len(corners) or bool(corners.min() >= 0 and corners.max() < n)
-
-
-def add_array(data: dict[str, np.ndarray], name: str, values: np.ndarray) -> str:
+def add_array(data: dict[str, np.ndarray], name: str, values: np.ndarray) -> None:
     """Add an array with one row per point or cell. If its name is taken, it receives a number."""
-    chosen = unique_name(name or "unnamed", data)
-    data[chosen] = values[:, 0] if values.shape[1] == 1 else values
-    return chosen
+    data[unique_name(name or "unnamed", data)] = values
 
 
 def arrays_of(data: MeshData) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray | None]:
-    """Return the arrays on points and cells, which contain a texture with seams, and the one of points."""
-    cell_data = dict(data.face_data)
-    if data.texture is None:
-        return dict(data.vertex_data), cell_data, None
-    if is_texture_of_vertices(data):
-        return dict(data.vertex_data), cell_data, data.texture[0]
-    cell_data[TEXTURE_OF_CORNERS] = texture_at_corners(data.texture)
-    return dict(data.vertex_data), cell_data, None
+    """Return the arrays on points and on cells, and the texture coordinates of the points.
+
+    The arrays on cells contain a texture with seams.
+    """
+    cell_data, coordinates = dict(data.face_data), None
+    if data.texture is not None and is_texture_of_vertices(data):
+        coordinates = data.texture[0]
+    elif data.texture is not None:
+        cell_data[TEXTURE_OF_CORNERS] = texture_at_corners(data.texture)
+    return dict(data.vertex_data), cell_data, coordinates

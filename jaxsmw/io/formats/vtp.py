@@ -14,10 +14,9 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.polygons import DAMAGED, Formatted, Polygons, omissions, unique_name
-from jaxsmw.io.formats.text import excerpt
+from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, unique_name, width_of
+from jaxsmw.io.formats.text import DAMAGED, excerpt, numbers_of
 from jaxsmw.io.formats.vtk_cells import (
-    LARGEST_COLUMNS,
     LINE,
     POLYGON,
     STRIP,
@@ -26,8 +25,8 @@ from jaxsmw.io.formats.vtk_cells import (
     add_array,
     arrays_of,
     cells_of,
+    check_array,
     joined,
-    numbers_of,
     polygons_of,
 )
 from jaxsmw.io.mesh_data import MeshData
@@ -151,14 +150,7 @@ class _Reader:
 
     def array(self, element: ElementTree.Element, rows: int, columns: int) -> np.ndarray:
         """Return the numbers of a DataArray (rows, columns)."""
-        kind = _TYPES.get(element.get("type", ""))
-        if kind is None:
-            raise InputError(
-                f"contains numbers of the unknown type {excerpt(element.get('type', ''))}: save the mesh "
-                "with floats and integers."
-            )
-        if not 1 <= columns <= LARGEST_COLUMNS:
-            raise InputError(f"declares an array with {count_of(columns, 'column')}, {DAMAGED}")
+        kind = check_array(_TYPES, element.get("type", ""), columns)
         count, form, text = rows * columns, element.get("format", "ascii"), element.text or ""
         if form == "ascii":
             values = numbers_of(text.split(), kind)
@@ -313,8 +305,7 @@ def _array(name: str, values: np.ndarray) -> str:
     packed = zlib.compress(content)
     header = np.array([1, len(content), 0, len(packed)] if content else [0, 0, 0], "<u8").tobytes()
     text = base64.b64encode(header) + base64.b64encode(packed if content else b"")
-    columns = values.shape[1] if values.ndim == 2 else 1
     return (
-        f'<DataArray type="{_NAMES[kind]}" Name={quoteattr(name)} NumberOfComponents="{columns}" '
+        f'<DataArray type="{_NAMES[kind]}" Name={quoteattr(name)} NumberOfComponents="{width_of(values)}" '
         f'format="binary">{text.decode()}</DataArray>'
     )

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
-from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 from jaxsmw.matching.executor import SpectralPair, Start, run
@@ -267,8 +266,7 @@ class Alternatives:
         return self.y.samples.nearest[pointwise_map[self.x.samples.vertices]]
 
     def _extended(self, found: SampleMap) -> Int64[np.ndarray, " m"]:
-        everywhere = self.y.samples.vertices[found][self.x.samples.nearest]
-        return extend_to_unreferenced(self.pair.mesh_x, everywhere)
+        return self.y.samples.vertices[found][self.x.samples.nearest]
 
 
 def _within(margin: float, candidates: Sequence[_Candidate]) -> list[_Candidate]:

@@ -27,7 +27,6 @@ def refine_and_repair(
     preset: Preset,
     *,
     outcome: Outcome | None = None,
-    alternatives: Iterable[Int64[np.ndarray, " m"]] | None = None,
     history: bool = False,
 ) -> Scored:
     """Run the first and the repeated stages of a preset from a start, and repair a map that looks wrong.
@@ -38,10 +37,9 @@ def refine_and_repair(
     steps.
 
     1. Alternatives: `jaxsmw.matching.search.alternatives` refines many initial maps on a thousand samples.
-      The
-       best of these maps, at most `finalists`, are then refined by the repeated stages. The outcome with the
-       best score is kept, which can also be the outcome of the original initial map. If the kept outcome
-       looks right, repair ends.
+       The repeated stages then refine the best of these maps, at most `finalists`. The outcome with the best
+       score is kept, which can also be the outcome of the original initial map. If the kept outcome looks
+       right, repair ends. Only the initial map `"shot"` has alternatives.
     2. Rounds: each round runs the repeated stages again. Each round repairs one kind of fault of the previous
        map, orientation reversal or discontinuities. The first functional map of the round is computed without
        the vertices that have this fault. If a map has both kinds of fault, the first round repairs the
@@ -63,9 +61,6 @@ def refine_and_repair(
     - `start`: the initial map.
     - `preset`: the stages and the repair. Without repair, the outcome is judged but not repaired.
     - `outcome`: the outcome of the stages if they have already run, such as a result of `run` in batches.
-    - `alternatives`: alternative maps (m,), the best first, as an iterable that is consumed only if needed.
-      By default, the maps come from `jaxsmw.matching.search.alternatives` if the initial map is `"shot"`. For
-      other initial maps, there are no alternatives by default.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Raises:** `InputError` if alternative maps cannot be computed.
@@ -77,8 +72,8 @@ def refine_and_repair(
     if repair is None or not best.successful:
         return best
     repeater = _Repeater(prepared.spectra, preset.repeated, judge, history)
-    computes_alternatives = alternatives is None and start.origin == "shot" and repair.finalists > 0
-    compares = computes_alternatives and not prepared.pair.partial
+    has_alternatives = start.origin == "shot" and repair.finalists > 0
+    compares = has_alternatives and not prepared.pair.partial
     if best.suspicious:
         logger.info(
             "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
@@ -91,8 +86,8 @@ def refine_and_repair(
         logger.info("the map is compared with alternative maps (distortion %.3f)", best.distortion)
     else:
         return best
-    if not computes_alternatives:
-        return repeater.repaired([best], alternatives or ())
+    if not has_alternatives:
+        return repeater.repaired([best])
     proxies = Alternatives(prepared, repair)
     judge = replace(judge, measure_deformation=proxies.deformation)
     repeater, usual = replace(repeater, judge=judge), best.pointwise_map
@@ -224,7 +219,9 @@ class _Repeater:
         first = max(0, len(outcome.refinements) - len(self.stages))
         return Outcome(outcome.initial_map, outcome.refinements[:first]).followed_by(again)
 
-    def repaired(self, known: Sequence[Scored], alternatives: Iterable[Int64[np.ndarray, " m"]]) -> Scored:
+    def repaired(
+        self, known: Sequence[Scored], alternatives: Iterable[Int64[np.ndarray, " m"]] = ()
+    ) -> Scored:
         """Return the best of judged maps and alternative maps, repaired by rounds if it looks wrong."""
         settings, maps = self.judge.settings, [*known]
         for number, alternative in enumerate(islice(alternatives, settings.finalists), 1):

@@ -1,0 +1,175 @@
+"""Readers and writers of landmark files, and the table of their formats.
+
+jaxsmw has its own readers of landmark files, because other libraries read these formats without checks. A
+damaged file must cause one clear error message, and a coordinate system must not be guessed.
+"""
+
+from __future__ import annotations
+
+import codecs
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxsmw.errors import InputError
+from jaxsmw.io.formats.landmark_tables import (
+    format_csv,
+    format_fcsv,
+    format_txt,
+    parse_fcsv,
+    parse_table,
+)
+from jaxsmw.io.formats.landmark_xml import format_picked_points, parse_picked_points, parse_point_set
+from jaxsmw.io.formats.markups import format_markups, parse_markups
+from jaxsmw.io.landmarks import Landmarks, check_count
+from jaxsmw.runtime.files import atomic_write, read_bytes, size_of_file
+
+
+class _Format(NamedTuple):
+    """The functions that parse and format a kind of file. `format` is None if it can only be read.
+
+    `is_for_landmarks` is False for tables, which often contain something else. `states_system` is True if
+    the files always state a coordinate system. `largest` is the largest size of a file in bytes.
+    """
+
+    parse: Callable[[str], Landmarks]
+    format: Callable[[Landmarks], str] | None
+    is_for_landmarks: bool = True
+    states_system: bool = False
+    largest: int = 2**27  # about a million lines
+
+
+_FORMATS = {
+    # JSON needs up to 25 times its size in memory. A file of 32 MiB contains 50 000 points of Slicer.
+    ".mrk.json": _Format(parse_markups, format_markups, states_system=True, largest=2**25),
+    ".fcsv": _Format(parse_fcsv, format_fcsv, states_system=True),
+    ".pp": _Format(parse_picked_points, format_picked_points),
+    ".mps": _Format(parse_point_set, None),
+    ".csv": _Format(parse_table, format_csv, is_for_landmarks=False),
+    ".txt": _Format(parse_table, format_txt, is_for_landmarks=False),
+}
+LANDMARK_SUFFIXES = tuple(suffix for suffix, kind in _FORMATS.items() if kind.is_for_landmarks)
+"""The suffixes of files that certainly contain named points."""
+
+
+def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
+    """Read the landmarks of one mesh from a file.
+
+    The file is text in UTF-8. If a landmark has no name, its 1-based number in the file becomes its name.
+
+    **Arguments:**
+
+    - `path`: the file. The suffix, in upper or lower case, determines the format:
+        - `.mrk.json`: a Markups file of 3D Slicer with a single point list. A file with several markups is
+          refused. If the file states no coordinate system, the default of the format applies, which is LPS.
+        - `.fcsv`: a file of 3D Slicer. The coordinate system 0 is RAS, and the coordinate system 1 is LPS.
+        - `.pp`: a file of MeshLab (PickedPoints).
+        - `.mps`: a point set of MITK, whose world coordinates are LPS.
+        - `.csv`, `.txt`: a table with the columns name, x, y and z, or x, y and z. Semicolons, tabs, commas
+          or blanks separate the columns. The first line may name the columns, and then their order is free.
+
+    **Returns:** `Landmarks` with l names and positions (l, 3) as in the file. Points are left out if Slicer
+    has no defined position for them, or if they are not active in MeshLab. The `notes` report these points, a
+    missing coordinate system in a file of Slicer, and an ignored unit.
+
+    **Raises:** `InputError` if the file cannot be read, does not have the format of its suffix, or is larger
+    than 128 MiB (`.mrk.json`: 32 MiB). `InputError` is also raised if the file contains no landmarks or more
+    than 2²⁰ landmarks, if a coordinate is not finite, or if two landmarks have the same name.
+    """
+    suffix = check_readable_suffix(path)
+    _check_size(path, size_of_file(path), suffix)
+    data = read_bytes(path)
+    try:
+        landmarks = _FORMATS[suffix].parse(_decode(data))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return replace(landmarks, name=str(path))
+
+
+def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
+    """Write landmarks to a file. Reading the file returns exactly the same names and positions.
+
+    The write is atomic: an incomplete file never appears at `path`.
+
+    **Arguments:**
+
+    - `path`: the file to create or to replace. The suffix determines the format: `.mrk.json` or `.fcsv` for
+      3D Slicer, `.pp` for MeshLab, `.csv` for a table with commas, or `.txt` for a table with tabs.
+    - `landmarks`: `Landmarks`. Files of Slicer state their coordinate system. Files of the format `.mrk.json`
+      also state their unit if it is known. Files in the other formats cannot state a coordinate system, so
+      their readers must know the coordinate system.
+
+    **Raises:** `InputError` for another suffix, for a file that cannot be written, or for more landmarks or
+    bytes than `read_landmark_file` accepts. For files of Slicer, `InputError` is also raised if the
+    coordinate system of the landmarks is None.
+    """
+    check_known_system(path, landmarks)
+    suffix = check_landmark_suffix(path)
+    try:
+        check_count(len(landmarks))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    write = _FORMATS[suffix].format
+    assert write is not None
+    data = write(landmarks).encode("utf-8")
+    _check_size(path, len(data), suffix)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def check_readable_suffix(path: str | os.PathLike[str]) -> str:
+    """Return the suffix of a landmark file in lower case; refuse a format that cannot be read."""
+    return _suffix(path, list(_FORMATS))
+
+
+def check_landmark_suffix(path: str | os.PathLike[str]) -> str:
+    """Return the suffix of a landmark file in lower case; refuse a format that cannot be written."""
+    return _suffix(path, [suffix for suffix, kind in _FORMATS.items() if kind.format is not None])
+
+
+def _suffix(path: str | os.PathLike[str], suffixes: list[str]) -> str:
+    for suffix in suffixes:
+        if Path(path).name.lower().endswith(suffix):
+            return suffix
+    raise InputError(
+        f"{path}: the suffix {Path(path).suffix!r} is not supported for this landmark file: choose one of "
+        f"{', '.join(suffixes)}."
+    )
+
+
+def check_known_system(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
+    """Refuse to write landmarks without a coordinate system to a file of 3D Slicer."""
+    suffix = check_landmark_suffix(path)
+    if landmarks.coordinates is None and _FORMATS[suffix].states_system:
+        raise InputError(
+            f"{path}: {suffix} files state a coordinate system, but the one of {landmarks.name} is not "
+            'known: set coordinates="LPS" or coordinates="RAS", or write a .csv file.'
+        )
+
+
+def _check_size(path: str | os.PathLike[str], size: int, suffix: str) -> None:
+    largest = _FORMATS[suffix].largest
+    if size > largest:
+        raise InputError(
+            f"{path}: is larger than {largest >> 20} MiB, the largest size of a {suffix} file of landmarks: "
+            "give fewer landmarks."
+        )
+
+
+def _decode(data: bytes) -> str:
+    """Decode the text of a file in UTF-8, with or without a byte order mark."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InputError("is text in UTF-16: save the file in UTF-8.")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"is not text in UTF-8 (byte {error.start} is not valid): save the file in UTF-8."
+        ) from None
+    if "\0" in text:
+        raise InputError("contains null characters, so it is not a text file: give a file of landmarks.")
+    if not text.strip():
+        raise InputError("is empty: give a file with at least one landmark.")
+    return text
