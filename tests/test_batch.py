@@ -19,8 +19,7 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
 from jaxsmw.runtime import batches as batch
-from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
-from jaxsmw.runtime.padding import padded_size
+from jaxsmw.runtime.batches import bytes_per_pair, padded_size, refine_pairs, stack
 
 SIZES = 150, 170, 260, 300
 PAIRS = [(0, 1), (1, 0), (2, 3), (0, 3), (1, 1), (0, 1), (3, 2)]

@@ -37,7 +37,6 @@ class ConsistentMaps:
 
     **Attributes:**
 
-    - `shapes`: the N shapes.
     - `maps`: the map of each edge. An edge whose match failed has no map.
     - `network`: the shapes, the maps and their estimated errors.
     - `template`: the index of the template in `shapes`.
@@ -45,7 +44,6 @@ class ConsistentMaps:
     - `cycle_errors`: the error of each triangle of edges (c,), in units of the square root of the area.
     """
 
-    shapes: Sequence[PreparedShape]
     maps: Mapping[Edge, EdgeMap]
     network: Network
     template: int
@@ -74,7 +72,7 @@ class ConsistentMaps:
         errors = np.maximum(estimated, prior / 2) + distorted
         network = Network(meshes, points, dict(zip(maps, errors.tolist(), strict=True)))
         medoid = network.medoid()
-        return cls(shapes, maps, network, medoid, synchronize(network, medoid), cycle_errors)
+        return cls(maps, network, medoid, synchronize(network, medoid), cycle_errors)
 
     def through(self, template: int) -> ConsistentMaps:
         """Return the consistent maps through another template."""
