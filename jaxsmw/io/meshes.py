@@ -272,12 +272,9 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
 
     `read_mesh_data` lists the formats, and reads the same data from the file, in the precision of the format:
     float32 in STL and glTF files, and float64 in the other formats. Colours in OBJ files become floats.
-
     Vertices keep their order in all formats except STL. glTF files need one texture vertex per vertex, so
     vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
-    them again.
-
-    The write is atomic: an incomplete file never appears at `path`.
+    them again. The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 
@@ -286,8 +283,7 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
     - `data`: a `MeshData`. The file contains all triangles of `data.faces`, including triangles that cleaning
         dropped from `data.mesh`.
 
-    **Returns:** A tuple of sentences about the data that the format cannot hold. The tuple is empty if the
-    file contains everything. Only a `.npz` file can contain all data of any `MeshData`.
+    **Returns:** A tuple of sentences about the data that the format cannot hold, which is empty for `.npz`.
 
     **Raises:** `InputError` for another suffix, positions that the format cannot hold, or a file that cannot
     be written.

@@ -70,10 +70,8 @@ def read_variables(path: str | os.PathLike[str]) -> dict[str, Any]:
 def parse_variables(data: bytes) -> dict[str, Any]:
     """Parse the contents of a `.mat` file into a dictionary from the names of variables to their values.
 
-    Structs become dictionaries, and axes of length 1 are dropped.
-
-    **Raises:** `InputError` if the contents are damaged, or larger than both 1 GiB and four times the size of
-    the file (`jaxsmw.runtime.files.largest_contents`), or if format 7.3 needs pymatreader.
+    Structs become dictionaries, and axes of length 1 are dropped. Refuse contents that are larger than both
+    1 GiB and four times the size of the file (`jaxsmw.runtime.files.largest_contents`).
     """
     is_hdf5 = data.startswith((b"MATLAB 7.3", b"\x89HDF")) or data[124:126] in (b"\0\2", b"\2\0")
     try:
@@ -235,17 +233,10 @@ def find_structs(variables: Mapping[str, Any], *fields: str) -> dict[str, Mappin
 def read_matrix(
     path: str | os.PathLike[str], name: str, *, columns: int | None = None
 ) -> Float64[np.ndarray, "rows columns"]:
-    """Read a matrix of real numbers from a `.mat` file.
+    """Read a matrix of real numbers from a `.mat` file; `columns` is the necessary number of columns, if any.
 
-    If the file contains only one suitable matrix, the matrix may have any name. A matrix with a single row is
-    read as a column, because a list in MATLAB may be either a row or a column.
-
-    **Arguments:**
-
-    - `name`: the name of the matrix to read if the file contains several suitable matrices.
-    - `columns`: the number of columns of a suitable matrix, or None for any number.
-
-    **Raises:** `InputError` if the file cannot be read, or the matrix is missing or ambiguous.
+    If the file contains only one suitable matrix, the matrix may have any name. Otherwise, the matrix `name`
+    is read. A matrix with a single row is read as a column, because a list in MATLAB may be either.
     """
     variables = read_variables(path)
     matrices = {key: value for key, value in variables.items() if _is_real(value)}

@@ -152,14 +152,12 @@ def _decompress(body: bytes, header: _Header) -> bytes:
 
 
 def lzf_decompressed(packed: bytes, size: int) -> bytes:
-    """Decompress data in the LZF format of Marc Lehmann's LibLZF.
+    """Decompress data in the LZF format of Marc Lehmann's LibLZF to exactly `size` bytes.
 
     After a control byte c below 32, c + 1 literal bytes follow. Any other control byte means a copy of
     earlier output. The upper three bits of the control byte are the length minus 2. If these bits are all
     set, the next byte is added to the length. The lower five bits and the following byte are the distance
     minus 1.
-
-    **Raises:** `InputError` if the data is damaged, or does not unpack to `size` bytes.
     """
     out, at = bytearray(), 0
     try:
