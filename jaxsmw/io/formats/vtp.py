@@ -8,6 +8,7 @@ import lzma
 import re
 import zlib
 from collections.abc import Sequence
+from itertools import pairwise
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
@@ -51,14 +52,16 @@ def parse_vtp(data: bytes) -> Polygons:
         raise InputError("contains no piece of PolyData: export the mesh again.")
     points, cells, point_data, cell_data, textures = zip(*map(file.piece, pieces), strict=True)
     first = np.cumsum([0, *map(len, points[:-1])])
-    shifted = [one._replace(corners=one.corners + at) for one, at in zip(cells, first, strict=True)]
-    known = [texture for texture in textures if texture is not None]
+    shifted = [
+        of_piece._replace(corners=of_piece.corners + at) for of_piece, at in zip(cells, first, strict=True)
+    ]
+    coordinates = [texture for texture in textures if texture is not None]
     return polygons_of(
         np.concatenate(points),
         joined(shifted),
         _common(point_data),
         _common(cell_data),
-        np.concatenate(known) if len(known) == len(pieces) else None,
+        np.concatenate(coordinates) if len(coordinates) == len(pieces) else None,
     )
 
 
@@ -122,22 +125,24 @@ class _Reader:
         self, piece: ElementTree.Element, tag: str, count: int
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Return the arrays on the points or cells of a piece, and the texture coordinates of the points."""
-        found: dict[str, np.ndarray] = {}
+        arrays: dict[str, np.ndarray] = {}
         section, coordinates = piece.find(tag), None
-        for element in () if section is None else section.findall("DataArray"):
+        if section is None:
+            return arrays, coordinates
+        texture = section.get("TCoords") if tag == "PointData" else None
+        for element in section.findall("DataArray"):
             values = self.array(element, count, _integer(element, "NumberOfComponents", 1))
             name = element.get("Name", "")
-            is_texture = tag == "PointData" and section is not None and name == section.get("TCoords", "\0")
-            if is_texture and values.shape[1] >= 2 and coordinates is None:
+            if name == texture and values.shape[1] >= 2 and coordinates is None:
                 coordinates = values
             else:
-                add_array(found, name, values)
-        return found, coordinates
+                add_array(arrays, name, values)
+        return arrays, coordinates
 
     def cells(self, piece: ElementTree.Element, tag: str) -> Cells:
         """Return the cells of one kind that a piece contains."""
         count = _integer(piece, f"NumberOf{tag}", 0)
-        arrays = {one.get("Name"): one for one in piece.findall(f"{tag}/DataArray")}
+        arrays = {element.get("Name"): element for element in piece.findall(f"{tag}/DataArray")}
         if not count:
             return cells_of(_KINDS[tag], np.zeros(1), np.empty(0, np.int64))
         if not {"offsets", "connectivity"} <= set(arrays):
@@ -174,26 +179,26 @@ class _Reader:
         if expected > self.budget:
             raise InputError(f"declares {count_of(count, 'number')}, more than the file contains, {DAMAGED}")
         self.budget -= expected
-        stream = _Stream(content, is_raw)
         size = self.header.itemsize
         if not self.compressor:
-            written = stream.take(size + expected)
+            written, _ = _taken(content, size + expected, is_raw)
             if np.frombuffer(written, self.header, 1)[0] != expected:
                 raise InputError(f"an array does not have {count_of(count, 'number')}, {DAMAGED}")
             unpacked = written[size:]
         else:
-            blocks, block, last = np.frombuffer(stream.peek(3 * size), self.header).tolist()
+            head, _ = _taken(content, 3 * size, is_raw)
+            blocks, block, last = np.frombuffer(head, self.header).tolist()
             total = (blocks - 1) * block + (last or block) if blocks else 0
             if total != expected:
                 raise InputError(f"an array does not have {count_of(count, 'number')}, {DAMAGED}")
-            sizes = np.frombuffer(stream.take((3 + blocks) * size), self.header)[3:].tolist()
-            packed = stream.take(sum(sizes))
-            parts, start = [], 0
-            for number, length in enumerate(sizes):
-                wanted = last or block if number == blocks - 1 else block
-                parts.append(self.unpack(packed[start : start + length], wanted))
-                start += length
-            unpacked = b"".join(parts)
+            head, content = _taken(content, (3 + blocks) * size, is_raw)
+            sizes = np.frombuffer(head, self.header)[3:].tolist()
+            packed, _ = _taken(content, sum(sizes), is_raw)
+            ends = np.cumsum([0, *sizes]).tolist()
+            unpacked = b"".join(
+                self.unpack(packed[start:end], last or block if number == blocks - 1 else block)
+                for number, (start, end) in enumerate(pairwise(ends))
+            )
         return np.frombuffer(unpacked, self.order + kind).astype(kind)
 
     def unpack(self, packed: bytes, size: int) -> bytes:
@@ -227,33 +232,21 @@ def _unpack_lz4(packed: bytes, size: int) -> bytes:
         return b""
 
 
-class _Stream:
-    """A stream of raw bytes, or of bytes in several consecutive base64 texts."""
+def _taken(content: bytes, size: int, is_raw: bool) -> tuple[bytes, bytes]:
+    """Return the first `size` bytes of raw content or of base64 text, and the content behind them.
 
-    def __init__(self, content: bytes, is_raw: bool) -> None:
-        self.content, self.is_raw, self.position = content, is_raw, 0
-
-    def peek(self, size: int) -> bytes:
-        start = self.position
-        found = self.take(size)
-        self.position = start
-        return found
-
-    def take(self, size: int) -> bytes:
-        """Return the next `size` bytes. Base64 text is read to the end of a group of four characters."""
-        length = size if self.is_raw else (size + 2) // 3 * 4
-        part = self.content[self.position : self.position + length]
-        self.position += length
-        if not self.is_raw:
-            try:
-                part = base64.b64decode(part, validate=True)
-            except binascii.Error:
-                part = b""
-        if len(part) < size:
-            raise InputError(
-                "an array ends early, so the file is truncated or damaged: export the mesh again."
-            )
-        return part[:size]
+    Base64 text is read to the end of a group of four characters.
+    """
+    length = size if is_raw else (size + 2) // 3 * 4
+    part = content[:length]
+    if not is_raw:
+        try:
+            part = base64.b64decode(part, validate=True)
+        except binascii.Error:
+            part = b""
+    if len(part) < size:
+        raise InputError("an array ends early, so the file is truncated or damaged: export the mesh again.")
+    return part[:size], content[length:]
 
 
 def _integer(element: ElementTree.Element, name: str, default: int) -> int:
