@@ -210,10 +210,10 @@ class Table:
                 )
         return rows
 
-    def index_base(self, chosen: IndexBase | None, *, default: IndexBase = 0) -> IndexBase:
-        """Return the chosen index of the first vertex or face, or else the default; 1 for `.mat` files."""
-        if chosen is not None:
-            return chosen
+    def index_base(self, stated: IndexBase | None, *, default: IndexBase = 0) -> IndexBase:
+        """Return the stated index of the first vertex or face, or else the default; 1 for `.mat` files."""
+        if stated is not None:
+            return stated
         return 1 if is_mat_file(self.path) else default
 
     def place(self, row: int) -> str:

@@ -188,9 +188,9 @@ def _within(array: np.ndarray, count: int, first: int = 0) -> bool:
 
 def _canonical(array: np.ndarray) -> np.ndarray:
     """Return a contiguous copy of Booleans as uint8, and of other numbers in types that all formats have."""
-    kind = {"b": np.uint8, "f2": np.float32, "f16": np.float64, "f12": np.float64}
-    wanted = kind.get(array.dtype.str[1:], kind.get(array.dtype.kind, array.dtype.newbyteorder("=")))
-    return np.array(array, dtype=wanted, order="C")
+    kinds = {"b": np.uint8, "f2": np.float32, "f16": np.float64, "f12": np.float64}
+    kind = kinds.get(array.dtype.str[1:], kinds.get(array.dtype.kind, array.dtype.newbyteorder("=")))
+    return np.array(array, dtype=kind, order="C")
 
 
 def _indices(values: Any, count: int, what: str, whole: str, first: int = 0) -> Int64[np.ndarray, "f 3"]:
@@ -219,9 +219,9 @@ def texture_of_corners(
     Corners of one vertex with equal coordinates share a texture vertex. The texture vertices of vertex 0 come
     first, then those of vertex 1, and so on. A corner whose coordinates are NaN has none.
     """
-    known = np.isfinite(at_corners).all(axis=1)
-    rows = np.column_stack([corners, at_corners])[known]
+    has_texture = np.isfinite(at_corners).all(axis=1)
+    rows = np.column_stack([corners, at_corners])[has_texture]
     distinct, number = np.unique(rows, axis=0, return_inverse=True)
     of_corner = np.full(len(corners), -1)
-    of_corner[known] = number.ravel()
+    of_corner[has_texture] = number.ravel()
     return distinct[:, 1:], of_corner

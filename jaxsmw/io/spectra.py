@@ -176,8 +176,8 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     if is_mat_file(path):
         structs = find_structs(read_variables(path), "evals", "evecs")
         if len(structs) != 1:
-            found = f"{len(structs)} eigenbases ({', '.join(structs)})" if structs else "no evals and evecs"
-            raise InputError(f"{path}: contains {found}: save a single struct with evals and evecs.")
+            bases = f"{len(structs)} eigenbases ({', '.join(structs)})" if structs else "no evals and evecs"
+            raise InputError(f"{path}: contains {bases}: save a single struct with evals and evecs.")
         (struct,) = structs.values()
         return make_spectrum(struct["evals"], struct["evecs"], _areas_of(struct, name), name=name)
     if Path(path).suffix.lower() != ".npz":

@@ -84,7 +84,7 @@ class _Scene:
             roots = document.list_of(document.item("scenes", document.json.get("scene", 0)), "nodes")
         else:
             children = [document.list_of(document.item("nodes", i), "children") for i in range(len(nodes))]
-            below = {str(child) for some in children for child in some}
+            below = {str(child) for of_node in children for child in of_node}
             roots = [i for i in range(len(nodes)) if str(i) not in below]
         in_scene: dict[int, tuple[dict[str, Any], np.ndarray]] = {}
         pending = [(root, np.eye(4)) for root in reversed(roots)]

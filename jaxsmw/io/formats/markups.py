@@ -67,10 +67,10 @@ def _parse_json(text: str) -> Any:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    properties = dict(pairs)
+    if len(properties) < len(pairs):
         raise InputError("states a property twice, so its meaning is not clear: export the markups again.")
-    return found
+    return properties
 
 
 def _single_list(document: Any) -> dict[str, Any]:

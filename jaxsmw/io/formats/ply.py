@@ -17,6 +17,7 @@ from jaxsmw.io.formats.polygons import (
     is_texture_of_vertices,
     omissions,
     texture_or_note,
+    width_of,
 )
 from jaxsmw.io.formats.text import excerpt, is_number
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, texture_at_corners, texture_of_corners
@@ -338,11 +339,11 @@ def _columns(data: Mapping[str, np.ndarray], reserved: set[str]) -> tuple[dict[s
     columns: dict[str, np.ndarray] = {}
     lost = set()
     for name, values in data.items():
-        known: tuple[str, ...] = _COLUMNS_OF.get(name, ())
-        count = 1 if values.ndim == 1 else values.shape[1]
+        components: tuple[str, ...] = _COLUMNS_OF.get(name, ())
+        count = width_of(values)
         names = [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(count)]
-        if values.ndim == 2 and 3 <= count <= len(known) and (name != COLORS or is_color(name, values)):
-            names = list(known[:count])
+        if values.ndim == 2 and 3 <= count <= len(components) and (name != COLORS or is_color(name, values)):
+            names = list(components[:count])
         stored = _storable(values)
         if stored is None or not re.fullmatch(r"[!-~]+", name) or {*names} & (reserved | {*columns}):
             lost.add(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import NoReturn
 from urllib.parse import quote, unquote
 
 import numpy as np
@@ -119,31 +120,29 @@ class _Reader:
 
     def attribute(self, words: list[str]) -> None:
         """Read an attribute of the points or of the cells."""
-        data = self.arrays[self.section]
         match words:
             case ["SCALARS", name, kind, *columns] if len(columns) < 2:
                 table = (self.line() or "").split()
                 if table[:1] != ["LOOKUP_TABLE"]:
                     self.refuse(table)
                 values = self.take(self.rows, _count(*columns) if columns else 1, kind)
-                add_array(data, unquote(name), values)
             case ["COLOR_SCALARS", name, columns]:
                 values = self.take(self.rows, _count(columns), "unsigned_char" if self.binary else "float")
                 if not self.binary:  # text files contain floats from 0 to 1
                     values = np.rint(255 * np.clip(np.nan_to_num(values), 0, 1)).astype(np.uint8)
-                add_array(data, unquote(name), values)
             case ["LOOKUP_TABLE", _, size]:
                 self.take(_count(size), 4, "unsigned_char" if self.binary else "float")
+                return
             case ["TEXTURE_COORDINATES", name, columns, kind]:
                 values = self.take(self.rows, _count(columns), kind)
                 if self.section == "POINT_DATA" and values.shape[1] >= 2:
                     self.coordinates = values
-                else:
-                    add_array(data, unquote(name), values)
+                    return
             case [keyword, name, kind] if keyword in _COLUMNS:
-                add_array(data, unquote(name), self.take(self.rows, _COLUMNS[keyword], kind))
+                values = self.take(self.rows, _COLUMNS[keyword], kind)
             case _:
                 self.refuse(words)
+        add_array(self.arrays[self.section], unquote(name), values)
 
     def field_array(self) -> None:
         """Read an array of a FIELD. Arrays of strings are skipped."""
@@ -157,7 +156,7 @@ class _Reader:
             case words:
                 self.refuse(words)
 
-    def refuse(self, words: list[str]) -> None:
+    def refuse(self, words: list[str]) -> NoReturn:
         if not words:
             raise InputError("ends early, so the file is truncated: export the mesh again.")
         raise InputError(f"contains the invalid line {excerpt(' '.join(words))}, {DAMAGED}")
@@ -203,15 +202,14 @@ class _Reader:
             self.truncated(count)
         words: list[str] = []
         while len(words) < count:
-            line = self.raw_line()
-            if line is None:
+            if (line := self.raw_line()) is None:
                 self.truncated(count)
-            words += (line or "").split()
+            words += line.split()
         if len(words) > count:
             raise InputError(f"continues after {count_of(count, 'number')}, {DAMAGED}")
         return numbers_of(words, "u1" if kind == "bit" else kind)
 
-    def truncated(self, count: int) -> None:
+    def truncated(self, count: int) -> NoReturn:
         raise InputError(
             f"declares {count_of(count, 'number')}, but the file ends within them, so the file is truncated "
             "or damaged: export the mesh again."

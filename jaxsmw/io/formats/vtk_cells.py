@@ -83,10 +83,10 @@ def polygons_of(
                     f"the array {name[:40]!a} has {count_of(len(values), 'row')}, but the file has "
                     f"{count_of(count, what)}: export the mesh again."
                 )
-    known = np.isin(cells.kinds, _POINTS + _LINES + _SURFACE)
-    if not known.all():
+    is_supported = np.isin(cells.kinds, _POINTS + _LINES + _SURFACE)
+    if not is_supported.all():
         raise InputError(
-            f"contains cells of type {cells.kinds[int(known.argmin())]}, which are not triangles or "
+            f"contains cells of type {cells.kinds[int(is_supported.argmin())]}, which are not triangles or "
             "polygons: extract the surface first."
         )
     used = np.isin(cells.kinds, _SURFACE)
