@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.io.formats.landmark_tables import (
     format_csv,
     format_fcsv,
@@ -81,10 +81,8 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
     suffix = check_readable_suffix(path)
     _check_size(path, size_of_file(path), suffix)
     data = read_bytes(path)
-    try:
+    with naming(path):
         landmarks = _FORMATS[suffix].parse(_decode(data))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     return replace(landmarks, name=str(path))
 
 
@@ -106,10 +104,8 @@ def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> N
     """
     check_known_system(path, landmarks)
     suffix = check_landmark_suffix(path)
-    try:
+    with naming(path):
         check_count(len(landmarks))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     write = _FORMATS[suffix].format
     assert write is not None
     data = write(landmarks).encode("utf-8")

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.choices import CoordinateSystem
-from jaxsmw.errors import InputError, check_choice
+from jaxsmw.errors import InputError, check_choice, naming
 from jaxsmw.geometry.mesh import LARGEST_EXTENT, Mesh
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal, distances_to_surface
 from jaxsmw.io.formats.text import is_number
@@ -61,12 +61,10 @@ class Landmarks:
     unit: str | None = None
 
     def __post_init__(self) -> None:
-        try:
+        with naming(self.name):
             if self.coordinates is not None:
                 check_choice(self.coordinates, CoordinateSystem, "a coordinate system")
             _check_points(self.names, self.positions, lambda i: f"landmark {i + 1}")
-        except InputError as error:
-            raise InputError(f"{self.name}: {error}") from None
 
     def __len__(self) -> int:
         return len(self.names)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.wording import count_of
 
@@ -88,7 +88,7 @@ class MeshData:
 
     def __post_init__(self) -> None:
         n = len(self.mesh.vertices)
-        try:
+        with naming(self.mesh.name):
             faces = _indices(self.faces, n, "faces", "vertices")
             checked = {
                 "faces": faces,
@@ -105,8 +105,6 @@ class MeshData:
             for attribute, value in checked.items():
                 object.__setattr__(self, attribute, value)
             self._check_labels()
-        except InputError as error:
-            raise InputError(f"{self.mesh.name}: {error}") from None
 
     @property
     def has_attributes(self) -> bool:

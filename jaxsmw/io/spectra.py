@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Float64
 from numpy.typing import ArrayLike
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh, to_host
 from jaxsmw.io.formats.mat import (
     FUNCTIONAL_MAP,
@@ -185,10 +185,8 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
             f"{path}: spectra are read from .npz and .mat files: give a file of one of these types."
         )
     data = read_bytes(path, largest=None)
-    try:
+    with naming(path):
         arrays = read_arrays(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     fields = "eigenvalues", "eigenvectors", "vertex_areas"
     if missing := [field for field in fields if field not in arrays]:
         raise InputError(f"{path}: lacks {', '.join(missing)}: write the spectrum again.")

@@ -30,7 +30,7 @@ import scipy.io
 from jaxtyping import Float64
 from scipy.io.matlab import MatWriteError, matfile_version
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, texture_or_note
 from jaxsmw.io.mesh_data import MeshData, Skin
 from jaxsmw.runtime.files import atomic_write, largest_contents, read_bytes
@@ -61,10 +61,8 @@ def is_mat_file(path: str | os.PathLike[str]) -> bool:
 def read_variables(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the variables of a `.mat` file of any size; see `parse_variables`. Messages name the file."""
     data = read_bytes(path, largest=None)
-    try:
+    with naming(path):
         return parse_variables(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def parse_variables(data: bytes) -> dict[str, Any]:
@@ -266,11 +264,8 @@ def _is_real(value: Any) -> bool:
 
 def write_variables(path: str | os.PathLike[str], variables: Mapping[str, Any]) -> None:
     """Write arrays, numbers and dictionaries, which become structs. Lists become columns."""
-    with atomic_write(path) as temporary:
-        try:
-            temporary.write_bytes(_saved(variables))
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+    with atomic_write(path) as temporary, naming(path):
+        temporary.write_bytes(_saved(variables))
 
 
 def _saved(variables: Mapping[str, Any]) -> bytes:

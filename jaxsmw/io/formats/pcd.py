@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import Polygons
-from jaxsmw.io.formats.text import excerpt, filled_lines, numbers
+from jaxsmw.io.formats.text import excerpt, export_again, filled_lines, numbers
 from jaxsmw.io.mesh_data import NORMALS
 from jaxsmw.wording import count_of
 
@@ -31,9 +31,9 @@ def parse_pcd(data: bytes) -> Polygons:
     else:
         size = points * record.itemsize
         if len(body) < size:
-            raise InputError(
-                f"the header declares {points} points, but the file ends earlier, so the file is truncated: "
-                "export the points again."
+            raise export_again(
+                f"the header declares {points} points, but the file ends earlier, so the file is truncated",
+                "points",
             )
         table = np.frombuffer(body[:size], record)
     columns = {name: table[name] for name in record.names or () if not name.startswith(_PADDING)}
@@ -56,9 +56,7 @@ def _header(data: bytes) -> tuple[np.dtype, int, str, bytes]:
     while "DATA" not in entries:
         end = data.find(b"\n", offset)
         if end < 0 or end > 2**16:
-            raise InputError(
-                "has no line DATA at the end of its header, so the file is damaged: export the points again."
-            )
+            raise export_again("has no line DATA at the end of its header, so the file is damaged", "points")
         words = data[offset:end].decode("latin-1").split()
         offset = end + 1
         if words and not words[0].startswith("#"):
@@ -86,9 +84,9 @@ def _header(data: bytes) -> tuple[np.dtype, int, str, bytes]:
         ):
             raise ValueError
     except (KeyError, TypeError, ValueError):
-        raise InputError(
-            f"the header is damaged (fields {excerpt(' '.join(names))}, data {excerpt(encoding)}): export "
-            "the points again."
+        raise export_again(
+            f"the header is damaged (fields {excerpt(' '.join(names))}, data {excerpt(encoding)})",
+            "points",
         ) from None
     return record, points, encoding, data[offset:]
 
@@ -121,7 +119,7 @@ def _decompressed(body: bytes, record: np.dtype, points: int) -> np.ndarray:
     packed, size = np.frombuffer(body[:8].ljust(8, b"\0"), "<u4").tolist()
     expected = points * record.itemsize
     if len(body) < 8 + packed:
-        raise InputError("ends within the compressed points, so it is truncated: export the points again.")
+        raise export_again("ends within the compressed points, so it is truncated", "points")
     if size != expected:
         raise InputError(
             f"declares {size} bytes of compressed points where the header requires {expected}, so the file "
@@ -170,5 +168,5 @@ def lzf_decompressed(packed: bytes, size: int) -> bytes:
     except IndexError:
         out = bytearray()
     if len(out) != size or at != len(packed):
-        raise InputError("contains damaged compressed points: export the points again.")
+        raise export_again("contains damaged compressed points", "points")
     return bytes(out)

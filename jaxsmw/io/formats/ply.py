@@ -19,7 +19,7 @@ from jaxsmw.io.formats.polygons import (
     texture_or_note,
     width_of,
 )
-from jaxsmw.io.formats.text import excerpt, is_number
+from jaxsmw.io.formats.text import damaged, excerpt, export_again, is_number
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, texture_at_corners, texture_of_corners
 
 _TYPES = {
@@ -64,9 +64,7 @@ def parse_ply(data: bytes) -> Polygons:
     newline = first[1]
     last = re.search(newline + rb"end_header[ \t]*" + newline, data)
     if last is None:
-        raise InputError(
-            "the header has no end_header line, so the file is truncated or damaged: export the mesh again."
-        )
+        raise export_again("the header has no end_header line, so the file is truncated or damaged")
     header = data[first.end() : last.start()].decode("latin-1").split(newline.decode())
     encoding, elements = _ply_header(header)
     body = data[last.end() :]
@@ -77,19 +75,17 @@ def parse_ply(data: bytes) -> Polygons:
         try:
             tables[name], offset = _ply_table(body, offset, count, properties)
         except EOFError:
-            raise InputError(
+            raise export_again(
                 f"the header declares {count} rows of {excerpt(name)}, but the file ends within these rows, "
-                "so the file is truncated or its header is wrong: export the mesh again."
+                "so the file is truncated or its header is wrong"
             ) from None
     if body[offset:].strip(b"\0 \t\r\n"):
-        raise InputError(
-            "continues after the last declared row, so the header is wrong: export the mesh again."
-        )
+        raise export_again("continues after the last declared row, so the header is wrong")
 
     vertex, face, strips = (tables.get(name, {}) for name in ("vertex", "face", "tristrips"))
     position = [vertex[axis].values for axis in "xyz" if axis in vertex and (vertex[axis].sizes == 1).all()]
     if len(position) < 3:
-        raise InputError("has no properties x, y and z for its vertices: export the mesh again.")
+        raise export_again("has no properties x, y and z for its vertices")
     corners, strip = (next((table[c] for c in _CORNERS if c in table), None) for table in (face, strips))
     if corners is None and elements.get("face", (0, {}))[0]:
         raise InputError("has no faces with vertex_indices: export the mesh again as a triangle mesh.")
@@ -119,7 +115,7 @@ def _binary(body: bytes) -> bytes:
     except ValueError:
         texts = (word.decode("latin-1") for word in words)
         culprit = excerpt(next(text for text in texts if not is_number(text, finite=False)))
-        raise InputError(f"{culprit} is written where a number should be: export the mesh again.") from None
+        raise export_again(f"{culprit} is written where a number should be") from None
 
 
 def _with_strips(polygons: Polygons, strips: _Column) -> Polygons:
@@ -188,9 +184,7 @@ def _texture(
         sizes, of_faces = of_corners.sizes[has_texture], faces.sizes[has_texture]
         width = int(sizes[0] // max(of_faces[0], 1))
         if width not in (2, 3) or (sizes != width * of_faces).any():
-            raise InputError(
-                "a face does not have two texture coordinates for each corner: export the mesh again."
-            )
+            raise export_again("a face does not have two texture coordinates for each corner")
         at_corners = np.full((len(corners), 2), np.nan)
         at_corners[np.repeat(has_texture, faces.sizes)] = of_corners.values.reshape(-1, width)[:, :2]
         return texture_of_corners(corners, at_corners)
@@ -209,9 +203,8 @@ def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _
     """Return the encoding, and a dictionary from element names to row counts and properties."""
     formats = [line.split()[1:] for line in lines if re.match(r"format(\s|$)", line)]
     if len(formats) != 1 or formats[0] not in [[encoding, "1.0"] for encoding in _BYTE_ORDERS]:
-        raise InputError(
-            f"the header does not name exactly one of the formats {', '.join(_BYTE_ORDERS)} in version "
-            "1.0: export the mesh again."
+        raise export_again(
+            f"the header does not name exactly one of the formats {', '.join(_BYTE_ORDERS)} in version 1.0"
         )
     encoding = formats[0][0]
 
@@ -239,9 +232,7 @@ def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _
             ):
                 properties[name] = _Property(number(kind), None, np.dtype(_TYPES[kind]))
             case _:
-                raise InputError(
-                    f"the header contains the invalid line {excerpt(line)}: export the mesh again."
-                )
+                raise export_again(f"the header contains the invalid line {excerpt(line)}")
     return encoding, elements
 
 
@@ -295,9 +286,7 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
                 raise EOFError
             written = np.frombuffer(body, length, 1, start)[0]
             if not 0 <= written <= len(body) or written % 1:
-                raise InputError(
-                    f"a list declares {written:.15g} numbers, so the file is damaged: export the mesh again."
-                )
+                raise damaged(f"a list declares {written:.15g} numbers")
             size = int(written)
         spans.append((offset, size))
         offset += size * kind.itemsize

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, width_of
-from jaxsmw.io.formats.text import DAMAGED, excerpt, numbers_of
+from jaxsmw.io.formats.text import damaged, excerpt, export_again, numbers_of
 from jaxsmw.io.formats.vtk_cells import (
     LINE,
     POLYGON,
@@ -55,14 +55,14 @@ class _Reader:
         self.position = 0
         version = re.match(r"# vtk DataFile Version (\d)\.\d+\s*$", self.raw_line() or "", re.IGNORECASE)
         if version is None:
-            raise InputError("does not begin with '# vtk DataFile Version': export the mesh again.")
+            raise export_again("does not begin with '# vtk DataFile Version'")
         self.major = int(version[1])
         if not 1 <= self.major <= 5:
             raise InputError(f"has the unknown version {version[1]}: save the mesh in version 5.1 or older.")
         self.raw_line()  # the title
         encoding = (self.raw_line() or "").strip().upper()
         if encoding not in ("ASCII", "BINARY"):
-            raise InputError(f"{excerpt(encoding)} is written where ASCII or BINARY should be, {DAMAGED}")
+            raise damaged(f"{excerpt(encoding)} is written where ASCII or BINARY should be")
         self.binary = encoding == "BINARY"
         self.points: np.ndarray | None = None
         self.cells: dict[str, Cells] = {}
@@ -79,13 +79,12 @@ class _Reader:
         cells = joined([self.cells[keyword] for keyword in (*_KINDS, "CELLS") if keyword in self.cells])
         if self.kinds is not None:
             if len(self.kinds) != len(cells.sizes):
-                raise InputError(
-                    f"has {count_of(len(cells.sizes), 'cell')}, but {len(self.kinds)} types of cells, "
-                    f"{DAMAGED}"
+                raise damaged(
+                    f"has {count_of(len(cells.sizes), 'cell')}, but {len(self.kinds)} types of cells"
                 )
             cells = cells._replace(kinds=self.kinds)
         elif "CELLS" in self.cells:
-            raise InputError(f"contains CELLS without CELL_TYPES, {DAMAGED}")
+            raise damaged("contains CELLS without CELL_TYPES")
         return polygons_of(
             self.points, cells, self.arrays["POINT_DATA"], self.arrays["CELL_DATA"], self.coordinates
         )
@@ -158,8 +157,8 @@ class _Reader:
 
     def refuse(self, words: list[str]) -> NoReturn:
         if not words:
-            raise InputError("ends early, so the file is truncated: export the mesh again.")
-        raise InputError(f"contains the invalid line {excerpt(' '.join(words))}, {DAMAGED}")
+            raise export_again("ends early, so the file is truncated")
+        raise damaged(f"contains the invalid line {excerpt(' '.join(words))}")
 
     def raw_line(self) -> str | None:
         """Return the next line, or None at the end of the file."""
@@ -206,13 +205,13 @@ class _Reader:
                 self.truncated(count)
             words += line.split()
         if len(words) > count:
-            raise InputError(f"continues after {count_of(count, 'number')}, {DAMAGED}")
+            raise damaged(f"continues after {count_of(count, 'number')}")
         return numbers_of(words, "u1" if kind == "bit" else kind)
 
     def truncated(self, count: int) -> NoReturn:
-        raise InputError(
+        raise export_again(
             f"declares {count_of(count, 'number')}, but the file ends within them, so the file is truncated "
-            "or damaged: export the mesh again."
+            "or damaged"
         )
 
     def skip_strings(self, count: int) -> None:
@@ -252,9 +251,8 @@ class _Reader:
             starts.append(position)
             position += int(stream[position]) + 1
         if position != size or len(starts) != count:
-            raise InputError(
-                f"declares {count_of(count, 'cell')} in {count_of(size, 'number')}, which contain other "
-                f"cells, {DAMAGED}"
+            raise damaged(
+                f"declares {count_of(count, 'cell')} in {count_of(size, 'number')}, which contain other cells"
             )
         is_corner = np.ones(size, dtype=bool)
         is_corner[starts] = False
@@ -263,7 +261,7 @@ class _Reader:
 
 def _count(word: str) -> int:
     if not re.fullmatch(r"\d{1,18}", word, re.ASCII):
-        raise InputError(f"{excerpt(word)} is written where a count should be, {DAMAGED}")
+        raise damaged(f"{excerpt(word)} is written where a count should be")
     return int(word)
 
 
