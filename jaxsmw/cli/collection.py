@@ -22,6 +22,8 @@ from jaxsmw.cli.collection_inputs import Meshes, check_collection, read_collecti
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import make_directory, remove_leftovers
+from jaxsmw.wording import count_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -137,7 +139,6 @@ def run(options: argparse.Namespace) -> None:
     with stopwatch.step("loading"):
         files = check_collection(options)
         from jaxsmw.collection.files import RESULT_DIRECTORIES, replace_results
-        from jaxsmw.runtime.files import make_directory, remove_leftovers
         from jaxsmw.runtime.provenance import claimed_directory
     with stopwatch.step("reading"):
         meshes = read_collection(options, files)
@@ -307,7 +308,6 @@ def _write(
 
 
 def _show(collection: Collection, model: ShapeModel, *, scale: bool) -> None:
-    from jaxsmw.wording import count_of
 
     for sentence in collection.sentences():
         show(sentence)

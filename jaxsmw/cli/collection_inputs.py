@@ -12,6 +12,8 @@ from jaxsmw.cli.arguments import option_of, refuse_without
 from jaxsmw.cli.console import report_progress, say
 from jaxsmw.cli.outputs import check_outputs
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import size_of_file
+from jaxsmw.wording import count_of
 
 if TYPE_CHECKING:
     from jaxsmw.io.landmarks import Landmarks
@@ -42,7 +44,6 @@ def check_collection(options: argparse.Namespace) -> dict[str, Path]:
     from jaxsmw.collection.files import RESULT_FILES
     from jaxsmw.io.landmark_files import check_readable_suffix
     from jaxsmw.io.meshes import check_mesh_suffix
-    from jaxsmw.runtime.files import size_of_file
 
     files = _mesh_files(options)
     refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_of")
@@ -74,7 +75,6 @@ def check_collection(options: argparse.Namespace) -> dict[str, Path]:
 def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
     """Return the paths of the mesh files that are not excluded, by their names and in alphabetical order."""
     from jaxsmw.io.meshes import MESH_SUFFIXES
-    from jaxsmw.wording import count_of
 
     directory = options.directory
     try:
