@@ -15,6 +15,7 @@ from jaxsmw.cli.console import report_progress, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
 from jaxsmw.cli.outputs import check_outputs
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import make_directory
 from jaxsmw.wording import count_of
 
 HELP = "match many pairs of a data set and measure the errors; an interrupted run can be continued"
@@ -124,7 +125,6 @@ def _measure(options: argparse.Namespace) -> None:
     from jaxsmw.benchmark.opponents.registry import find_methods, suited_methods
     from jaxsmw.benchmark.protocols import protocol_pairs
     from jaxsmw.benchmark.tables import markdown_table, write_tables
-    from jaxsmw.runtime.files import make_directory
     from jaxsmw.runtime.workers import open_executor
 
     data_set = open_data_set(options.data)

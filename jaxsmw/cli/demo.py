@@ -9,6 +9,7 @@ from jaxsmw.cli.console import Stopwatch, report_progress, show
 from jaxsmw.cli.measurement import estimate_error, show_match
 from jaxsmw.cli.method import add_method, check_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
+from jaxsmw.runtime.files import make_directory
 
 HELP = "generate a creature in two poses, match the poses and write a report"
 
@@ -50,7 +51,6 @@ def run(options: argparse.Namespace) -> None:
         from jaxsmw.evaluation.metrics import geodesic_error
         from jaxsmw.io.maps import write_pointwise_map
         from jaxsmw.io.meshes import write_mesh
-        from jaxsmw.runtime.files import make_directory
     report_progress("generating the creature ...")
     with stopwatch.step("creature"):
         pair = creature_pair(options.kind, vertices=options.vertices, seed=options.seed)

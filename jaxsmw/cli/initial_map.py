@@ -13,6 +13,7 @@ from jaxsmw.cli.arguments import path
 from jaxsmw.cli.console import report_progress, say
 from jaxsmw.cli.inputs import note_index_base
 from jaxsmw.errors import InputError
+from jaxsmw.wording import count_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -93,7 +94,6 @@ def _read_landmark_files(files: tuple[str, ...], mesh_x: Mesh, mesh_y: Mesh) -> 
     from jaxsmw.io.landmark_files import read_landmark_file
     from jaxsmw.io.landmarks import match_landmarks
     from jaxsmw.transfer.landmarks import landmark_vertices
-    from jaxsmw.wording import count_of
 
     both = [read_landmark_file(file) for file in files]
     matched = match_landmarks(*both)

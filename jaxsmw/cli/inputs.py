@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from jaxsmw.choices import IndexBase
 from jaxsmw.cli.console import report_progress, say
+from jaxsmw.runtime.files import size_of_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 def check_inputs(*paths: str | None) -> None:
     """Check that input files exist, before libraries are imported for a second."""
-    from jaxsmw.runtime.files import size_of_file
 
     for file in filter(None, paths):
         size_of_file(file)

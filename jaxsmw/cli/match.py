@@ -28,6 +28,7 @@ from jaxsmw.cli.measurement import (
 from jaxsmw.cli.method import add_method, check_method, match_meshes
 from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import atomic_write, make_directory
 
 if TYPE_CHECKING:
     import numpy as np
@@ -191,7 +192,6 @@ def _write_points(options: argparse.Namespace, correspondence: Correspondence, p
         report_written(options.surface_points)
     if options.texture:
         from jaxsmw.report.texture import TEXTURE_FILES, write_textured_pair
-        from jaxsmw.runtime.files import make_directory
 
         directory = make_directory(options.texture)
         write_textured_pair(directory, correspondence.mesh_x, correspondence.mesh_y, points)
@@ -213,8 +213,6 @@ def _write_overlap(file: str, correspondence: Correspondence, stopwatch: Stopwat
 def _write_numbers(file: str, numbers: Shaped[np.ndarray, " m"], form: str = "%.6f") -> None:
     """Write one number per line."""
     from numpy import savetxt
-
-    from jaxsmw.runtime.files import atomic_write
 
     with atomic_write(file) as temporary:
         savetxt(temporary, numbers, form)

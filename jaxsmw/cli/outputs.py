@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from jaxsmw.cli.console import Stopwatch, report_progress
 from jaxsmw.cli.method import preset_name
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import atomic_write, check_directory, check_writable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,7 +43,6 @@ def check_outputs(
     written = [*files, *figures, *pages]
     written += [os.path.join(directory, name) for directory, names in directories for name in names]
     _refuse_clashes(filter(None, inputs), written, [directory for directory, _ in directories])
-    from jaxsmw.runtime.files import check_directory, check_writable
 
     for path in files:
         check_writable(path)
@@ -117,7 +117,6 @@ def write_figure(path: str, figure: Figure) -> None:
 
 def write_text(path: str, text: str) -> None:
     """Write a text to a file."""
-    from jaxsmw.runtime.files import atomic_write
 
     with atomic_write(path) as temporary:
         temporary.write_text(text, "utf-8")

@@ -13,6 +13,7 @@ from jaxsmw.cli import benchmark, cache, collection, demo, evaluate, match, rend
 from jaxsmw.cli.arguments import add_quiet, shortened
 from jaxsmw.cli.console import flush_output, log_to_console, say, show
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import check_working_directory
 
 
 def run_command(arguments: Sequence[str]) -> int:
@@ -61,7 +62,6 @@ def _run(arguments: Sequence[str]) -> None:
     with warnings.catch_warnings():
         warnings.showwarning = show_once
         from jaxsmw.runtime.cache import cache_compiled_programs
-        from jaxsmw.runtime.files import check_working_directory
         from jaxsmw.runtime.memory import check_address_space
 
         check_address_space()

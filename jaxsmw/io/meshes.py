@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Int64, UInt8
 from numpy.typing import ArrayLike
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.point_cloud import triangulate_points
 from jaxsmw.io.formats.polygons import Polygons, texture_or_note, triangles_of
@@ -138,15 +138,13 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
             f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
             f"mesh to one of {', '.join(_WRITABLE | _ONLY_POINTS)}."
         )
-    try:
+    with naming(path):
         polygons = _parse(data, suffix, path.parent)
         is_strip = np.zeros(len(polygons.sizes), bool) if polygons.strips is None else polygons.strips
         at, polygon = triangles_of(polygons.sizes, is_strip)
         faces = polygons.corners[at]
         notes = [*polygons.notes, *_notes(polygons.sizes[~is_strip], polygons.lines, len(faces))]
         texture, lost = texture_or_note(lambda: _texture_at(polygons, at))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     face_data = {name: _repeated(values, polygon) for name, values in polygons.face_data.items()}
     if len(faces) or not len(polygons.vertices):
         mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
@@ -272,12 +270,9 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
 
     `read_mesh_data` lists the formats, and reads the same data from the file, in the precision of the format:
     float32 in STL and glTF files, and float64 in the other formats. Colours in OBJ files become floats.
-
     Vertices keep their order in all formats except STL. glTF files need one texture vertex per vertex, so
     vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
-    them again.
-
-    The write is atomic: an incomplete file never appears at `path`.
+    them again. The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 
@@ -286,18 +281,15 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
     - `data`: a `MeshData`. The file contains all triangles of `data.faces`, including triangles that cleaning
         dropped from `data.mesh`.
 
-    **Returns:** A tuple of sentences about the data that the format cannot hold. The tuple is empty if the
-    file contains everything. Only a `.npz` file can contain all data of any `MeshData`.
+    **Returns:** A tuple of sentences about the data that the format cannot hold, which is empty for `.npz`.
 
     **Raises:** `InputError` for another suffix, positions that the format cannot hold, or a file that cannot
     be written.
     """
     path = Path(path)
     check_mesh_suffix(path)
-    try:
+    with naming(path):
         content, notes = _function("format", path.suffix.lower())(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
     return notes

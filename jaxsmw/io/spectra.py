@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Float64
 from numpy.typing import ArrayLike
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh, to_host
 from jaxsmw.io.formats.mat import (
     FUNCTIONAL_MAP,
@@ -59,11 +59,10 @@ def make_spectrum(
 
     **Arguments:**
 
-    - `eigenvalues`: the eigenvalues (k,), ascending and not negative, in units of 1 / length². If
-        `eigenvectors` and `vertex_areas` are None, `eigenvalues` is instead a shape of another library. The
-        shape can be a `TriMesh` of pyFM after a call of its method `process`, or a shape of geomfum with an
-        eigenbasis. Any other object with the attributes `eigenvalues`, `eigenvectors` and `vertex_areas` is
-        also accepted.
+    - `eigenvalues`: the eigenvalues (k,), ascending and not negative, in units of 1 / length². If it is the
+        only argument, it is a shape of another library: a `TriMesh` of pyFM after a call of its method
+        `process`, a shape of geomfum with an eigenbasis, or any other object with the attributes
+        `eigenvalues`, `eigenvectors` and `vertex_areas`.
     - `eigenvectors`: the eigenvectors (n, k), in units of 1 / length, orthonormal with respect to the vertex
         areas.
     - `vertex_areas`: the vertex areas (n,), in units of length², or the lumped mass matrix (n, n), dense or
@@ -71,12 +70,12 @@ def make_spectrum(
     - `name`: the name of the spectrum in messages.
 
     **Returns:** A `Spectrum` of a surface of area 1, with `eigenvalues` (k,), `eigenvectors` (n, k),
-    `vertex_areas` (n,) and `mask` (n,). It has no descriptors, positions or normals. Its arrays have JAX's
+    `vertex_areas` (n,) and `mask` (n,), but without descriptors, positions and normals. Its arrays have JAX's
     default float type (float32 unless `jax_enable_x64` is set).
 
-    **Raises:** `InputError` if the arrays do not fit each other or are not finite real numbers. `InputError`
-    is also raised if the eigenvalues are negative or not ascending, a vertex area is negative, the
-    eigenvectors are not orthonormal, or an object of another library has no eigenbasis.
+    **Raises:** `InputError` if the arrays do not fit each other or are not finite real numbers, if
+    eigenvalues are negative or not ascending, a vertex area is negative, the eigenvectors are not
+    orthonormal, or an object of another library has no eigenbasis.
     """
     if eigenvectors is None and vertex_areas is None:
         eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues, name)
@@ -163,13 +162,10 @@ def _real(values: Any, what: str, name: str) -> np.ndarray:
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     """Read the eigenbasis of a shape from a `.mat` file or a `.npz` file (see `write_spectrum`).
 
-    **Arguments:**
-
-    - `path`: the file.
-        - A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,).
-        - A `.mat` file contains the following variables, or one struct with fields of these names. `evals`
-          (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are either
-          `A`, which is the lumped mass matrix (n, n) or its diagonal, or a list `area` (n).
+    A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,). A `.mat` file
+    contains the following variables, or one struct with fields of these names. `evals` (k) are the
+    eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are either `A`, which is the lumped
+    mass matrix (n, n) or its diagonal, or a list `area` (n).
 
     **Returns:** A `Spectrum`, as from `make_spectrum`.
 
@@ -180,8 +176,8 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     if is_mat_file(path):
         structs = find_structs(read_variables(path), "evals", "evecs")
         if len(structs) != 1:
-            found = f"{len(structs)} eigenbases ({', '.join(structs)})" if structs else "no evals and evecs"
-            raise InputError(f"{path}: contains {found}: save a single struct with evals and evecs.")
+            bases = f"{len(structs)} eigenbases ({', '.join(structs)})" if structs else "no evals and evecs"
+            raise InputError(f"{path}: contains {bases}: save a single struct with evals and evecs.")
         (struct,) = structs.values()
         return make_spectrum(struct["evals"], struct["evecs"], _areas_of(struct, name), name=name)
     if Path(path).suffix.lower() != ".npz":
@@ -189,10 +185,8 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
             f"{path}: spectra are read from .npz and .mat files: give a file of one of these types."
         )
     data = read_bytes(path, largest=None)
-    try:
+    with naming(path):
         arrays = read_arrays(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     fields = "eigenvalues", "eigenvectors", "vertex_areas"
     if missing := [field for field in fields if field not in arrays]:
         raise InputError(f"{path}: lacks {', '.join(missing)}: write the spectrum again.")
@@ -209,8 +203,8 @@ def _areas_of(struct: Mapping[str, Any], name: str) -> Any:
 def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh | None = None) -> None:
     """Write the spectrum of a shape to a `.npz` file, or as a struct `S` to a `.mat` file for MATLAB.
 
-    A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,). In a `.mat`
-    file, `S` has the following fields.
+    A `.npz` file contains the arrays that `read_spectrum` lists. In a `.mat` file, `S` has the following
+    fields.
 
     - `evals` (k) and `evecs` (n, k) are the eigenvalues and eigenvectors.
     - `A` (n, n) is the lumped mass matrix, as a sparse matrix.
@@ -226,9 +220,9 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
     **Arguments:**
 
     - `path`: the file to create or to replace. The suffix, `.npz` or `.mat`, determines the format.
-    - `spectrum`: a `Spectrum` (n vertices, k eigenvectors). The numbers in the file are in the unit of the
-        spectrum. The positions, normals, mask and descriptors of the spectrum are not written.
-    - `mesh`: the mesh of the spectrum (n vertices), or None. A `.npz` file does not contain the mesh.
+    - `spectrum`: a `Spectrum` (n vertices, k eigenvectors), whose positions, normals, mask and descriptors
+      are not written.
+    - `mesh`: the mesh of the spectrum (n vertices), or None.
 
     **Raises:** `InputError` for another suffix, a mesh with another number of vertices, or a file that cannot
     be written.
@@ -274,9 +268,7 @@ def check_spectrum_path(path: str | os.PathLike[str]) -> None:
 def read_functional_map(
     path: str | os.PathLike[str], spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> Float64[np.ndarray, "k_x k_y"]:
-    """Read a functional map from a `.mat` file.
-
-    The functional map is a pullback, which takes functions on Y to functions on X.
+    """Read a functional map, a pullback that takes functions on Y to functions on X, from a `.mat` file.
 
     **Arguments:**
 
@@ -289,8 +281,8 @@ def read_functional_map(
     this library only if the eigenbases of the file belong to surfaces of area 1. Otherwise, C must be
     multiplied by the factor that `make_spectrum` states.
 
-    **Raises:** `InputError` if the file cannot be read or contains no suitable matrix. `InputError` is also
-    raised if the matrix is too large for the spectra, or has entries that are not finite.
+    **Raises:** `InputError` if the file cannot be read or contains no suitable matrix, or if the matrix is
+    too large for the spectra or has entries that are not finite.
     """
     matrix = read_matrix(path, FUNCTIONAL_MAP)
     most = spectrum_x.eigenvalues.shape[0], spectrum_y.eigenvalues.shape[0]
@@ -315,8 +307,8 @@ def write_functional_map(
     **Arguments:**
 
     - `path`: the file to create or to replace, with the suffix `.mat`.
-    - `functional_map`: the pullback C (k_X, k_Y), which takes functions on Y to functions on X. C has no
-        unit. The eigenbases must belong to surfaces of area 1, as the spectra of this library do.
+    - `functional_map`: the pullback C (k_X, k_Y), without unit. The eigenbases must belong to surfaces of
+        area 1, as the spectra of this library do.
 
     **Raises:** `InputError` for another suffix, entries that are not finite real numbers, or a file that
     cannot be written.
