@@ -324,7 +324,7 @@ def sound(tmp_path_factory) -> dict[str, bytes]:
 
 
 @given(data=st.data())
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_damaged_files_are_read_or_refused(tmp_path_factory, sound, data):
     name = data.draw(st.sampled_from(sorted(sound)))
     content = sound[name]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 from messages import assert_names, refused
+from sampled_cases import first_always
 from synthetic import random_spectrum
 
 from jaxsmw.core.banks import CubicSpline, FilterBank, Meyer
@@ -185,9 +186,13 @@ def test_common_scale_does_not_matter(pair, factor):
     )
 
 
-@pytest.mark.parametrize("refiner", ALL_REFINERS.values(), ids=ALL_REFINERS)
-def test_padding_changes_nothing(pair, refiner):
+@pytest.mark.parametrize(
+    "name",
+    first_always(sorted(ALL_REFINERS, key=lambda name: name not in ("default", "regression")), always=2),
+)
+def test_padding_changes_nothing(pair, name):
     x, y, initial_map, _ = pair
+    refiner = ALL_REFINERS[name]
 
     def padded(spectrum: Spectrum, rows: int) -> Spectrum:
         return Spectrum(
