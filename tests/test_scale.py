@@ -39,7 +39,7 @@ def run(capsys):
 @pytest.fixture(scope="module")
 def body():
     """A body in two poses."""
-    return creature_pair(vertices=2500, seed=3)
+    return creature_pair(vertices=1500, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def part(body):
     return upper_part(body.source, 0.6), body.target
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 25.0])
+@pytest.mark.parametrize("scale", [1e-3, 25.0])
 def test_the_scale_of_a_part_is_found(part, scale):
     part, full = part
     found = estimate_scale(moved(part, scale), full)
