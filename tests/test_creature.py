@@ -21,8 +21,7 @@ from jaxsmw.creature import (
 )
 from jaxsmw.errors import InputError
 
-# The dragon takes the longest time to generate.
-KINDS = [pytest.param(kind, marks=pytest.mark.sampled) if kind == "dragon" else kind for kind in CREATURES]
+KINDS = first_always(CREATURES)
 
 
 @pytest.fixture(autouse=True, scope="module")

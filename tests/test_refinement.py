@@ -271,6 +271,7 @@ def test_refinement_iterates_on_samples_and_ends_on_all_vertices(pair):
         refine(x, y, initial_map, samples=(samples_x,))
 
 
+@pytest.mark.slow
 def test_refinement_can_start_and_end_on_samples(pair):
     x, y, initial_map, _ = pair
     generator = np.random.default_rng(1)

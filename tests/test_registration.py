@@ -249,6 +249,7 @@ def test_the_shapes_can_have_different_numbers_of_eigenvectors(pair):
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampled", first_always([True, False]))
 @pytest.mark.parametrize("refiner", [Registration((20, 30)), FeatureRegression((20, 30))])
 def test_both_maps_of_a_state_are_recovered_together(pair, refiner, sampled):

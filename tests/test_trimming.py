@@ -157,6 +157,7 @@ def test_the_trimmed_stage_is_the_last_stage_with_lower_levels(pose, part):
         assert trimmed_stage(other, replace(TRIMMED, repair=settings)) is None
 
 
+@pytest.mark.slow
 def test_full_shapes_and_parts_of_similar_area_are_not_trimmed(pose, part):
     source, target, truth = pose
     same = nearest(part, part.vertices)
@@ -166,6 +167,7 @@ def test_full_shapes_and_parts_of_similar_area_are_not_trimmed(pose, part):
         assert np.asarray(found.spectrum_y.mask).sum() == meshes[1].referenced_vertices.sum()
 
 
+@pytest.mark.slow
 def test_all_trims_share_one_program_that_is_compiled_ahead(pose, part, compilations):
     _, target, truth = pose
     twice = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=2))
