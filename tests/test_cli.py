@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import scipy.io
 import trimesh
-from command_line import COMMANDS, SMALL, Outcome, assert_refused, runner, write_pair
+from command_line import COMMANDS, SMALL, Outcome, assert_refused, write_pair
 from messages import assert_names
 from sampled_cases import first_always
 from scipy.spatial import KDTree
@@ -47,11 +47,6 @@ from jaxsmw.report.texture import TEXTURE_FILES
 from jaxsmw.wording import percentage
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
-
-
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
 
 
 @pytest.fixture(scope="module")

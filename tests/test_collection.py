@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import assert_refused, runner
+from command_line import assert_refused
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
@@ -377,11 +377,6 @@ def test_real_people_through_the_template(shared):
 
 
 # ----------------------------------------------------------------------------------------------- the command
-
-
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
 
 
 @pytest.fixture(scope="module")

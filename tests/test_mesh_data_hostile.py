@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
-from command_line import assert_refused, runner, write_pair
+from command_line import assert_refused, write_pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mesh_samples import sample
@@ -240,11 +240,6 @@ def test_textures_that_cannot_be_read_are_left_out(tmp_path, name):
     assert data.mesh.faces.tolist() == [[0, 1, 2]] and data.texture is None
     (note,) = (note for note in data.mesh.notes if "texture" in note)
     assert fault in note and note.endswith(".")
-
-
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import SMALL, assert_refused, runner
+from command_line import SMALL, assert_refused
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
@@ -29,11 +29,6 @@ def upper_part(mesh: Mesh, share: float) -> Mesh:
 def moved(mesh: Mesh, scale: float) -> Mesh:
     rotation = Rotation.random(random_state=5).as_matrix()
     return replace(mesh, vertices=scale * mesh.vertices @ rotation.T + [5, -3, 100])
-
-
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
 
 
 @pytest.fixture(scope="module")
