@@ -568,7 +568,7 @@ def test_the_digest_covers_all_code_that_results_depend_on():
 @pytest.mark.parametrize(("target", "share"), [("b", "1 of 2 pairs"), ("c", "1 given pairs")])
 def test_the_summary_says_whether_pairs_belong_to_the_list_of_the_data_set(target, share):
     """The list of a remeshed set contains pairs of one class only, but a given list may contain others."""
-    pairs = [SimpleNamespace(source="a", target=name) for name in ("b", "d")]
+    pairs = [SimpleNamespace(names=("a", name)) for name in ("b", "d")]
     results = SimpleNamespace(rows=[{"source": "a", "target": target, "machine": "a machine"}], failures=[])
     data_set = SimpleNamespace(pairs=pairs, layout="a set")
     assert _introduction(data_set, results, Settings("shot")).startswith(share)

@@ -28,8 +28,8 @@ from jaxsmw.core.banks import LowPass
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.creature import creature
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.executor import SpectralPair, Start, run_batches
 from jaxsmw.matching.search.chirality import Decision
 from jaxsmw.matching.stages import PRESETS, Preset, Stage

@@ -14,8 +14,8 @@ from synthetic import grid_mesh
 
 from jaxsmw import InputError, read_mesh
 from jaxsmw.benchmark.datasets import DataSet, open_data_set, read_pairs
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.io.meshes import write_mesh
 
 VERTICES, FACES = grid_mesh(4, 5)

@@ -16,7 +16,8 @@ from jaxsmw.evaluation.ground_truth import (
     write_ground_truth,
 )
 from jaxsmw.evaluation.metrics import GeodesicError, coverage, geodesic_error
-from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
+from jaxsmw.geometry.geodesics import geodesic_distances
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.io.maps import read_landmarks, read_pointwise_map, write_pointwise_map
 
 # X has 4 vertices and 2 faces. Y has 9 vertices and 8 faces.

@@ -4,9 +4,10 @@ from synthetic import body_with_arms, sphere_mesh
 
 from jaxsmw import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
+from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.search.proxies import Proxy, extremities, plausible_pairings
 
 

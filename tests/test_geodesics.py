@@ -10,12 +10,8 @@ from synthetic import grid_mesh, sphere_mesh
 
 from jaxsmw import InputError, Mesh, make_mesh, read_mesh
 from jaxsmw.geometry import geodesics
-from jaxsmw.geometry.geodesics import (
-    SurfacePoints,
-    geodesic_distances,
-    geodesic_distances_between,
-    geodesic_graph,
-)
+from jaxsmw.geometry.geodesics import geodesic_distances, geodesic_distances_between, geodesic_graph
+from jaxsmw.geometry.surface_points import SurfacePoints
 
 
 @pytest.fixture(autouse=True)

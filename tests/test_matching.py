@@ -26,8 +26,8 @@ from jaxsmw.creature import creature_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching import preparation
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import reverse_map

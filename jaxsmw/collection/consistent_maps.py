@@ -12,7 +12,7 @@ from jaxsmw.collection.consistency import Edge, estimate_edge_errors
 from jaxsmw.collection.edges import EdgeMap
 from jaxsmw.collection.result import MatchedEdge
 from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
-from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.preparation import PreparedShape
 
 # Lengths are in units of the square root of the area of each shape. Table R26 is in `docs/research_log.md`.
@@ -37,7 +37,6 @@ class ConsistentMaps:
 
     **Attributes:**
 
-    - `shapes`: the N shapes.
     - `maps`: the map of each edge. An edge whose match failed has no map.
     - `network`: the shapes, the maps and their estimated errors.
     - `template`: the index of the template in `shapes`.
@@ -45,7 +44,6 @@ class ConsistentMaps:
     - `cycle_errors`: the error of each triangle of edges (c,), in units of the square root of the area.
     """
 
-    shapes: Sequence[PreparedShape]
     maps: Mapping[Edge, EdgeMap]
     network: Network
     template: int
@@ -74,7 +72,7 @@ class ConsistentMaps:
         errors = np.maximum(estimated, prior / 2) + distorted
         network = Network(meshes, points, dict(zip(maps, errors.tolist(), strict=True)))
         medoid = network.medoid()
-        return cls(shapes, maps, network, medoid, synchronize(network, medoid), cycle_errors)
+        return cls(maps, network, medoid, synchronize(network, medoid), cycle_errors)
 
     def through(self, template: int) -> ConsistentMaps:
         """Return the consistent maps through another template."""

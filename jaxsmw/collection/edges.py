@@ -22,7 +22,7 @@ from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.pairs import match_many, prepare_task
 from jaxsmw.collection.shapes import preset_key, shape_key
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.preparation import DescriptorAxes, PreparedShape
 from jaxsmw.matching.stages import Preset

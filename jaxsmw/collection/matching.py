@@ -20,9 +20,9 @@ from jaxsmw.collection.result import Collection
 from jaxsmw.collection.shapes import describe_shapes, prepare_usable_shapes
 from jaxsmw.errors import InputError, check_choice, check_number, check_whole_number
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
 from jaxsmw.geometry.shortcuts import points_on_uncut
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.preparation import PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.runtime.batches import check_devices

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64, Int64
 
 from jaxsmw.collection.shape_models import ShapeModel, shape_model
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.preparation import DescriptorAxes
 from jaxsmw.transfer.registered_mesh import RegisteredMesh, register_mesh
 from jaxsmw.wording import count_of

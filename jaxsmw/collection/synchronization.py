@@ -13,11 +13,11 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from jaxsmw.collection.consistency import Edge
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.geometry.surface_points import SurfacePoints
+from jaxsmw.runtime.batches import pad_rows, padded_size
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
 
 # Lengths are in units of the square root of the area of each shape. Table R26 is in `docs/research_log.md`.
 # Each iteration averages the points on every shape. (Table R26)

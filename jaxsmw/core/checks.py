@@ -52,6 +52,21 @@ def check_kind(name: str, value: object, *kinds: type) -> None:
     raise TypeError(f"the {name} is {shown}, but {needed} is needed")
 
 
+def check_pointwise_map(name: str, pointwise_map: Array | np.ndarray, number_of_vertices: int) -> None:
+    """Check that a map has one integer per vertex of X.
+
+    **Raises:** `ValueError` if the map has another shape; `TypeError` if it is not an array of integers.
+    """
+    check_kind(name, pointwise_map, np.ndarray, jax.Array)
+    if pointwise_map.shape != (number_of_vertices,):
+        raise ValueError(
+            f"the {name} has shape {pointwise_map.shape}, but X has {number_of_vertices} vertices: give one "
+            "vertex of Y for each vertex of X"
+        )
+    if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
+        raise TypeError(f"the {name} has type {pointwise_map.dtype}, but integer vertex indices are needed")
+
+
 def check_between(
     owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
 ) -> None:

@@ -6,7 +6,7 @@ import jax
 from jaxtyping import Array, Float, Int, Int32
 
 from jaxsmw.choices import Search
-from jaxsmw.core.functional_map import Convention, out_and_in
+from jaxsmw.core.functional_map import Convention, FunctionalMap, out_and_in
 from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.search import Patches, make_patches, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
@@ -14,35 +14,29 @@ from jaxsmw.core.triangles import nearest_point_on_triangles
 
 
 def spectral_embeddings(
-    functional_map: Float[Array, "k_out k_in"],
+    functional_map: FunctionalMap,
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     *,
     convention: Convention = "pullback",
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Return spectral embeddings of X and Y: point sets in which matched vertices are close to each other.
+    """Return the points of X (m, d) and of Y (n, d) in which `decode` searches, of unit 1 / length.
 
-    In the pullback convention, the points of X are the rows of `Phi_X`, and the points of Y are the rows of
-    `Phi_Y C^T`. In the pushforward convention, the points of X are the rows of `Phi_X C^T`, and the points of
-    Y are the rows of `Phi_Y`.
+    In the pullback convention, the points are the rows of `Phi_X` and of `Phi_Y C^T`. In the pushforward
+    convention, they are the rows of `Phi_X C^T` and of `Phi_Y`.
 
-    The convention matters because a filtered functional map shortens the vectors that it maps. The search
-    finds the nearest point of Y (the database) for each point of X (a query). In the pushforward convention,
-    C shrinks the queries, and a few points of the database with small norms are then nearest to most queries.
-    In the pullback convention, C shrinks the database, which hardly changes the order of the distances from a
-    query. On real shapes, refinement with filtering therefore succeeds only in the pullback convention.
-
-    **Arguments:** as in `decode`.
-
-    **Returns:** The points of X (m, d) and of Y (n, d), where d is the number of rows of C. The coordinates
-    have the unit of the eigenvectors, which is 1 / length.
+    The convention matters because a filtered functional map shortens the vectors that it maps. In the
+    pushforward convention, C shrinks the points of X (the queries), and a few points of Y with small norms
+    are then nearest to most queries. In the pullback convention, C shrinks the points of Y, which hardly
+    changes the order of the distances from a query. On real shapes, refinement with filtering therefore
+    succeeds only in the pullback convention.
     """
     rows_out, rows_in = out_and_in(convention, spectrum_x.eigenvectors, spectrum_y.eigenvectors)
     return out_and_in(convention, rows_out, product(rows_in, functional_map.T))
 
 
 def decode(
-    functional_map: Float[Array, "k_out k_in"],
+    functional_map: FunctionalMap,
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     *,
@@ -70,7 +64,7 @@ def decode(
 
 
 def decode_to_triangles(
-    functional_map: Float[Array, "k_out k_in"],
+    functional_map: FunctionalMap,
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     faces_y: Int[Array, "f 3"],
@@ -81,17 +75,12 @@ def decode_to_triangles(
 
     The method is that of Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The
     triangles of Y span a surface in the space of the `spectral_embeddings`. Each vertex of X is mapped to the
-    nearest point of this surface.
+    nearest point of this surface. Unlike with `decode`, functions on Y therefore stay smooth when they are
+    transferred to a finer X. For shapes of 5000 vertices, the function takes about one second, ten times as
+    long as `decode`. The time grows with the product of the numbers of vertices.
 
-    If X is finer than Y, `decode` maps several neighbouring vertices of X to the same vertex of Y. With this
-    function, textures and other functions on Y stay smooth when they are transferred to X. For shapes of 5000
-    vertices, it takes about one second, ten times as long as `decode` without patches. The time grows with
-    the number of vertices of X times the number of vertices of Y.
-
-    **Arguments:**
-
-    - `functional_map`, `spectrum_x`, `spectrum_y`, `convention`: as in `decode`.
-    - `faces_y`: (f, 3), the triangles of Y, as vertex indices from 0 to n - 1.
+    The arguments are those of `decode`, and the triangles `faces_y` (f, 3), as vertex indices from 0 to n -
+    1.
 
     **Returns:** The triangle of Y for each vertex of X, as a 0-based row of `faces_y` (m,), and the
     barycentric weights of its corners (m, 3), which are non-negative and sum to 1.

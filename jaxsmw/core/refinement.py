@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.choices import ITERATIONS
-from jaxsmw.core.checks import all_finite, check_kind, counts_iterations
+from jaxsmw.core.checks import all_finite, check_kind, check_pointwise_map, counts_iterations
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, Samples, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where
@@ -120,9 +120,8 @@ def refine(
     """Refine a pointwise map T: X -> Y by alternating between functional maps and pointwise maps.
 
     The loop is Algorithm 1 of the MWP paper, generalised to any refiner. The function is pure and
-    jit-compiled. JAX compiles it again only when sizes or static settings change. For many pairs of equal
-    size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For pairs of different sizes, use
-    `jaxsmw.refine_pairs`.
+    jit-compiled. For many pairs of equal size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For
+    pairs of different sizes, use `jaxsmw.refine_pairs`.
 
     If samples are given, only the first functional map and the last pointwise map are computed from all
     vertices, as in the fast variant of the MWP authors' program. `starts_on_samples` and `ends_on_samples`
@@ -296,7 +295,7 @@ def _check_arguments(
 ) -> None:
     check_kind("refiner", refiner, Refiner)
     check_spectra(spectrum_x, spectrum_y)
-    check_kind("initial map", pointwise_map, np.ndarray, jax.Array)
+    check_pointwise_map("initial map", pointwise_map, len(spectrum_x.mask))
     if samples is not None:
         if not isinstance(samples, tuple) or len(samples) != 2:
             raise ValueError(
@@ -305,15 +304,6 @@ def _check_arguments(
             )
         check_kind("samples of X", samples[0], np.ndarray, jax.Array)
         check_kind("samples of Y", samples[1], np.ndarray, jax.Array)
-    if pointwise_map.shape != spectrum_x.mask.shape:
-        raise ValueError(
-            f"the initial map has shape {pointwise_map.shape}, but X has {len(spectrum_x.mask)} vertices: "
-            "give one vertex of Y for each vertex of X"
-        )
-    if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
-        raise TypeError(
-            f"the initial map has type {pointwise_map.dtype}, but its entries must be integer vertex indices"
-        )
 
 
 def check_samples_use(refiner: Refiner, sampled: bool, starts: bool, ends: bool) -> None:

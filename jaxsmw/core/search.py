@@ -47,18 +47,17 @@ def nearest_neighbor(
 ) -> Int32[Array, " m"]:
     """Return, for each query, the index of the database row that is nearest in Euclidean distance.
 
-    The search compares every query with every row, and it is exact up to rounding errors. If several database
-    rows are identical, the search returns the lowest of their indices. The queries are processed in blocks,
-    so no array of size m x n is stored.
+    The search compares every query with every row, and it is exact up to rounding errors. Of several
+    identical database rows, the first is returned. The queries are processed in blocks, so no array of size m
+    x n is stored.
 
     The score of a database row b for a query q is `q·b - |b|²/2`, which is largest for the nearest row. The
-    search finds the two chunks of database rows with the best scores, and the best row in each of these
-    chunks. The search then compares the distances from the query to these two rows, because scores have large
-    rounding errors if `|b|` is large compared to the distance.
+    search compares the distances to the best rows of the two chunks of rows with the best scores, because
+    scores have large rounding errors if `|b|` is large compared to the distance.
 
     **Arguments:**
 
-    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
+    - `queries`, `database`: query points (m, d) and database points (n, d), in the same unit.
     - `database_mask`: a Boolean array (n,), False for rows that are never chosen; at least one must be True.
       With None (the default), all rows can be chosen.
 
@@ -214,15 +213,14 @@ def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: 
     """Divide points into patches of equal size by repeated halving. Their number is a power of two.
 
     The function halves each group of points along the coordinate with the largest variance, among the first 6
-    coordinates. The patches of a region come from one group of an earlier halving.
+    coordinates. The first eigenvectors of a surface vary slowly, so neighbouring vertices have similar
+    coordinates.
 
     **Arguments:**
 
-    - `points`: the points (n, d), such as the rows of the matrix of eigenvectors. The first eigenvectors vary
-      slowly over the surface, so neighbouring vertices have similar coordinates.
+    - `points`: the points (n, d), such as the rows of the matrix of eigenvectors.
     - `mask`: a Boolean array (n,), False for points that are ignored.
-    - `size`: the desired number of points per patch. The actual number is 0.7 to 1.4 times the desired
-      number.
+    - `size`: the desired number of points per patch. The actual number is 0.7 to 1.4 times this number.
     - `rank`: the number r of `variations` per patch; 0 for patches of queries, which need no variations.
     """
     n = points.shape[0]
@@ -315,27 +313,20 @@ def nearest_neighbor_in_patches(
 ) -> Int32[Array, " m"]:
     """Return the same indices as `nearest_neighbor`, but skip patches that are too far away.
 
-    Each patch of the database has a bounding box with r axes through the centre of the patch. The box also
-    has a radius: the largest distance from a point of the patch to the space that the axes span. The box
-    gives a lower bound on the distances from a query to the points of the patch, by only r + 1 scalar
-    products. Each region has such a box as well.
+    Each patch of the database has a bounding box with r axes through its centre, and a radius: the largest
+    distance from a point of the patch to the space that the axes span. The box gives a lower bound on the
+    distances from a query to the points of the patch, by only r + 1 scalar products. Each region has such a
+    box as well.
 
     For each query, a point in the region with the nearest box is the first candidate. A region is too far
     away if its lower bound exceeds the distance to this candidate. In the other regions, a point of the patch
     with the nearest box is the second candidate. A patch is too far away if its lower bound exceeds the
-    distance to the nearer candidate. For each patch of queries, the search skips the regions and the patches
-    that are too far away from every query. The bounds allow for rounding errors, so no nearest point is
-    skipped. If the points are spread evenly in all dimensions, the search skips no patch, and
-    `nearest_neighbor` is faster.
+    distance to the nearer candidate. For each patch of queries, the search skips what is too far away from
+    every query. The bounds allow for rounding errors, so no nearest point is skipped. If the points are
+    spread evenly in all dimensions, nothing is skipped, and `nearest_neighbor` is faster.
 
-    **Arguments:**
-
-    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
-    - `query_patches`, `database_patches`: the results of `make_patches` for the queries and for the database.
-      Patches remain valid if a linear map is applied to their points. Masked points of the database are never
-      chosen. The results for masked queries are meaningless.
-
-    **Returns:** One index from 0 to n - 1 per query, (m,).
+    The patches are the results of `make_patches`. They remain valid if a linear map is applied to their
+    points. Masked points of the database are never chosen. The results for masked queries are meaningless.
     """
     found, _ = search_in_patches(queries, database, query_patches, database_patches)
     return found

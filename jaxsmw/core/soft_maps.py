@@ -183,14 +183,13 @@ class Recovery(eqx.Module):
         """
 
 
-class Softmax(Recovery):
-    """A recovery in which each query gives shares to all database rows, and larger shares to nearer rows.
+class _Tempered(Recovery):
+    """A recovery with a temperature."""
 
-    The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
-    `distance` is the distance between the query and the row; see `Recovery`. The result is a `SoftMap`.
-    """
-
-    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
+    @property
+    @abc.abstractmethod
+    def temperature(self) -> Float[Array, ""]:
+        """The temperature, in the unit that `Recovery` describes."""
 
     def __check_init__(self) -> None:
         check_between(self, "temperature", self.temperature)
@@ -201,14 +200,30 @@ class Softmax(Recovery):
         database: Float[Array, "n d"],
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
-    ) -> SoftMap:
-        transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
+    ) -> SoftMap | SparseSoftMap:
+        return self.map_from(_normalized(queries, database, query_areas, database_areas, self.temperature))
+
+    @abc.abstractmethod
+    def map_from(self, transport: _Transport) -> SoftMap | SparseSoftMap:
+        """Return the soft map of scaled inputs."""
+
+
+class Softmax(_Tempered):
+    """A recovery in which each query gives shares to all database rows, and larger shares to nearer rows.
+
+    The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
+    `distance` is the distance between the query and the row; see `Recovery`. The result is a `SoftMap`.
+    """
+
+    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
+
+    def map_from(self, transport: _Transport) -> SoftMap:
         b = transport.database_areas
         unknown, no_iterations = jnp.asarray(jnp.nan, b.dtype), jnp.asarray(0, jnp.int32)
         return transport.soft_map(jnp.zeros_like(b), unknown, jnp.asarray(False), no_iterations)
 
 
-class NearestFew(Recovery):
+class NearestFew(_Tempered):
     """A recovery in which each query gives shares only to its nearest database rows.
 
     The shares of these rows are those of `Softmax`. They are differentiable, but derivatives treat the choice
@@ -226,19 +241,11 @@ class NearestFew(Recovery):
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
 
     def __check_init__(self) -> None:
-        check_between(self, "temperature", self.temperature)
         check_kind("number", self.number, int, np.integer)
         if self.number < 1:
             raise ValueError(f"NearestFew needs at least 1 row, not {self.number}")
 
-    def __call__(
-        self,
-        queries: Float[Array, "m d"],
-        database: Float[Array, "n d"],
-        query_areas: Float[Array, " m"],
-        database_areas: Float[Array, " n"],
-    ) -> SparseSoftMap:
-        transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
+    def map_from(self, transport: _Transport) -> SparseSoftMap:
         queries, database, _, b, temperature = transport
         settled_queries, settled = lax.stop_gradient((queries, database))
         unit = jnp.asarray(1, queries.dtype)
@@ -254,7 +261,7 @@ class NearestFew(Recovery):
         return SparseSoftMap(rows, jax.nn.softmax(exponents + _log(b)[rows], axis=1))
 
 
-class Sinkhorn(Recovery):
+class Sinkhorn(_Tempered):
     """A recovery by entropy-regularised optimal transport, which preserves the areas of database rows.
 
     The function `sinkhorn` computes the `SoftMap`. If the iterations end before they reach the tolerance, no
@@ -271,7 +278,6 @@ class Sinkhorn(Recovery):
     tolerance: float = eqx.field(static=True, default=0.01)
 
     def __check_init__(self) -> None:
-        check_between(self, "temperature", self.temperature)
         check_kind("iterations", self.iterations, int, np.integer)
         if self.iterations < 1 or not self.tolerance > 0:
             raise ValueError(
@@ -279,22 +285,8 @@ class Sinkhorn(Recovery):
                 f"{self.tolerance}"
             )
 
-    def __call__(
-        self,
-        queries: Float[Array, "m d"],
-        database: Float[Array, "n d"],
-        query_areas: Float[Array, " m"],
-        database_areas: Float[Array, " n"],
-    ) -> SoftMap:
-        return sinkhorn(
-            queries,
-            database,
-            query_areas=query_areas,
-            database_areas=database_areas,
-            temperature=self.temperature,
-            iterations=self.iterations,
-            tolerance=self.tolerance,
-        )
+    def map_from(self, transport: _Transport) -> SoftMap:
+        return _sinkhorn_map(transport, self.iterations, self.tolerance)
 
 
 def sinkhorn(
@@ -344,9 +336,7 @@ def sinkhorn(
     if iterations < 1:
         raise ValueError(f"sinkhorn needs at least 1 iteration, not {iterations}")
     arrays = map(jnp.asarray, (queries, database, query_areas, database_areas, temperature))
-    transport = _normalized(*arrays)
-    potentials, residual, done = _sinkhorn_potentials(transport, iterations, tolerance)
-    return transport.soft_map(potentials, residual, residual <= tolerance, done)
+    return _sinkhorn_map(_normalized(*arrays), iterations, tolerance)
 
 
 class _SinkhornState(NamedTuple):
@@ -358,10 +348,7 @@ class _SinkhornState(NamedTuple):
     iterations: Int32[Array, ""]
 
 
-def _sinkhorn_potentials(
-    transport: _Transport, iterations: int, tolerance: float | Float[Array, ""]
-) -> tuple[Float[Array, " n"], Float[Array, ""], Int32[Array, ""]]:
-    """Return the potentials of `sinkhorn`, their residual, and the number of iterations."""
+def _sinkhorn_map(transport: _Transport, iterations: int, tolerance: float | Float[Array, ""]) -> SoftMap:
     queries, database, a, b, temperature = transport
     dtype, (m, d) = queries.dtype, queries.shape
     log_b, rest = _log(b), -m % _BLOCK
@@ -394,7 +381,7 @@ def _sinkhorn_potentials(
     zeros = jnp.zeros_like(b)
     initial = _SinkhornState(zeros, zeros, jnp.asarray(jnp.inf, dtype), jnp.asarray(0, jnp.int32))
     last, _ = lax.scan(step, initial, None, length=iterations)
-    return last.potentials, last.residual, last.iterations
+    return transport.soft_map(last.potentials, last.residual, last.residual <= tolerance, last.iterations)
 
 
 def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:

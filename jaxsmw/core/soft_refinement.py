@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.checks import check_kind, check_option, counts_iterations
+from jaxsmw.core.functional_map import FunctionalMap
 from jaxsmw.core.refinement import check_spectra, checked, diagnose
 from jaxsmw.core.refiner import Problem, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -21,7 +22,7 @@ from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, Spar
 from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
-Step = Callable[[Float[Array, "k_out k_in"]], tuple[Float[Array, "k_out k_in"], RESULTS]]
+Step = Callable[[FunctionalMap], tuple[FunctionalMap, RESULTS]]
 """A function that takes a functional map, and returns the next functional map and a status code."""
 
 
@@ -41,7 +42,7 @@ class SoftRefinement(eqx.Module):
       C. The change is 0 at a fixed point.
     """
 
-    functional_map: Float[Array, "k_out k_in"]
+    functional_map: FunctionalMap
     soft_map: SoftMap | SparseSoftMap
     result: RESULTS
     iterations: Int32[Array, ""]
@@ -111,11 +112,11 @@ def refine_softly(
     first, result = refiner.update(prepared, pointwise_map, None)
     first_result = checked(first, result)
 
-    def recover(functional_map: Float[Array, "k_out k_in"]) -> SoftMap | SparseSoftMap:
+    def recover(functional_map: FunctionalMap) -> SoftMap | SparseSoftMap:
         points = refiner.embeddings(prepared, State(functional_map))
         return recovery(*points, *_areas(spectrum_x, spectrum_y))
 
-    def step(functional_map: Float[Array, "k_out k_in"]) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+    def step(functional_map: FunctionalMap) -> tuple[FunctionalMap, RESULTS]:
         following, how = refiner.update(prepared, recover(functional_map), State(functional_map))
         return following.functional_map, checked(following, how)
 
@@ -226,14 +227,14 @@ def _areas(*spectra: Spectrum) -> Iterator[Float[Array, " n"]]:
 class _Iterated(NamedTuple):
     """The final functional map, its last change, the status code, and the number of iterations."""
 
-    functional_map: Float[Array, "k_out k_in"]
-    last_change: Float[Array, "k_out k_in"]
+    functional_map: FunctionalMap
+    last_change: FunctionalMap
     result: RESULTS
     iterations: Int32[Array, ""]
 
 
 def _through_iterations(
-    step: Step, first: Float[Array, "k_out k_in"], first_result: RESULTS, iterations: int
+    step: Step, first: FunctionalMap, first_result: RESULTS, iterations: int
 ) -> _Iterated:
     """Run a fixed number of iterations. Derivatives are computed through all iterations."""
 
@@ -246,9 +247,7 @@ def _through_iterations(
     return _Iterated(last, last - previous, result, jnp.asarray(iterations, jnp.int32))
 
 
-def _to_the_fixed_point(
-    step: Step, first: Float[Array, "k_out k_in"], iterations: int, tolerance: float
-) -> _Iterated:
+def _to_the_fixed_point(step: Step, first: FunctionalMap, iterations: int, tolerance: float) -> _Iterated:
     """Iterate up to the fixed point. Derivatives are computed by the implicit function theorem."""
     last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
     # The fixed-point solver returns neither the status code of an update nor the last change of the
@@ -259,11 +258,8 @@ def _to_the_fixed_point(
 
 
 def _fixed_point(
-    step: Callable[[Float[Array, "k_out k_in"]], Float[Array, "k_out k_in"]],
-    first: Float[Array, "k_out k_in"],
-    iterations: int,
-    tolerance: float,
-) -> tuple[Float[Array, "k_out k_in"], Int32[Array, ""], Bool[Array, ""]]:
+    step: Callable[[FunctionalMap], FunctionalMap], first: FunctionalMap, iterations: int, tolerance: float
+) -> tuple[FunctionalMap, Int32[Array, ""], Bool[Array, ""]]:
     """Return the fixed point of a step, the number of iterations, and whether the iterations converged."""
     # These imports are local because they take as long as the computation of an eigenbasis.
     import lineax as lx
@@ -274,7 +270,7 @@ def _fixed_point(
     # set.
     unit = lax.stop_gradient(jnp.max(jnp.abs(first)))
 
-    def scaled_step(scaled: Float[Array, "k_out k_in"], _: None) -> Float[Array, "k_out k_in"]:
+    def scaled_step(scaled: FunctionalMap, _: None) -> FunctionalMap:
         return (step(scaled.astype(first.dtype) * unit) / unit).astype(float)
 
     solution: optx.Solution = optx.fixed_point(
@@ -291,9 +287,7 @@ def _fixed_point(
 
 
 @jax.custom_jvp
-def _differentiable_if(
-    converged: Bool[Array, ""], functional_map: Float[Array, "k_out k_in"]
-) -> Float[Array, "k_out k_in"]:
+def _differentiable_if(converged: Bool[Array, ""], functional_map: FunctionalMap) -> FunctionalMap:
     """Return the functional map, with NaN derivatives unless it is a fixed point."""
     return functional_map
 

@@ -14,7 +14,6 @@ on average.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -28,6 +27,7 @@ from jaxsmw.choices import GeodesicMethod
 from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.arrays import ranges, ratio, sides_of
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints, check_points
 from jaxsmw.runtime.cache import cached
 
 # A straight line of the graph may cross at most this number of edges of the mesh.
@@ -45,44 +45,6 @@ _RADII = (0.01, 0.05, 0.25)
 
 # libigl may never finish if the height of a triangle is less than this fraction of its longest edge.
 _EXACT_HEIGHT = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class SurfacePoints:
-    """Points on the faces of a mesh, given by barycentric weights.
-
-    `len(points)` is the number p of points, and `points[rows]` selects points by 0-based indices. Functions
-    that receive `SurfacePoints` check them; the constructor does not.
-
-    **Attributes:**
-
-    - `faces`: the face of each point, as 0-based indices (p,) into `Mesh.faces`, int64.
-    - `weights`: the barycentric weights (p, 3) of the three corners of the face, float64. The weights are at
-      least 0, and each row sums to 1.
-    """
-
-    faces: Int64[np.ndarray, " p"]
-    weights: Float64[np.ndarray, "p 3"]
-
-    def __len__(self) -> int:
-        return len(self.faces)
-
-    def __getitem__(self, rows: Int[np.ndarray, " q"]) -> SurfacePoints:
-        return SurfacePoints(self.faces[rows], self.weights[rows])
-
-    def positions(self, mesh: Mesh) -> Float64[np.ndarray, "p 3"]:
-        """Return the positions (p, 3) of the points in space, in the unit of their mesh."""
-        return self.interpolate(mesh.vertices, mesh)
-
-    def interpolate(self, values: Float64[np.ndarray, "n x"], mesh: Mesh) -> Float64[np.ndarray, "p x"]:
-        """Return the values at the points (p, x), given the values at the n vertices of the mesh."""
-        return np.einsum("pk,pkx->px", self.weights, values[mesh.faces[self.faces]])
-
-    def nearest_corners(self, mesh: Mesh) -> Int64[np.ndarray, " p"]:
-        """Return for each point the nearest corner of its face, as a vertex (p,)."""
-        corners = mesh.faces[self.faces]
-        distances = np.linalg.norm(mesh.vertices[corners] - self.positions(mesh)[:, None], axis=2)
-        return corners[np.arange(len(corners)), distances.argmin(axis=1)]
 
 
 class _Sides(NamedTuple):
@@ -194,6 +156,22 @@ class _Lines(NamedTuple):
     origins: Int[np.ndarray, " l"]
     ends: Int[np.ndarray, " l"]
     lengths: Float64[np.ndarray, " l"]
+
+    def distances(
+        self,
+        to_vertices: Float64[np.ndarray, "s n"],
+        sources: Int64[np.ndarray, " q"],
+        points: Int64[np.ndarray, " q"],
+    ) -> Float64[np.ndarray, " q"]:
+        """Return the distances from `sources[i]` to the origin `points[i]`, given those to all vertices.
+
+        The origins must be ascending. A path ends with a line to one of them, in the opposite direction.
+        """
+        start = np.searchsorted(self.origins, points)
+        counts = np.searchsorted(self.origins, points, side="right") - start
+        pair, line = ranges(start, counts)
+        lengths = to_vertices[sources[pair], self.ends[line]] + self.lengths[line]
+        return np.minimum.reduceat(lengths, np.cumsum(counts) - counts)
 
 
 def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.ndarray, depth: int) -> _Lines:
@@ -333,7 +311,7 @@ def geodesic_distances_between(
     if isinstance(starts, SurfacePoints) and isinstance(ends, SurfacePoints):
         distances = _straight_distances(mesh, starts, ends)
     graph, nodes = _network(mesh, starts)
-    arrivals = _arrivals(mesh, ends)
+    arrivals = _lines_from(mesh, ends)
     at_once = max(1, _DISTANCES_AT_ONCE // graph.shape[0])
     pending = np.argsort(nodes, kind="stable")
     for radius in [*(np.sqrt(mesh.area) * np.array(_RADII)), np.inf]:
@@ -390,52 +368,25 @@ def _network(
     if not isinstance(points, SurfacePoints):
         return graph, points
     coordinates = graph.tocoo()
-    number, vertices, lengths = _lines_from_points(mesh, points)
+    added = _lines_from(mesh, points)
     lines = (
         _Lines(coordinates.row, coordinates.col, coordinates.data),
-        _Lines(size + number, vertices, lengths),
+        added._replace(origins=size + added.origins),
     )
     return _shortest(lines, size + len(points)), size + np.arange(len(points))
 
 
-def _lines_from_points(mesh: Mesh, points: SurfacePoints) -> _Lines:
-    """Return straight lines from points on faces to vertices; an origin is the number of a point."""
+def _lines_from(mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints) -> _Lines:
+    """Return straight lines from points to vertices, with the numbers of the points as origins, ascending."""
+    if not isinstance(points, SurfacePoints):
+        return _Lines(np.arange(len(points)), points, np.zeros(len(points)))
     corners, sides = mesh.faces[points.faces], _sides(mesh)
     offsets = mesh.vertices[corners] - points.positions(mesh)[:, None]
     number = np.repeat(np.arange(len(points)), 3)
     near = _Lines(number, corners.ravel(), np.linalg.norm(offsets, axis=2).ravel())
     far = _lines(sides, *_exits(sides, points), _DEPTH)
-    return _Lines(*(np.concatenate(part) for part in zip(near, far, strict=True)))
-
-
-class _Arrivals(NamedTuple):
-    """The last lines of paths to points: those of point i are numbered `first[i]` to `first[i + 1] - 1`."""
-
-    first: Int64[np.ndarray, " p1"]
-    vertices: Int64[np.ndarray, " l"]
-    lengths: Float64[np.ndarray, " l"]
-
-    def distances(
-        self,
-        to_vertices: Float64[np.ndarray, "s n"],
-        sources: Int64[np.ndarray, " q"],
-        points: Int64[np.ndarray, " q"],
-    ) -> Float64[np.ndarray, " q"]:
-        """Return the distances from `sources[i]` to `points[i]`, given those to all vertices (s, n)."""
-        counts = self.first[points + 1] - self.first[points]
-        pair, line = ranges(self.first[points], counts)
-        lengths = to_vertices[sources[pair], self.vertices[line]] + self.lengths[line]
-        return np.minimum.reduceat(lengths, np.cumsum(counts) - counts)
-
-
-def _arrivals(mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints) -> _Arrivals:
-    """Return the last lines of the paths to points; a vertex is reached from itself by a line of length 0."""
-    if not isinstance(points, SurfacePoints):
-        return _Arrivals(np.arange(len(points) + 1), points, np.zeros(len(points)))
-    number, vertices, lengths = _lines_from_points(mesh, points)
-    order = np.argsort(number, kind="stable")
-    first = np.searchsorted(number[order], np.arange(len(points) + 1))
-    return _Arrivals(first, vertices[order], lengths[order])
+    order = np.argsort(np.concatenate([near.origins, far.origins]), kind="stable")
+    return _Lines(*(np.concatenate(part)[order] for part in zip(near, far, strict=True)))
 
 
 def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
@@ -473,57 +424,3 @@ def _vertices(points: Int64[np.ndarray, " p"] | SurfacePoints) -> Int64[np.ndarr
             "method='strips'."
         )
     return points
-
-
-def check_points(
-    points: ArrayLike | SurfacePoints, mesh: Mesh, name: str
-) -> Int64[np.ndarray, " p"] | SurfacePoints:
-    """Check that vertex indices or `SurfacePoints` (p,) belong to a mesh. Return indices as int64.
-
-    `name` is the name of the points in error messages.
-
-    **Raises:** `InputError` if a vertex or face does not exist, or barycentric weights are negative or do not
-    sum to 1.
-    """
-    if not isinstance(points, SurfacePoints):
-        return check_indices(points, len(mesh.vertices), f"{name} on {mesh.name}: vertex")
-    return check_surface_points(points, mesh, name)
-
-
-def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> SurfacePoints:
-    """Check that `SurfacePoints` belong to a mesh; see `check_points`."""
-    faces = check_indices(points.faces, len(mesh.faces), f"{name} on {mesh.name}: face")
-    with np.errstate(invalid="ignore"):  # comparisons with NaN are false
-        good = (points.weights >= 0).all(axis=1) & (np.abs(points.weights.sum(axis=1) - 1) < 1e-6)
-    if not good.all():
-        at = int(good.argmin())
-        raise InputError(
-            f"{name} on {mesh.name}: number {at} has the barycentric weights {points.weights[at].tolist()}, "
-            "which must be at least 0 and sum to 1: correct the weights, or divide them by their sum."
-        )
-    return SurfacePoints(faces, points.weights)
-
-
-def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray, " p"]:
-    """Check that values are indices (p,) from 0 to `count` - 1. Return them as int64.
-
-    `name` is the text before the word "indices" in error messages, such as "vertex".
-
-    **Raises:** `InputError` if the values are not a list of integers in this range, or if some are masked.
-    """
-    if np.ma.is_masked(values):
-        raise InputError(f"{name} indices are masked in part: fill in or remove the masked indices.")
-    indices = np.asarray(values)
-    if indices.ndim != 1 or indices.dtype.kind not in "iu":
-        raise InputError(
-            f"{name} indices must be a list of integers, but are {indices.dtype.name} of shape "
-            f"{indices.shape}: give one index for each point."
-        )
-    outside = (indices < 0) | (indices >= count)
-    if outside.any():
-        at = int(outside.argmax())
-        cure = "subtract 1, because they seem to count from 1" if indices.max() == count else "correct it"
-        raise InputError(
-            f"{name} indices must lie between 0 and {count - 1}, but entry {at} is {indices[at]}: {cure}."
-        )
-    return indices.astype(np.int64)

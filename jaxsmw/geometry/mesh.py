@@ -112,10 +112,7 @@ class Mesh:
     def average(
         self, values: Float[np.ndarray, "n ..."] | Bool[np.ndarray, " n"]
     ) -> Float[np.ndarray, " ..."] | np.floating:
-        """Return the area-weighted mean of values at the vertices (n, ...), in the unit of the values.
-
-        The mean of a mask is the share of the area in which the mask is True.
-        """
+        """Return the area-weighted mean of values at the vertices (n, ...), or the share of a mask's area."""
         return np.average(values, axis=0, weights=self.vertex_areas)
 
     @cached_property
@@ -229,11 +226,7 @@ class Mesh:
     def faces_around(
         self, vertices: Int64[np.ndarray, " q"]
     ) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, " p"]]:
-        """Return all faces around each given vertex.
-
-        **Returns:** Two arrays (p,) with one entry per pair of a given vertex and a face around it. The first
-        array contains indices into `vertices`, and the second array contains indices of faces.
-        """
+        """Return all pairs of a given vertex and a face around it: rows of `vertices` (p,) and faces (p,)."""
         faces = np.argsort(self.faces.ravel(), kind="stable") // 3
         counts = np.bincount(self.faces.ravel(), minlength=len(self.vertices))
         first = np.cumsum(counts) - counts

@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.sparse import csgraph, csr_array
 
 from jaxsmw.geometry.arrays import sides_of, unit_vectors
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, components_of_faces, connected_components
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.scans import in_small_components
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.wording import count_of
 
 logger = logging.getLogger("jaxsmw")

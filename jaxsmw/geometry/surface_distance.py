@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.geometry.arrays import ratio
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 
 # If more than this share of the nearest triangles face away from the given normals, the triangles are not
 # oriented consistently.

@@ -20,8 +20,8 @@ from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
-from jaxsmw.geometry.geodesics import SurfacePoints, check_indices
 from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
+from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map
 from jaxsmw.matching.executor import SpectralPair, Start, embeddings, nearest_points, reverse_map
 from jaxsmw.matching.judge import Scored, estimate_error, overlap, wrong_probability
 from jaxsmw.matching.pair import Pair
@@ -325,13 +325,7 @@ class Correspondence:
         if reverse_map is None:
             reverse = self.reverse_map()
         else:
-            name = f"map to {self.mesh_x.name}: vertex"
-            reverse = check_indices(reverse_map, len(self.mesh_x.vertices), name)
-            if len(reverse) != len(self.mesh_y.vertices):
-                raise InputError(
-                    f"{self.mesh_y.name}: the reverse map has {len(reverse)} entries for "
-                    f"{len(self.mesh_y.vertices)} vertices: give one vertex of X for each vertex."
-                )
+            reverse = check_pointwise_map(reverse_map, self.mesh_y, self.mesh_x, "reverse map")
         return (
             overlap(self.pair, self.pointwise_map, reverse),
             overlap(self.pair.reversed(), reverse, self.pointwise_map),

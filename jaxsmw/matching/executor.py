@@ -23,9 +23,8 @@ from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_candidates
 from jaxsmw.matching.stages import Stage
-from jaxsmw.runtime.batches import refine_pairs
+from jaxsmw.runtime.batches import pad_rows, padded_size, refine_pairs
 from jaxsmw.runtime.compilation import compile_ahead, compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
 
 # Shapes with more vertices than this number are not padded, because padding would need too much memory.
 _PADDED_UP_TO = 50_000

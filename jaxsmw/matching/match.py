@@ -25,9 +25,9 @@ from jaxsmw.choices import (
     Scale,
 )
 from jaxsmw.errors import check_choice
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike
 from jaxsmw.geometry.scans import SMALL_CLOSED
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import Outcome, Start, compile_stage
 from jaxsmw.matching.judge import Scored, discontinuous_parts, estimate_error, orientation_reversal

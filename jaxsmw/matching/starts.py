@@ -19,9 +19,10 @@ from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.alignment import align_rigidly
-from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points, geodesic_distances
+from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import poisson_disk_samples
+from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, check_surface_points
 from jaxsmw.matching.executor import Start, nearest_rows
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -139,20 +140,15 @@ def _finite(prepared: PreparedPair, name: str, features: _Features) -> _Features
 
 def _checked_map(pair: Pair, init: ArrayLike) -> Int64[np.ndarray, " m"]:
     mesh_x, mesh_y = pair.meshes
-    given = check_indices(init, len(mesh_y.vertices), f"initial map on {mesh_y.name}: vertex")
-    if len(given) != (m := len(mesh_x.vertices)):
-        raise InputError(
-            f"the initial map has {len(given)} entries, but {mesh_x.name} has {m} vertices: give one entry "
-            "for each vertex."
-        )
-    unused = ~mesh_y.referenced_vertices[given] & mesh_x.referenced_vertices
+    matches = check_pointwise_map(init, mesh_x, mesh_y, "initial map")
+    unused = ~mesh_y.referenced_vertices[matches] & mesh_x.referenced_vertices
     if unused.any():
         raise InputError(
             f"the initial map sends {unused.sum()} vertices to vertices of {mesh_y.name} that are in no "
-            f"face, for example vertex {np.flatnonzero(unused)[0]} to vertex {given[unused][0]}: choose "
-            "vertices in faces."
+            f"face, for example vertex {np.flatnonzero(unused)[0]} to vertex {matches[unused][0]}: "
+            "choose vertices in faces."
         )
-    return given
+    return matches
 
 
 def _shot_features(prepared: PreparedPair) -> _Features:

@@ -13,22 +13,45 @@ import numpy as np
 from jax import lax
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int, Int32
+from jaxtyping import Array, Int, Int32, Shaped
 
+from jaxsmw.core.checks import check_pointwise_map
 from jaxsmw.core.refinement import Refinement, RefineSettings, refine
-from jaxsmw.core.search import queries_per_block
+from jaxsmw.core.search import BLOCK, queries_per_block
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import one_blas_thread
 
 # In scripts/benchmark_batches.py, larger batches save no time on any tested device.
 _LARGEST_BATCH = 64
 # The assumed memory, in bytes, of a device that does not report its memory.
 _USUAL_MEMORY = 8 * 2**30
+# A padded size is a multiple of `power / _SUBDIVISION`, where `power` is the largest power of two below the
+# number of vertices. Every padded size is also a multiple of the block size of the search. At most 1/8 of the
+# vertices of a padded shape are padding if the padded size is at least 1024. Shapes with 4000 to 16 000
+# vertices have only 17 different padded sizes.
+_SUBDIVISION = 8
 
 Tree = TypeVar("Tree")
+
+
+def padded_size(number_of_vertices: int) -> int:
+    """Return the number of vertices to which a shape is padded.
+
+    One compiled program serves all shapes with the same padded size.
+    """
+    power = 2 ** max(number_of_vertices - 1, 1).bit_length() // 2
+    step = max(power // _SUBDIVISION, BLOCK)
+    return -(-number_of_vertices // step) * step
+
+
+def pad_rows(rows: Shaped[np.ndarray, "n ..."], number_of_rows: int) -> Shaped[np.ndarray, "p ..."]:
+    """Return an array (n, ...) extended by rows of zeros to a given number of rows.
+
+    `number_of_rows` must be at least n.
+    """
+    return np.pad(rows, ((0, number_of_rows - len(rows)), *((0, 0),) * (rows.ndim - 1)))
 
 
 def stack(spectra: Sequence[Spectrum]) -> Spectrum:
@@ -170,17 +193,7 @@ def _check_pairs(
                 f"pair {position} is {tuple(pair)}, but there are {len(spectra)} shapes: give the indices of "
                 "two shapes, counted from 0"
             )
-        if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
-            raise InputError(
-                f"the initial map of pair {position} has type {pointwise_map.dtype}: give integer vertex "
-                "indices"
-            )
-        vertices = spectra[pair[0]].mask.shape
-        if pointwise_map.shape != vertices:
-            raise InputError(
-                f"the initial map of pair {position} has shape {pointwise_map.shape}, but X has "
-                f"{vertices[0]} vertices: give one vertex of Y for each vertex of X"
-            )
+        check_pointwise_map(f"initial map of pair {position}", pointwise_map, len(spectra[pair[0]].mask))
 
 
 class _Sizes(NamedTuple):

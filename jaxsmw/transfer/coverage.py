@@ -30,11 +30,9 @@ class Attraction(NamedTuple):
     positions: Float64[np.ndarray, "c 3"]
 
     def matrix(self) -> csr_array:
-        """The quadratic term (m, m) of the weighted squared distances."""
         return csr_array(self.interpolation.T @ (diags_array(self.weights) @ self.interpolation))
 
     def right_side(self) -> Float64[np.ndarray, "m 3"]:
-        """The linear term of the weighted squared distances."""
         return self.interpolation.T @ (self.weights[:, None] * self.positions)
 
 

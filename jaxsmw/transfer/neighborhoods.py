@@ -49,13 +49,7 @@ class Similarities(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Neighborhoods:
-    """The edges of a mesh that is scaled by the factor `size`. The edges have positive weights.
-
-    **Attributes:**
-
-    - `mesh`: the mesh, with n vertices and e edges.
-    - `size`: the factor by which lengths of the mesh are multiplied.
-    """
+    """The edges of a mesh (n vertices, e edges), with its lengths multiplied by the factor `size`."""
 
     mesh: Mesh
     size: float = 1.0
@@ -67,7 +61,7 @@ class Neighborhoods:
 
     @cached_property
     def vectors(self) -> Float64[np.ndarray, "e 3"]:
-        """The vector of each edge of the scaled mesh, from the edge's second vertex to its first vertex."""
+        """The vector of each edge of the scaled mesh, from its second vertex to its first vertex."""
         return self.size * self.differences(self.mesh.vertices)
 
     @cached_property

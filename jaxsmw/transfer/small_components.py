@@ -63,11 +63,7 @@ def follow_surroundings(
     counterpart, and its vertices are matched to the nearest vertices of the counterpart. The vertices of
     other components are matched to the nearest vertices of Y that have faces.
 
-    **Arguments:**
-
-    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
-    - `positions`: the positions of the vertices of X on Y (m, 3), in the unit of Y.
-    - `similarities`: the transformations of the vertices that take X to these positions.
+    `positions` (m, 3) are those of the vertices of X on Y, in the unit of Y, to which `similarities` take X.
 
     **Returns:** The positions (m, 3) and the transformations of all vertices, where vertices that have faces
     keep theirs; the matches (m,) of the vertices of small components, as vertices of Y, and -1 for all
@@ -119,7 +115,7 @@ def match_small_components(
     - `scale`: the factor from lengths on X to lengths on Y.
 
     **Returns:** The map (m,), in which only the vertices without faces have new matches, and the share of X's
-    area that has no counterpart. Without small components, the map is returned unchanged.
+    area that has no counterpart.
     """
     if not len(mesh_x.small_faces):
         return pointwise_map, 0.0

@@ -112,14 +112,9 @@ class Method(abc.ABC):
 
     def check(self, pairs: Sequence[DataPair]) -> None:
         """Raise `InputError` if the method cannot match a pair. A benchmark checks all pairs at first."""
-        if self.full_only and any(pair.partial for pair in pairs):
-            raise InputError(
-                f"{self.reference}: cannot match partial shapes: remove this method from --methods."
-            )
-        if self.partial_only and not all(pair.partial for pair in pairs):
-            raise InputError(
-                f"{self.reference}: matches partial shapes only: remove this method from --methods."
-            )
+        if not self.suits(pairs):
+            fault = "cannot match partial shapes" if self.full_only else "matches partial shapes only"
+            raise InputError(f"{self.reference}: {fault}: remove this method from --methods.")
 
     def suits(self, pairs: Sequence[DataPair]) -> bool:
         """Return whether the method can match all pairs. Unlike `check`, `suits` does not look for files."""

@@ -56,9 +56,9 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
+from jaxsmw.runtime.batches import pad_rows
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows
 
 # The slope of the sigmoid, and the largest filter value that counts as zero.
 _SLOPE, _NEGLIGIBLE = 0.2, 1e-3
@@ -309,7 +309,7 @@ def _best_matches(
     ]
     random = Rotation.random(proposals - 1, rng=seed).as_matrix() if proposals > 1 else []
     poses = [_aligned(sampled, rotation) for rotation in (np.eye(3), *random)]
-    best = min(poses, key=lambda pose: pose.energy).matches
+    best, _ = min(poses, key=lambda pose: pose[1])
     shells, few = (x.shell(last), y.shell(last)), sampled[-1]
     return _Matches(
         _extended(*shells, *few, best.forward), _extended(*shells[::-1], *few[::-1], best.backward)
@@ -326,15 +326,10 @@ def _extended(
     )
 
 
-class _Pose(NamedTuple):
-    """The matches of the samples after alignment from an initial pose, and their energy."""
-
-    energy: float
-    matches: _Matches
-
-
-def _aligned(sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndarray, "3 3"]) -> _Pose:
-    """Align the shells of the samples, level by level, after a rotation of X."""
+def _aligned(
+    sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndarray, "3 3"]
+) -> tuple[_Matches, float]:
+    """Align the shells of the samples after a rotation of X. Return the matches and their energy."""
 
     # The rotation of X is known, so the deformation need not estimate rotations (our choice). The deformation
     # is near to the rotated shell in the same Dirichlet energy as in `_refined`.
@@ -365,7 +360,7 @@ def _aligned(sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndar
             (x, y), moved(x, y, matches.forward, rotation), moved(y, x, matches.backward, rotation.T)
         )
         matches = space.matches()
-    return _Pose(space.energy(matches), matches)
+    return matches, space.energy(matches)
 
 
 def _refined(

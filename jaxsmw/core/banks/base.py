@@ -9,6 +9,10 @@ from jaxtyping import Array, Float
 
 from jaxsmw.core.checks import check_integer
 
+Points = Float[Array, " p"]
+Eigenvalues = Float[Array, " k"]
+Responses = Float[Array, "filters p"]
+
 
 class FilterBank(eqx.Module):
     """The base class of filter banks (a scaling function g_0 and wavelet filters g_1 … g_L).
@@ -23,9 +27,7 @@ class FilterBank(eqx.Module):
     """
 
     @abc.abstractmethod
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         """Return the responses of all filters at the given points of the eigenvalue axis.
 
         **Arguments:**
@@ -38,9 +40,7 @@ class FilterBank(eqx.Module):
         """
 
 
-def sample_bank(
-    bank: FilterBank, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-) -> Float[Array, "filters p"]:
+def sample_bank(bank: FilterBank, points: Points, eigenvalues: Eigenvalues) -> Responses:
     """Return the responses (filters, p) of a bank, which can be a user's.
 
     **Raises:** `ValueError` if the responses are not of shape (filters, p).

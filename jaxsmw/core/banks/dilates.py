@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmw.core.banks.base import FilterBank, check_number_of_filters
+from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, check_number_of_filters
 from jaxsmw.core.checks import as_parameter, check_between
 
 
@@ -32,9 +32,7 @@ class _LogSpacedDilates(FilterBank):
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
         """Return the scaling function at `scaled`, which is `ratio * lambda / lambda_max`."""
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         relative, ratio = points / eigenvalues[-1], jnp.asarray(self.ratio, points.dtype)
         # The scales are in units of 1 / lambda_max.
         scales = (2 * ratio) ** jnp.linspace(1, 0, self.filters - 1, dtype=points.dtype)
@@ -111,8 +109,6 @@ class Heat(FilterBank):
         if not self.times.size:
             raise ValueError("the times of Heat must be a list of at least one time")
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         relative = points / eigenvalues[-1]
         return jnp.exp(-jnp.asarray(self.times, points.dtype)[:, None] * relative[None, :])

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmw.core.banks.base import FilterBank, sample_bank
+from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, sample_bank
 from jaxsmw.core.checks import as_parameter, check_option
 
 
@@ -36,7 +36,7 @@ class FrameBounds(NamedTuple):
 
 def frame_bounds(
     bank: FilterBank,
-    eigenvalues: Float[Array, " k"],
+    eigenvalues: Eigenvalues,
     *,
     over: Literal["eigenvalues", "interval"] = "eigenvalues",
     resolution: int = 10_001,
@@ -48,13 +48,12 @@ def frame_bounds(
     - `bank`: the filter bank, a `FilterBank`.
     - `eigenvalues`: (k,), the eigenvalues of a shape, ascending, in any unit. The last eigenvalue is
       lambda_max.
-    - `over`: `"eigenvalues"` (the default) evaluates G at the given eigenvalues. The bounds then apply to
-      every linear combination of the corresponding eigenvectors. `"interval"` evaluates G at evenly spaced
-      points of [0, lambda_max]. If the bank depends only on lambda_max, these bounds hold for every shape
-      with this lambda_max.
+    - `over`: `"eigenvalues"` (the default) evaluates G at the given eigenvalues, so the bounds apply to the
+      span of their eigenvectors. `"interval"` evaluates G at evenly spaced points of [0, lambda_max]. If the
+      bank depends only on lambda_max, these bounds hold for every shape with this lambda_max.
     - `resolution`: the number of points of `"interval"`, at least 2, by default 10 001. With a point spacing
       h, the error of a bound is at most `h² max|G''| / 8`, or `h max|G'| / 2` at a kink of G. With the
-      default resolution, the relative error is below 1e-5 for the banks of this package with up to 8 filters.
+      default, the relative error is below 1e-5 for the banks of this package with up to 8 filters.
 
     **Raises:** `ValueError` if `over` is unknown, if `resolution` is below 2 with `over="interval"`, or if
     the bank returns responses that are not of shape (filters, points).
@@ -74,9 +73,7 @@ class Tightened(FilterBank):
 
     bank: FilterBank
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         responses = self.bank(points, eigenvalues)
         # Division by the largest response prevents underflow of the squares. This divisor cancels in
         # `scaled / sqrt(frame)`.
@@ -153,9 +150,7 @@ class SoftmaxFrame(FilterBank):
         points = jnp.linspace(0, 1, knots)
         return cls(2 * jnp.log(jnp.maximum(jnp.abs(sample_bank(bank, points, points)), floor)))
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         knots = jnp.linspace(0, 1, self.logits.shape[1], dtype=points.dtype)
         relative, logits = points / eigenvalues[-1], self.logits.astype(points.dtype)
         heights = jax.vmap(lambda z: jnp.interp(relative, knots, z))(logits)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsmw.core.banks.base import FilterBank, check_number_of_filters
+from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, check_number_of_filters
 from jaxsmw.core.checks import as_parameter, check_between, check_integer
 
 
@@ -22,14 +22,10 @@ class _Transitions(FilterBank):
     """
 
     @abc.abstractmethod
-    def transitions(
-        self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
-    ) -> Float[Array, "wavelets p"]:
+    def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
         """Return the angle of each transition, divided by pi / 2. The quotient rises from 0 to 1."""
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         theta = jnp.pi / 2 * self.transitions(points, eigenvalues[-1])
         fall, rise = jnp.cos(theta), jnp.sin(theta)
         return jnp.concatenate([fall[:1], rise[:-1] * fall[1:], rise[-1:]])
@@ -50,9 +46,7 @@ class _DyadicBands(_Transitions):
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
         """Return `theta / (pi / 2)`, which rises from 0 to 1 as `ramp` rises from 0 to 1."""
 
-    def transitions(
-        self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
-    ) -> Float[Array, "wavelets p"]:
+    def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
         # The limit of 100 octaves prevents overflow of `2.0**octaves`. It does not change the responses,
         # because no positive eigenvalue is 100 octaves below lambda_max.
         octaves = np.minimum(np.arange(self.filters - 1, 0, -1), 100)
@@ -112,9 +106,7 @@ class _TwoBands(_Transitions):
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
         """Return `theta / (pi / 2)` for each value of `excess`, which is `lambda / edge - 1`."""
 
-    def transitions(
-        self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
-    ) -> Float[Array, "wavelets p"]:
+    def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
         edge = lambda_max * jnp.asarray(self.edge, points.dtype)
         return self.profile(points / edge - 1)[None, :]
 
@@ -188,9 +180,7 @@ class Regular(_Transitions):
         if self.degree < 0:
             raise ValueError(f"the degree of Regular cannot be negative, but is {self.degree}")
 
-    def transitions(
-        self, points: Float[Array, " p"], lambda_max: Float[Array, ""]
-    ) -> Float[Array, "wavelets p"]:
+    def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
         sine = jnp.clip(2 * points / lambda_max - 1, -1, 1)
         for _ in range(self.degree):
             sine = jnp.sin(jnp.pi / 2 * sine)
@@ -220,9 +210,7 @@ class ExponentialWindow(FilterBank):
         check_between(self, "edge", self.edge)
         check_between(self, "slope", self.slope)
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         edge, slope = (jnp.asarray(leaf, points.dtype) for leaf in (self.edge, self.slope))
         # Clipping excludes u = 0 and u = 1, where an exponent is infinite and has no gradient.
         tiny = jnp.finfo(points.dtype).eps
@@ -246,9 +234,7 @@ class LowPass(FilterBank):
     def __check_init__(self) -> None:
         check_between(self, "edge", self.edge, high=1.0)
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         edge = eigenvalues[-1] * jnp.asarray(self.edge, points.dtype)
         # Beyond twice the edge, this sine is exactly zero, but the equivalent `cos(pi / 2)` has a rounding
         # error.
@@ -261,7 +247,5 @@ class Identity(FilterBank):
     The bank is a Parseval frame and has no arguments.
     """
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         return jnp.ones_like(points)[None, :]

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmw.core.banks.base import FilterBank, check_number_of_filters
+from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, check_number_of_filters
 from jaxsmw.core.checks import as_parameter, check_between, check_integer
 
 
@@ -24,12 +24,10 @@ class _UniformTranslates(FilterBank):
         check_number_of_filters(self, self.filters, self.overlap)
 
     @abc.abstractmethod
-    def window(self, position: Float[Array, "filters p"]) -> Float[Array, "filters p"]:
+    def window(self, position: Float[Array, "filters p"]) -> Responses:
         """Return the window at positions in (-1/2, 1/2), which are in units of the window's width."""
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         steps = points / eigenvalues[-1] * (self.filters - self.overlap + 1)
         centres = jnp.arange(self.filters, dtype=points.dtype) + (1 - self.overlap / 2)
         position = (steps[None, :] - centres[:, None]) / self.overlap
@@ -55,7 +53,7 @@ class Itersine(_UniformTranslates):
         if self.overlap < 2 or self.overlap % 2:
             raise ValueError(f"the overlap of Itersine must be even and positive, not {self.overlap}")
 
-    def window(self, position: Float[Array, "filters p"]) -> Float[Array, "filters p"]:
+    def window(self, position: Float[Array, "filters p"]) -> Responses:
         return math.sqrt(2 / self.overlap) * jnp.sin(jnp.pi / 2 * jnp.cos(jnp.pi * position) ** 2)
 
 
@@ -78,7 +76,7 @@ class HalfCosine(_UniformTranslates):
         if self.overlap < 3:
             raise ValueError(f"the overlap of HalfCosine must be at least 3, not {self.overlap}")
 
-    def window(self, position: Float[Array, "filters p"]) -> Float[Array, "filters p"]:
+    def window(self, position: Float[Array, "filters p"]) -> Responses:
         return math.sqrt(8 / (3 * self.overlap)) * jnp.cos(jnp.pi * position) ** 2
 
 
@@ -103,9 +101,7 @@ class Gabor(FilterBank):
         check_number_of_filters(self, self.filters, 2)
         check_between(self, "width", self.width)
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         steps = points / eigenvalues[-1] * (self.filters - 1)
         centres = jnp.arange(self.filters, dtype=points.dtype)
         offsets = (steps[None, :] - centres[:, None]) / jnp.asarray(self.width, points.dtype)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmw.core.banks.base import FilterBank
+from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses
 from jaxsmw.core.checks import as_parameter, check_between
 
 
@@ -22,7 +22,7 @@ class Warp(eqx.Module):
     """
 
     @abc.abstractmethod
-    def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
         """Return the warped points (p,), in any unit; `FilterBank` describes the arguments."""
 
 
@@ -43,9 +43,7 @@ class Warped(FilterBank):
     bank: FilterBank
     warp: Warp
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         return self.bank(self.warp(points, eigenvalues), self.warp(eigenvalues, eigenvalues))
 
 
@@ -61,7 +59,7 @@ class Logarithm(Warp):
     def __check_init__(self) -> None:
         check_between(self, "strength", self.strength)
 
-    def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
         return jnp.log1p(jnp.asarray(self.strength, points.dtype) * (points / eigenvalues[-1]))
 
 
@@ -77,7 +75,7 @@ class Power(Warp):
     def __check_init__(self) -> None:
         check_between(self, "exponent", self.exponent)
 
-    def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
         relative = points / eigenvalues[-1]
         # For exponents below 1 the slope at the eigenvalue 0 is infinite, so gradients use the slope 0 there.
         positive = jnp.where(relative > 0, relative, 1)
@@ -97,7 +95,7 @@ class SpectralDistribution(Warp):
     eigenspace equally.
     """
 
-    def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
         # Eigensolvers return repeated eigenvalues as nearly equal numbers, so eigenvalues are compared with a
         # tolerance.
         tolerance = 1e-6 * eigenvalues[-1]

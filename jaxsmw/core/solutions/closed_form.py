@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import check_option
 from jaxsmw.core.functional_map import (
+    FunctionalMap,
     Norm,
     PseudoInverse,
     WaveletProblem,
@@ -49,22 +50,20 @@ class Solution(eqx.Module, Generic[PreparedT]):
         problem: WaveletProblem,
         prepared: PreparedT,
         pointwise_map: PointwiseMap,
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
         """Compute the functional map C that corresponds to a pointwise map T.
 
         **Arguments:**
 
-        - `problem`: a `WaveletProblem`, which contains the spectra of both shapes, the responses of the
-          filter bank, and the convention of C.
+        - `problem`: the `WaveletProblem`: both spectra, the responses of the filter bank, and the convention
+          of C.
         - `prepared`: the values that `prepare` returned for this problem.
-        - `pointwise_map`: the map T: an integer array (m,) with one 0-based vertex of Y per vertex of X, or a
-          `SoftMap` or `SparseSoftMap` from X to Y.
-        - `previous`: the functional map (k_out, k_in) of the previous iteration, or None in the first
-          iteration. An iterative solver can start from this map.
+        - `pointwise_map`: the map T, as in `encode`.
+        - `previous`: the functional map of the previous iteration, or None in the first iteration. An
+          iterative solver can start from this map.
 
-        **Returns:** The functional map C (k_out, k_in), without unit, and a status code, which is a member of
-        `RESULTS`.
+        **Returns:** C (k_out, k_in), without unit, and a status code, which is a member of `RESULTS`.
         """
 
 
@@ -118,8 +117,8 @@ class Filtering(Solution[PreparedFiltering]):
         problem: WaveletProblem,
         prepared: PreparedFiltering,
         pointwise_map: PointwiseMap,
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
         _, spectrum_in = problem.spectra
         eigenvectors_in, convention = spectrum_in.eigenvectors, problem.convention
         unfiltered = encode_by(prepared.dual_out, pointwise_map, eigenvectors_in, convention)
@@ -149,8 +148,8 @@ class NearestOrthogonal(Solution[PreparedT]):
         problem: WaveletProblem,
         prepared: PreparedT,
         pointwise_map: PointwiseMap,
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
         return nearest_orthogonal(functional_map), result
 
@@ -181,8 +180,8 @@ class LeastSquares(Solution[None]):
         problem: WaveletProblem,
         prepared: None,
         pointwise_map: PointwiseMap,
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
         energy = problem.energy(pointwise_map, norm=self.norm)
         _, responses_in = problem.responses
         frame = frame_function(responses_in)
