@@ -8,7 +8,7 @@ import shutil
 import signal
 import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -237,6 +237,15 @@ def forget_programs() -> Iterator[None]:
     """Release compiled programs after each test module, because the programs of all tests take gigabytes."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """A function that runs the command line in this process."""
+    # The type checks apply only to modules that are imported after this file.
+    from command_line import runner
+
+    return runner(capsys)
 
 
 @pytest.fixture

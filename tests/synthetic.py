@@ -1,5 +1,8 @@
 """Synthetic spectra and simple meshes that several test files share."""
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -25,6 +28,22 @@ def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) 
         jnp.asarray(areas, dtype),
         jnp.ones(n, bool),
     )
+
+
+def stacked(*trees: Any) -> Any:
+    """Stack the arrays of several spectra, or of other trees of equal structure."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def in_precision(tree: Any, dtype: type) -> Any:
+    """Convert the floating-point arrays of a tree to another type."""
+    return jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype == float else leaf, tree)
+
+
+def mean_error(mesh: Mesh, pointwise_map: np.ndarray, truth: np.ndarray) -> float:
+    """The mean distance between matches and true matches, in units of the square root of the area."""
+    offsets = mesh.vertices[pointwise_map] - mesh.vertices[truth]
+    return float(np.linalg.norm(offsets, axis=1).mean() / mesh.area**0.5)
 
 
 def grid_mesh(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:

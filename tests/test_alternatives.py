@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from synthetic import mean_error
 
 from jaxsmw import creature_pair, geodesic_error, match, read_mesh
 from jaxsmw.benchmark.datasets import open_data_set
@@ -55,10 +56,6 @@ def moved(mesh, rotation, shift=2.0):
 
 def prepared(mesh_x, mesh_y, *, creases=0, **options):
     return prepare(Pair.make(mesh_x, mesh_y, **options), Sizes(60, creases, 500)).describe(30)
-
-
-def mean_error(mesh, found, truth):
-    return float(np.linalg.norm(mesh.vertices[found] - mesh.vertices[truth], axis=1).mean() / mesh.area**0.5)
 
 
 def test_samples_belong_to_the_nearest_along_the_surface():

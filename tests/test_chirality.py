@@ -180,6 +180,7 @@ def test_a_doubtful_hand_is_flagged(lump, monkeypatch, evidence, mirrored):
     assert found.mirror_evidence == evidence
 
 
+@pytest.mark.slow
 def test_evidence_has_opposite_signs_for_opposite_hands(lump):
     for target, sign in ((turned(lump), -1), (turned(lump.mirrored()), 1)):
         pair = Pair.make(lump, target)

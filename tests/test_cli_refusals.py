@@ -5,18 +5,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import SMALL, assert_refused, runner, write_pair
+from command_line import SMALL, assert_refused, write_pair
 from messages import assert_names
 from synthetic import bumpy_mesh
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.meshes import write_mesh
 from jaxsmw.runtime.files import atomic_write, check_directory, check_writable, make_directory
-
-
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import assert_refused, runner
+from command_line import assert_refused
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
@@ -173,6 +173,7 @@ def test_an_interrupted_call_continues(meshes, found, matched, tmp_path):
         np.testing.assert_array_equal(first.vertices, second.vertices)
 
 
+@pytest.mark.slow
 def test_an_added_mesh_is_matched_alone(meshes, matched, tmp_path):
     def run(number):
         return match_collection(
@@ -198,6 +199,7 @@ def test_an_unusable_mesh_is_left_out_and_named(meshes, found, work):
     assert any("triangle" in sentence for sentence in result.sentences())
 
 
+@pytest.mark.slow
 def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch):
     """The first match of one pair maps every vertex to the mirror image of its match."""
     original = edges.match_edges
@@ -320,6 +322,7 @@ def signed_volume(mesh: Mesh) -> float:
     return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
 
 
+@pytest.mark.slow
 def test_meshes_of_the_other_hand_can_be_named(meshes, found):
     some = [mesh.mirrored() if number == 1 else mesh for number, mesh in enumerate(meshes)]
     result = match_collection(
@@ -374,11 +377,6 @@ def test_real_people_through_the_template(shared):
 
 
 # ----------------------------------------------------------------------------------------------- the command
-
-
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
 
 
 @pytest.fixture(scope="module")

@@ -160,6 +160,7 @@ def test_the_preset_uses_crease_eigenvectors_on_small_meshes_only():
     assert accurate.fitted(15_000).sizes.number_of_crease_eigenvectors == 0
 
 
+@pytest.mark.slow
 def test_match_computes_them_for_its_stages():
     mesh = bumpy_mesh(3)
     with_creases, without = (

@@ -26,7 +26,7 @@ def ends_of(mesh):
 @pytest.fixture(scope="module")
 def creature():
     """Two poses of a body, and the extremities of both."""
-    pair = creature_pair(vertices=2000)
+    pair = creature_pair(vertices=1000)
     return pair, ends_of(pair.source), ends_of(pair.target)
 
 

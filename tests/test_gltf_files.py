@@ -526,7 +526,7 @@ def sound(tmp_path_factory) -> bytes:
 
 
 @given(data=st.data())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_damaged_files_are_read_or_refused(tmp_path_factory, sound, data):
     path, content = tmp_path_factory.getbasetemp() / "damaged.glb", sound
     at = data.draw(st.integers(12, len(content) - 1))

@@ -11,7 +11,7 @@ from messages import refused
 from sampled_cases import first_always
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
-from synthetic import bumpy_mesh
+from synthetic import bumpy_mesh, mean_error
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from jaxsmw.core.banks import FilterBank, Meyer
@@ -26,7 +26,7 @@ from jaxsmw.creature import creature_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.mesh import Mesh, make_mesh
+from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching import preparation
 from jaxsmw.matching.correspondence import Correspondence
@@ -60,12 +60,6 @@ def pair():
 def usual(pair):
     """The result of `OPTIONS`, with its history."""
     return match(*pair[:2], **OPTIONS, history=True)
-
-
-def mean_error(mesh_y: Mesh, t: np.ndarray, truth: np.ndarray) -> float:
-    return float(
-        np.linalg.norm(mesh_y.vertices[t] - mesh_y.vertices[truth], axis=1).mean() / np.sqrt(mesh_y.area)
-    )
 
 
 @pytest.mark.parametrize(

@@ -927,7 +927,7 @@ def read_or_refuse(path: Path) -> None:
 
 
 @given(junk=st.binary(max_size=300), start=st.sampled_from(STARTS), suffix=st.sampled_from(SUFFIXES))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_junk_is_refused_in_one_sentence(scratch, junk, start, suffix):
     path = scratch / f"junk{suffix}"
     path.write_bytes(start + junk)
@@ -952,7 +952,7 @@ SPLICES = st.one_of(
 
 
 @given(data=st.data(), sound=st.sampled_from(SOUND))
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_damaged_files_are_read_or_refused(scratch, data, sound):
     suffix, content = sound
     for _ in range(data.draw(st.integers(1, 3))):
@@ -972,7 +972,7 @@ COORDINATES = st.one_of(
 
 
 @given(vertices=hnp.arrays(np.float64, st.tuples(st.integers(3, 8), st.just(3)), elements=COORDINATES))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_written_meshes_are_read_back_bit_for_bit(scratch, vertices):
     vertices = np.concatenate([vertices, np.array(SQUARE) * 1e45])
     faces = np.array(SQUARE_FACES) + len(vertices) - 4

@@ -173,8 +173,8 @@ def embedding():
     return compute_spectrum(bumpy_mesh(4), 30).eigenvectors
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@pytest.mark.parametrize("noise", [0.0, 0.3, 3.0])
+@pytest.mark.parametrize("dtype", first_always([jnp.float32, jnp.float64]))
+@pytest.mark.parametrize("noise", first_always([0.3, 0.0, 3.0]))
 def test_search_in_patches_equals_exhaustive_search_on_surfaces(embedding, dtype, noise):
     """The noise levels give a perfect map, a poor map and a random map."""
     generator = np.random.default_rng(0)
