@@ -245,7 +245,7 @@ class Alternatives:
         starts = (Start(start, excluded=fault) for start, fault in zip(initial, faults, strict=False))
         candidates = []
         # All refinements are started first. The host scores a finished refinement while the others run.
-        for outcome in list(run([fitted], self._spectra, starts)):
+        for outcome in [run([fitted], self._spectra, start) for start in starts]:
             if outcome.successful:
                 found = outcome.pointwise_map
                 score = self._judge.score_map(self._extended(found), outcome.uncertainty)
