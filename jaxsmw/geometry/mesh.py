@@ -432,8 +432,8 @@ def make_mesh(
             if welded
             else "Welding changed nothing: no two vertices of faces have the same position."
         )
-    number, dropped = _distinct_faces(triangles)
-    notes += dropped
+    number, about_faces = _distinct_faces(triangles)
+    notes += about_faces
     if lost.any():
         with_lost = lost[triangles[number]].any(axis=1)
         number = number[~with_lost]
@@ -443,10 +443,8 @@ def make_mesh(
             f"{count_of(int(with_lost.sum()), 'face')} dropped."
         )
 
-    def with_faces(kept: Int64[np.ndarray, " g"]) -> Mesh:
-        return Mesh(position, triangles[kept], name, dropped_faces=np.delete(np.arange(len(triangles)), kept))
-
-    mesh = with_faces(number)
+    dropped_faces = np.delete(np.arange(len(triangles)), number)
+    mesh = Mesh(position, triangles[number], name, dropped_faces=dropped_faces)
     if mesh.degenerate_faces.all():
         raise InputError(
             f"{name}: no triangle has an area, because all corners coincide or lie on a line: "
@@ -462,7 +460,7 @@ def make_mesh(
             f"the area left out ({count_of(int(small.sum()), 'face')}): they take no part in the match, but "
             "move with their surroundings."
         )
-        mesh = replace(with_faces(number[~small]), small_faces=triangles[number[small]])
+        mesh = replace(mesh.without_faces(small), small_faces=mesh.faces[small])
     return replace(mesh, notes=(*notes, *_unusual_vertices(mesh)))
 
 
