@@ -141,26 +141,26 @@ class Mesh:
         return referenced
 
     @cached_property
-    def used_vertices(self) -> Int64[np.ndarray, " u"]:
+    def referenced_indices(self) -> Int64[np.ndarray, " u"]:
         """The indices of the referenced vertices (u,), ascending."""
         return np.flatnonzero(self.referenced_vertices)
 
     @cached_property
     def middle(self) -> Float64[np.ndarray, " 3"]:
         """The mean position of the referenced vertices (3,)."""
-        return self.vertices[self.used_vertices].mean(axis=0)
+        return self.vertices[self.referenced_indices].mean(axis=0)
 
     def compact(self) -> tuple[Float64[np.ndarray, "u 3"], Int64[np.ndarray, "f 3"]]:
-        """Return the positions of the `used_vertices`, and the faces as rows of these positions."""
+        """Return the positions of the `referenced_indices`, and the faces as rows of these positions."""
         number = np.cumsum(self.referenced_vertices) - 1
-        return self.vertices[self.used_vertices], number[self.faces]
+        return self.vertices[self.referenced_indices], number[self.faces]
 
     def spread(self, rows: Shaped[np.ndarray, "u ..."]) -> Shaped[np.ndarray, "n ..."]:
-        """Return the rows of the `used_vertices` as rows of all vertices, with zeros at the others."""
+        """Return the rows of the `referenced_indices` as rows of all vertices, with zeros at the others."""
         if len(rows) == len(self.vertices):
             return rows
         everywhere = np.zeros((len(self.vertices), *rows.shape[1:]), rows.dtype)
-        everywhere[self.used_vertices] = rows
+        everywhere[self.referenced_indices] = rows
         return everywhere
 
     @cached_property
@@ -319,7 +319,7 @@ class Diagnosis:
 
 def diagnose(mesh: Mesh) -> Diagnosis:
     """Count all unusual elements of a mesh, such as boundary edges and degenerate triangles."""
-    unreferenced = len(mesh.vertices) - len(mesh.used_vertices)
+    unreferenced = len(mesh.vertices) - len(mesh.referenced_indices)
     boundary_chain = connected_components(mesh.boundary_edges, len(mesh.vertices))[1]
     return Diagnosis(
         vertices=len(mesh.vertices),
@@ -493,7 +493,7 @@ def _unusual_vertices(mesh: Mesh) -> list[str]:
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
             "surface should be closed there, weld it (`weld=True`, on the command line `--weld`)."
         )
-    if unreferenced := len(mesh.vertices) - len(mesh.used_vertices):
+    if unreferenced := len(mesh.vertices) - len(mesh.referenced_indices):
         notes.append(
             f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) among {len(mesh.vertices)} "
             "vertices."
@@ -522,10 +522,10 @@ def _check_resolution(mesh: Mesh) -> None:
     """Refuse a mesh with a vertex so far away that rounding errors are comparable to edge lengths."""
     lengths = mesh.lengths(mesh.edges)
     median = np.median(lengths[lengths > 0])
-    middle = np.median(mesh.vertices[mesh.used_vertices], axis=0)
+    middle = np.median(mesh.vertices[mesh.referenced_indices], axis=0)
     for vertices, center, limit, place in (
         (np.arange(len(mesh.vertices)), 0, LARGEST_COORDINATE, "origin"),
-        (mesh.used_vertices, middle, LARGEST_DISTANCE, "middle of the mesh"),
+        (mesh.referenced_indices, middle, LARGEST_DISTANCE, "middle of the mesh"),
     ):
         distances = np.abs(mesh.vertices[vertices] - center).max(axis=1) / median
         if distances.max() > limit:

@@ -46,7 +46,7 @@ class UncoveredVertices:
     def __init__(self, mesh_x: Mesh, mesh_y: Mesh) -> None:
         self._mesh = mesh_x
         self._root = np.sqrt(mesh_y.area)
-        used = mesh_y.used_vertices
+        used = mesh_y.referenced_indices
         self._positions, self._areas = mesh_y.vertices[used], mesh_y.vertex_areas[used]
         self._first = True
 

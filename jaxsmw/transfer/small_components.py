@@ -93,7 +93,9 @@ def follow_surroundings(
     similarities.rotations[rows], similarities.scales[rows] = of_rows
     for counterpart in np.unique(counterparts[of_row]):
         own = rows[counterparts[of_row] == counterpart]
-        candidates = mesh_y.used_vertices if counterpart < 0 else others.rows[others.of_row == counterpart]
+        candidates = (
+            mesh_y.referenced_indices if counterpart < 0 else others.rows[others.of_row == counterpart]
+        )
         matches[own] = candidates[KDTree(mesh_y.vertices[candidates]).query(positions[own])[1]]
     # Welding leaves vertices without faces at the positions of vertices of small components.
     known = known | (matches >= 0)
