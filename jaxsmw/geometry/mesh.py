@@ -151,12 +151,12 @@ class Mesh:
         return self.vertices[self.referenced_indices].mean(axis=0)
 
     def compact(self) -> tuple[Float64[np.ndarray, "u 3"], Int64[np.ndarray, "f 3"]]:
-        """Return the positions of the `referenced_indices`, and the faces as rows of these positions."""
+        """Return the positions of the referenced vertices, and the faces as rows of these positions."""
         number = np.cumsum(self.referenced_vertices) - 1
         return self.vertices[self.referenced_indices], number[self.faces]
 
     def spread(self, rows: Shaped[np.ndarray, "u ..."]) -> Shaped[np.ndarray, "n ..."]:
-        """Return the rows of the `referenced_indices` as rows of all vertices, with zeros at the others."""
+        """Return rows of the referenced vertices (u, ...) as rows of all vertices, with zeros elsewhere."""
         if len(rows) == len(self.vertices):
             return rows
         everywhere = np.zeros((len(self.vertices), *rows.shape[1:]), rows.dtype)

@@ -93,9 +93,8 @@ def follow_surroundings(
     similarities.rotations[rows], similarities.scales[rows] = of_rows
     for counterpart in np.unique(counterparts[of_row]):
         own = rows[counterparts[of_row] == counterpart]
-        candidates = (
-            mesh_y.referenced_indices if counterpart < 0 else others.rows[others.of_row == counterpart]
-        )
+        is_paired = counterpart >= 0
+        candidates = others.rows[others.of_row == counterpart] if is_paired else mesh_y.referenced_indices
         matches[own] = candidates[KDTree(mesh_y.vertices[candidates]).query(positions[own])[1]]
     # Welding leaves vertices without faces at the positions of vertices of small components.
     known = known | (matches >= 0)
