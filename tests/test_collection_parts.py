@@ -83,7 +83,7 @@ def test_the_graph_contains_the_minimum_spanning_tree_and_is_connected_with_few_
 def test_added_shapes_add_only_their_own_edges():
     distances = random_distances(20)
     before = choose_edges(distances[:16, :16], edges_per_shape=3)
-    after = choose_edges(distances, edges_per_shape=3, given=before)
+    after = choose_edges(distances, edges_per_shape=3, matched=before)
     assert set(before) <= set(after)
     added = set(after) - set(before)
     assert len(added) == 3 * 4
@@ -93,15 +93,15 @@ def test_added_shapes_add_only_their_own_edges():
         18,
         19,
     }
-    assert choose_edges(distances, edges_per_shape=3, given=after) == after
+    assert choose_edges(distances, edges_per_shape=3, matched=after) == after
 
 
 def test_a_removed_shape_does_not_split_the_graph():
     distances = random_distances(6)
     star = [(0, 1), (0, 2), (0, 3)]
-    assert is_connected(choose_edges(distances[:4, :4], given=star), 4)
+    assert is_connected(choose_edges(distances[:4, :4], matched=star), 4)
     # Shape 0 was removed, and with it all edges of the star; shapes 3 and 4 are still matched with each other.
-    assert is_connected(choose_edges(distances, edges_per_shape=2, given=[(1, 2), (3, 4)]), 6)
+    assert is_connected(choose_edges(distances, edges_per_shape=2, matched=[(1, 2), (3, 4)]), 6)
 
 
 def test_random_edges_depend_on_the_seed_only():
@@ -280,10 +280,10 @@ def test_the_medoid_has_the_smallest_sum_of_path_errors(body):
         (np.ones((3, 3)), {"random_share": True}, "random_share is True"),
         (np.ones((3, 3)), {"seed": -1}, "seed is -1: give a whole number of at least 0"),
         (np.ones((3, 3)), {"seed": 1.0}, "seed is 1.0"),
-        (np.ones((3, 3)), {"given": [(0, 3)]}, "3 shapes"),
-        (np.ones((3, 3)), {"given": [(0, 1), (0, 1.0)]}, "given edge 1 is"),
-        (np.ones((3, 3)), {"given": [3]}, "given edge 0 is 3"),
-        (np.ones((3, 3)), {"given": [(1, 1)]}, "joins shape 1 to itself"),
+        (np.ones((3, 3)), {"matched": [(0, 3)]}, "3 shapes"),
+        (np.ones((3, 3)), {"matched": [(0, 1), (0, 1.0)]}, "given edge 1 is"),
+        (np.ones((3, 3)), {"matched": [3]}, "given edge 0 is 3"),
+        (np.ones((3, 3)), {"matched": [(1, 1)]}, "joins shape 1 to itself"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
