@@ -21,7 +21,7 @@ from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.inputs import check_inputs, read_maps, report_mesh
 from jaxsmw.cli.measurement import show_quality
 from jaxsmw.cli.method import add_method, check_method, given_method, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
+from jaxsmw.cli.outputs import check_outputs, report_written, write_match_report
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ def _check(options: argparse.Namespace) -> None:
     check_outputs(
         inputs,
         files=[options.registered, options.attributes, options.landmarks_output],
-        directories=report_directories(options.report),
+        report=options.report,
     )
     import jaxsmw.matching.match  # noqa: F401 (imported here because loading is timed separately)
 
