@@ -20,7 +20,7 @@ from jaxsmw.choices import (
 from jaxsmw.cli.arguments import add_eigenproblem, add_values, option_of, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.initial_map import InitialMap
+from jaxsmw.cli.inputs import InitialMap
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
