@@ -207,9 +207,9 @@ def match_meshes(
         show(f"scale:       {correspondence.pair.scale:.4g} (lengths on the target / lengths on the source)")
     evidence = correspondence.mirror_evidence
     if correspondence.mirrored or evidence is not None:
-        took = "the mirror image of the source" if correspondence.mirrored else "the source itself"
-        known = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"
-        show(f"hand:        {took}{known}")
+        hand = "the mirror image of the source" if correspondence.mirrored else "the source itself"
+        reason = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"
+        show(f"hand:        {hand}{reason}")
     return correspondence
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from concurrent.futures import ThreadPoolExecutor
+from statistics import median
 from typing import TYPE_CHECKING, get_args
 
 from jaxsmw.choices import CoordinateSystem
@@ -145,8 +146,8 @@ def _check(options: argparse.Namespace) -> None:
     refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_output", "coordinates")
     written = options.landmarks_output or options.report
     refuse_without(options, "--landmarks-output or --report", bool(written), "landmarks")
-    if options.map and (given := given_method(options)):
-        raise InputError(f"{given[0]} has no effect with --map: give one of the two.")
+    if options.map and (names := given_method(options)):
+        raise InputError(f"{names[0]} has no effect with --map: give one of the two.")
     if options.map and options.report:
         raise InputError("--report: describes a match, but --map gives a map: leave one of the two out.")
     refuse_without(options, "--partial", options.partial, "scale")
@@ -251,25 +252,24 @@ def _transfer_landmarks(
     from jaxsmw.transfer.landmarks import transfer_landmarks
 
     with stopwatch.step("landmarks"):
-        found = transfer_landmarks(landmarks, registered, expected_error=expected_error)
-    for note in found.notes:
+        transferred = transfer_landmarks(landmarks, registered, expected_error=expected_error)
+    for note in transferred.notes:
         say(f"note: {note}")
-    _show_landmarks(found)
+    _show_landmarks(transferred)
     if options.landmarks_output:
-        write_landmark_file(options.landmarks_output, found.landmarks)
+        write_landmark_file(options.landmarks_output, transferred.landmarks)
         report_written(options.landmarks_output)
-    return found.landmarks
+    return transferred.landmarks
 
 
-def _show_landmarks(found: TransferredLandmarks) -> None:
+def _show_landmarks(transferred: TransferredLandmarks) -> None:
     """Print the expected error of each landmark, and mark large errors."""
-    if found.expected_errors is None:
+    if transferred.expected_errors is None:
         return
-    import numpy as np
-
     show("expected errors of landmarks, in the unit of the target:")
-    large = found.expected_errors > _LARGE * np.median(found.expected_errors)
-    for name, error, is_large in zip(found.landmarks.names, found.expected_errors, large, strict=True):
+    errors = transferred.expected_errors.tolist()
+    for name, error in zip(transferred.landmarks.names, errors, strict=True):
+        is_large = error > _LARGE * median(errors)
         show(
             f"  {name}: {error:.3g}{' (more than twice the median: check this landmark)' if is_large else ''}"
         )
