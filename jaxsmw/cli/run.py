@@ -121,7 +121,7 @@ class Parser(argparse.ArgumentParser):
                 return name
         return None
 
-    def print_help(self, file: Any = None) -> None:
+    def print_help(self, file: object = None) -> None:
         """Print the help. Unlike argparse, raise an error if standard output cannot be written."""
         show(self.format_help().rstrip())
 
@@ -156,7 +156,7 @@ class _Version(argparse.Action):
             option_strings, argparse.SUPPRESS, nargs=0, default=argparse.SUPPRESS, help="print the version"
         )
 
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
         import jaxsmw
 
         show(f"jaxsmw {jaxsmw.__version__}")
