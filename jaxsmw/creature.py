@@ -20,8 +20,8 @@ from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 
 _Vector = tuple[float, float, float]
 
@@ -33,18 +33,12 @@ _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class CreaturePair:
-    """Two meshes of one synthetic creature in two poses, with the exact ground truth.
-
-    The two meshes are triangulated independently. `creature_pair` makes a `CreaturePair`.
+    """Two meshes of one synthetic creature in two poses, with the exact ground truth; see `creature_pair`.
 
     **Attributes:**
 
-    - `source`: the source, a `Mesh` with m vertices.
-    - `target`: the target, a `Mesh` with n vertices.
-    - `truth`: the ground truth as a `SurfacePoints` with m points on the target, one for each source vertex.
-      A `SurfacePoints` consists of triangles and barycentric weights.
-    - `true_map`: the ground truth as a pointwise map (m,), int64, 0-based target vertices. Entry i is the
-      corner nearest to point i of `truth`, among the corners of the triangle in which the point lies.
+    - `source`, `target`: the source (m vertices) and the target, which are triangulated independently.
+    - `truth`: the ground truth as m `SurfacePoints` on the target, one for each source vertex.
     """
 
     source: Mesh
@@ -53,7 +47,7 @@ class CreaturePair:
 
     @cached_property
     def true_map(self) -> Int64[np.ndarray, " m"]:
-        """The ground truth as a pointwise map (m,), int64; see `CreaturePair`."""
+        """The nearest corner of each point of `truth`: a pointwise map (m,), 0-based target vertices."""
         return self.truth.nearest_corners(self.target)
 
 
@@ -568,17 +562,16 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
     The mesh is closed and has no handles. The triangles are well shaped and oriented outward. For a given
     kind, number of vertices and seed, every pose has the same triangles, so vertex i is always the same point
     of the body. In the rest pose, the body is mirror symmetric in x, but its triangulation is not symmetric.
+    The mesh is about 1.5 units high. The x axis points to the creature's left, the y axis up and the z axis
+    forward.
 
     **Arguments:**
 
-    - `kind`: `"quadruped"`, `"biped"` or `"dragon"`.
+    - `kind`: `"quadruped"` (a fox), `"biped"` (a goblin) or `"dragon"`.
     - `vertices`: the number of vertices, at least 500.
-    - `pose`: `"rest"` or another pose of this kind. `CREATURES` lists the poses of each kind.
-    - `seed`: a random seed, an integer of at least 0. The seed determines the proportions, the triangulation,
-      and the small random changes of the pose.
-
-    **Returns:** The mesh, with exactly `vertices` vertices, about 1.5 units high. The x axis points to the
-    creature's left, the y axis up and the z axis forward.
+    - `pose`: one of the poses that `CREATURES` lists for this kind.
+    - `seed`: an integer of at least 0, which determines the proportions, the triangulation, and the small
+      random changes of the pose.
 
     **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, or a seed
     whose body intersects itself. No seed below 250 makes a body that intersects itself.
@@ -597,20 +590,8 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     The two shapes are nearly isometric and are triangulated independently. The source is in the pose
     `"stand"`. The target is the same individual in another, randomly chosen pose, with 1 to 5 % fewer
     vertices. To compute the ground truth, the source vertices are projected onto the target's triangles in
-    the common rest pose. The projection between the two triangulations is the only source of errors in the
-    ground truth.
-
-    **Arguments:**
-
-    - `kind`: `"quadruped"` (a fox), `"biped"` (a goblin) or `"dragon"`.
-    - `vertices`: the number m of source vertices, at least 500.
-    - `seed`: a random seed, an integer of at least 0. The seed determines the individual, the poses and the
-      triangulations.
-
-    **Returns:** A `CreaturePair`. Its bodies have the size and the axes of those of `creature`.
-
-    **Raises:** `InputError` for an unknown kind, fewer than 500 vertices, a negative seed, or (rarely) a seed
-    whose body intersects itself.
+    the common rest pose. This projection is the only source of errors in the ground truth. The arguments and
+    the errors are those of `jaxsmw.creature.creature`; `vertices` is the number m of source vertices.
     """
     _check(kind, vertices, seed)
     random = _random(seed, "pair")

@@ -34,7 +34,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark_speed import ITERATIONS, Part, measure_parts, medians, truth_of
+from benchmark_speed import ITERATIONS, truth_of
+from common import Part, make_parser, measure_parts, medians
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Int
@@ -76,10 +77,7 @@ class MatrixProduct(NamedTuple):
 
 
 def matrix_products(function: Callable, *arguments: Any) -> Counter[MatrixProduct]:
-    """Return how often a function computes each matrix product.
-
-    An operation in a loop with an unknown number of steps is counted once.
-    """
+    """Return how often a function computes each matrix product, counting loops of unknown length once."""
     found: Counter[MatrixProduct] = Counter()
 
     def add(jaxpr: Jaxpr, times: int) -> None:
@@ -99,10 +97,7 @@ def matrix_products(function: Callable, *arguments: Any) -> Counter[MatrixProduc
 
 
 def time_of_products(products: Counter[MatrixProduct], count: int, repeats: int) -> float:
-    """Return the seconds that the given products take for `count` pairs, in full float32 precision.
-
-    Only the maximum of each row of a product is kept.
-    """
+    """Return the seconds that the given products take for `count` pairs, in full float32 precision."""
     size = min(PRODUCTS, count)
     everything = sum(one.operations * times for one, times in products.items())
     generator = np.random.default_rng(0)
@@ -137,14 +132,6 @@ def refine_one(pair: Pair) -> Refinement:
     return refine(*pair, iterations=ITERATIONS)
 
 
-def one_by_one(batch: Pair) -> Refinement:
-    return lax.map(refine_one, batch)
-
-
-def in_batches(batch: Pair, size: int) -> Refinement:
-    return lax.map(refine_one, batch, batch_size=size)
-
-
 def random_spectrum(generator: np.random.Generator, n: int, k: int) -> Spectrum:
     """Return a spectrum of random numbers for n vertices and k eigenvectors."""
     orthonormal, _ = np.linalg.qr(generator.standard_normal((n, k)))
@@ -166,21 +153,17 @@ def paper(options: argparse.Namespace) -> Iterator[Part]:
     x, y = (stack([shapes[pair[side]] for pair in pairs]) for side in (0, 1))
     batch = x, y, jnp.stack(initial_maps)
     separate = [(shapes[i], shapes[j], T) for (i, j), T in zip(pairs, initial_maps, strict=True)]
-    programs = {"lax.map": jax.jit(one_by_one)}
+    programs = {"lax.map": jax.jit(partial(lax.map, refine_one))}
     for size in options.batch_sizes:
-        programs[f"vmap of {size}"] = jax.jit(partial(in_batches, size=size))
+        programs[f"vmap of {size}"] = jax.jit(partial(lax.map, refine_one, batch_size=size))
     memory = {
         name: program.lower(batch).compile().memory_analysis().temp_size_in_bytes
         for name, program in programs.items()
     }
-
-    def run(program: Callable[[Pair], Refinement]) -> Callable[[], object]:
-        return lambda: program(batch)
-
     seconds = medians(
         {
             "loop": lambda: [refine_one(pair) for pair in separate],
-            **{name: run(program) for name, program in programs.items()},
+            **{name: partial(program, batch) for name, program in programs.items()},
             "refine_pairs": lambda: [
                 refined.pointwise_map
                 for _, refined in refine_pairs(shapes, pairs, initial_maps, iterations=ITERATIONS)
@@ -314,22 +297,14 @@ PARTS = {"paper": paper, "accurate": accurate, "agreement": agreement}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
+    parser = make_parser(__doc__, parts=PARTS, faust=True, output="batches", pairs=64)
     parser.add_argument("--vertices", type=int, default=5000, help="per shape (default: %(default)s)")
     parser.add_argument(
         "--eigenvectors", type=int, default=100, help="per random shape (default: %(default)s)"
     )
-    parser.add_argument("--pairs", type=int, default=64, help="(default: %(default)s)")
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[4, 16, 64])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="refine 8 pairs once, in batches of 2 and 8")
-    parser.add_argument(
-        "--data", type=Path, metavar="FAUST_R", help="the directory of the remeshed FAUST set"
-    )
-    parser.add_argument("--output", type=Path, default=Path("batches"), metavar="DIR")
     options = parser.parse_args()
     if options.quick:
         options.pairs, options.batch_sizes, options.repeats = 8, [2, 8], 1

@@ -33,12 +33,13 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
 import igl
 import numpy as np
-from benchmark_transfer import read_scan_landmarks
+from common import common_landmarks, make_parser, scan_files
 from jaxtyping import Float64
 from tqdm import tqdm
 
@@ -79,19 +80,15 @@ ABLATIONS: dict[str, tuple[float, dict[str, float]]] = {
 
 def main() -> None:
     """Measure the collections that the command line names, and print a summary of each."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, output="collections", pairs=200)
     parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument("sets", nargs="+", metavar="DATA_SET")
     parser.add_argument("--preset", choices=tuple(PRESETS), default=DEFAULT_PRESET)
-    parser.add_argument("--pairs", type=int, default=200, help="number of compared pairs (default: 200)")
     parser.add_argument("--ablations", action="store_true", help="also measure all ablations")
     parser.add_argument(
         "--growth", type=int, nargs="+", metavar="N", help="measure N shapes instead of errors"
     )
     parser.add_argument("--no-direct", action="store_true", help="leave out the matches of single pairs")
-    parser.add_argument("--output", type=Path, default=Path("collections"), help="directory of the results")
     options = parser.parse_args()
     for name in options.sets:
         for number in options.growth or ():
@@ -99,18 +96,13 @@ def main() -> None:
         if options.growth:
             continue
         for ablation in ABLATIONS if options.ablations else [_DEFAULT]:
-            found = _measure(options, name, ablation)
-            print(f"{name}, {ablation}: {json.dumps(found)}", flush=True)
+            print(f"{name}, {ablation}: {json.dumps(_measure(options, name, ablation))}", flush=True)
     print(made_with())
 
 
 def _files(directory: Path, name: str) -> list[Path]:
     data_set, _, prefix = name.partition("/")
-    files = sorted(
-        file
-        for file in (directory / data_set).rglob("*")
-        if file.suffix in (".off", ".ply", ".vtk") and file.name.startswith(prefix)
-    )
+    files = [file for file in scan_files(directory / data_set) if file.name.startswith(prefix)]
     if len(files) < 2:
         raise InputError(f"{directory / data_set}: contains {len(files)} meshes: give a data set with two.")
     return files
@@ -176,8 +168,13 @@ def _measure(options: argparse.Namespace, name: str, ablation: str) -> dict[str,
         result["direct"] = _summary(np.array(single))
         result["ratio"] = float(np.mean(through) / np.mean(single))
     if options.ablations and ablation == _DEFAULT:
-        points = [_measure_truth(found, files, i, j, _Unregistered(found, i, j)) for i, j in pairs]
-        result["without_registered_meshes"] = _summary(np.array(points))
+        template = found.meshes[found.template]
+        errors = []
+        for i, j in pairs:
+            of_pair = found.points[i], found.points[j], template, found.meshes[i], found.meshes[j]
+            unregistered = SimpleNamespace(pointwise_map=vertex_map_between(*of_pair))
+            errors.append(_measure_truth(found, files, i, j, unregistered))
+        result["without_registered_meshes"] = _summary(np.array(errors))
     return result
 
 
@@ -206,15 +203,6 @@ def _matched_growth(files: list[Path], number: int) -> dict[str, Any]:
     }
 
 
-class _Unregistered:
-    """The map of a pair, computed from the consistent points alone, without registered meshes."""
-
-    def __init__(self, found: Collection, i: int, j: int):
-        self.pointwise_map = vertex_map_between(
-            found.points[i], found.points[j], found.meshes[found.template], found.meshes[i], found.meshes[j]
-        )
-
-
 def _measure_truth(found: Collection, files: list[Path], i: int, j: int, single: Any) -> float:
     """Return the mean error of a map in thousandths, against ground truth."""
     truth_files = [files[shape].parents[1] / "corres" / f"{files[shape].stem}.vts" for shape in (i, j)]
@@ -225,9 +213,7 @@ def _measure_truth(found: Collection, files: list[Path], i: int, j: int, single:
 
 def _measure_landmarks(found: Collection, files: list[Path], i: int, j: int, single: Any) -> float:
     """Return the mean distance of carried landmarks to manual landmarks, in thousandths of the diagonal."""
-    marks_x, marks_y = (read_scan_landmarks(files[shape]) for shape in (i, j))
-    names = [name for name in marks_x.names if name in set(marks_y.names)]
-    marks_x, marks_y = marks_x.select(names), marks_y.select(names)
+    marks_x, marks_y = common_landmarks(files[i], files[j])
     if single is None:
         on_source, _ = nearest_surface_points(marks_x.positions, found.meshes[i])
         on_target = found.registered[j].project(found.registered[i].project_back(on_source))
@@ -239,11 +225,7 @@ def _measure_landmarks(found: Collection, files: list[Path], i: int, j: int, sin
 
 
 def _cycles(found: Collection) -> dict[str, float]:
-    """Return cycle errors of a collection, in thousandths of the square root of the area.
-
-    The dictionary contains the mean cycle errors of the graph. It also contains the mean and the median cycle
-    error of maps through the template, for random triples of shapes.
-    """
+    """Return the cycle errors of the graph, and of maps through the template for random triples of shapes."""
     generator = np.random.default_rng(0)
     number = len(found.meshes)
     errors = []
@@ -263,11 +245,8 @@ def _cycles(found: Collection) -> dict[str, float]:
 
 
 def _summary(errors: Float64[np.ndarray, " p"]) -> dict[str, float]:
-    interval = mean_interval(errors, 0)
     return {
-        "mean": float(errors.mean()),
-        "low": float(interval.low),
-        "high": float(interval.high),
+        **mean_interval(errors, 0)._asdict(),
         "median": float(np.median(errors)),
         "largest": float(errors.max()),
         "lost": int((errors > _LOST).sum()),

@@ -14,7 +14,6 @@ and the same command continues after an interruption.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import re
 import time
@@ -24,15 +23,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import make_parser, measure_pairs
 from jaxtyping import Bool, Float64
 
 from jaxsmw import Mesh, geodesic_error, make_mesh, match, read_ground_truth, read_mesh
 from jaxsmw.benchmark.intervals import mean_interval
-from jaxsmw.benchmark.journal import Journal
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation import GroundTruth
 from jaxsmw.geometry import SurfacePoints, nearest_surface_points
-from jaxsmw.runtime.compilation import release_programs
 from jaxsmw.runtime.provenance import made_with
 
 _SHARES = 0.4, 0.9
@@ -43,21 +41,14 @@ _EVALUATED = 400
 
 def main() -> None:
     """Measure all pairs, and print a summary."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, output="overlap")
     parser.add_argument("directory", type=Path, metavar="SHREC16_PARTIAL")
     parser.add_argument("--pairs", type=int, help="largest number of pairs (default: all pairs)")
-    parser.add_argument("--output", type=Path, default=Path("overlap"), help="directory of the results")
     options = parser.parse_args()
-    options.output.mkdir(parents=True, exist_ok=True)
-    journal = Journal(options.output / "overlap.csv", ("source", "target"))
-    for pair in itertools.islice(_pairs(options.directory), options.pairs):
-        if pair.names not in journal:
-            release_programs()
-            row = dict(zip(("source", "target"), pair.names, strict=True)) | pair.measure()
-            journal.append([row])
-            print(row, flush=True)
+    warnings.simplefilter("ignore")
+    pairs = itertools.islice(_pairs(options.directory), options.pairs)
+    file = options.output / "overlap.csv"
+    journal = measure_pairs(file, pairs, lambda pair: pair.names, _PartialPair.measure)
     for name in ("error", "iou", "iou_of_all", "seconds"):
         values = np.array([float(row[name]) for row in journal.rows])
         print(f"{name}: {mean_interval(values, seed=0)}, median {np.median(values):.3f}")
@@ -98,9 +89,7 @@ class _PartialPair:
         """Match the pair, and return the error in the overlap and the quality of the predicted overlap."""
         mesh_x, mesh_y = self.source.mesh, self.target.mesh
         start = time.perf_counter()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            found = match(mesh_x, mesh_y, partial=True)
+        found = match(mesh_x, mesh_y, partial=True)
         seconds = time.perf_counter() - start
         used = np.flatnonzero(self.inside)
         truth = GroundTruth(used, SurfacePoints(self.points.faces[used], self.points.weights[used]))

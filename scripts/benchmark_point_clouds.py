@@ -9,24 +9,22 @@ a mesh. Errors are geodesic errors on the mesh of the target, in thousandths of 
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from pathlib import Path
 
 import numpy as np
+from common import make_parser
 
-from jaxsmw import Mesh, geodesic_error, match, read_ground_truth, read_mesh
+from jaxsmw import Mesh, geodesic_error, match, read_mesh
+from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
 from jaxsmw.geometry import triangulate_points
 from jaxsmw.runtime.provenance import made_with
 
 
 def main() -> None:
     """Match the pairs, and print the errors of each pair and their means."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, pairs=20)
     parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
-    parser.add_argument("--pairs", type=int, default=20, help="number of pairs (default: 20)")
     parser.add_argument(
         "--noise",
         type=float,
@@ -34,31 +32,25 @@ def main() -> None:
         help="standard deviation of the noise, in units of the median edge length (default: 0)",
     )
     options = parser.parse_args()
-    listed = (options.directory / "test_pairs.txt").read_text("utf-8").splitlines()
-    pairs = [tuple(Path(name).stem for name in line.split()[:2]) for line in listed]
+    warnings.simplefilter("ignore")  # suspicious maps are measured too
     rows = []
-    for row in np.random.default_rng(0).permutation(len(pairs))[: options.pairs]:
-        names = pairs[row]
-        meshes = [read_mesh(options.directory / "off" / f"{name}.off") for name in names]
-        truth_files = [options.directory / "corres" / f"{name}.vts" for name in names]
-        truth = read_ground_truth(truth_files, *meshes)
+    for pair in choose_pairs(open_data_set(options.directory), str(options.pairs), 0):
+        meshes = [read_mesh(file) for file in pair.meshes]
         clouds = [_cloud(mesh, options.noise) for mesh in meshes]
-        kinds = meshes, clouds, (clouds[0], meshes[1])
+        truth = pair.ground_truth(*meshes)
         errors = []
-        for source, target in kinds:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # suspicious maps are measured too
-                found = match(source, target)
-            errors.append(1e3 * geodesic_error(meshes[1], found.pointwise_map, truth).mean)
+        for source, target in (meshes, clouds, (clouds[0], meshes[1])):
+            pointwise_map = match(source, target).pointwise_map
+            errors.append(1e3 * geodesic_error(meshes[1], pointwise_map, truth).mean)
         rows.append(errors)
-        print(*names, *(f"{error:.1f}" for error in errors), flush=True)
+        print(*pair.names, *(f"{error:.1f}" for error in errors), flush=True)
+    of_meshes = np.mean(rows, axis=0)[0]
     for kind, values in zip(
         ("meshes", "point clouds", "point cloud to mesh"), np.transpose(rows), strict=True
     ):
-        ratio = values.mean() / np.mean(rows, axis=0)[0]
-        print(
-            f"{kind}: mean {values.mean():.1f}, median {np.median(values):.1f}, {ratio:.2f} times the meshes'"
-        )
+        mean = values.mean()
+        ratio = mean / of_meshes
+        print(f"{kind}: mean {mean:.1f}, median {np.median(values):.1f}, {ratio:.2f} times the meshes'")
     print(made_with())
 
 

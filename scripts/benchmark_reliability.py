@@ -24,7 +24,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from benchmark_speed import Part, measure_parts
+from common import Part, make_parser, measure_parts
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
@@ -198,18 +198,8 @@ PARTS = {part.__name__: part for part in (determinism, long_run)}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
-    parser.add_argument(
-        "--data", type=Path, metavar="FAUST_R", help="the directory of the remeshed FAUST set"
-    )
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
-    parser.add_argument(
-        "--pairs", type=int, default=2000, metavar="N", help="the number of pairs of long_run"
-    )
+    parser = make_parser(__doc__, parts=PARTS, faust=True, output="reliability", pairs=2000)
     parser.add_argument("--preset", default="accurate", help="the preset of long_run")
-    parser.add_argument("--output", type=Path, default=Path("reliability"), metavar="DIR")
     measure_parts("Reliability", PARTS, parser.parse_args(), draw)
 
 

@@ -34,7 +34,6 @@ three minutes.
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import re
@@ -43,7 +42,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from importlib import import_module
@@ -57,13 +56,13 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import scipy.sparse as sp
+from common import Part, make_parser, measure_parts, medians
 from jaxtyping import Array, Float32, Int64
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from jaxsmw.benchmark.tables import markdown
 from jaxsmw.choices import Eigensolver, Search
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import Refiner
@@ -83,10 +82,8 @@ from jaxsmw.matching.preparation import paired_spectra
 from jaxsmw.matching.stages import PresetName, Stage
 from jaxsmw.matching.starts import initial_map
 from jaxsmw.report.figures import save_figure
-from jaxsmw.report.summary import provenance
 from jaxsmw.runtime.cache import cache_compiled_programs
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.files import make_directory
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
@@ -95,9 +92,6 @@ LARGE = (100_000, 300_000, 1_000_000)
 XLA_DEFAULTS = ", XLA's defaults"
 # For shapes with more than this number of vertices, a matrix of all distances would take gigabytes.
 STORED = 10_000
-
-Part = tuple[str, str, list[list[str]], dict[str, Any]]
-"""A tuple of a table's title, a note on the measurement, the rows of the table, and all measured numbers."""
 
 
 class PlainSearch(WaveletPreservation):
@@ -109,53 +103,22 @@ class PlainSearch(WaveletPreservation):
         return jnp.argmin(0.5 * jnp.sum(database**2, axis=1)[None, :] - products, axis=1).astype(jnp.int32)
 
 
-def medians(
-    candidates: dict[str, Callable[[], object]],
-    repeats: int,
-    clock: Callable[[], Any] = time.perf_counter,
-    *,
-    warm: bool = True,
-) -> dict[str, Any]:
-    """Run the candidates alternately, and return the median time of each candidate in seconds.
-
-    **Arguments:**
-
-    - `candidates`: a dictionary from the name of each candidate to the function to time.
-    - `repeats`: the number of timed runs of each candidate.
-    - `clock`: a function that returns the current time in seconds, or an array of times in seconds.
-    - `warm`: whether each candidate first runs once without timing, so that JAX compiles it.
-    """
-    seconds: dict[str, list[Any]] = {name: [] for name in candidates}
-    for turn in range(repeats + warm):
-        for name, candidate in candidates.items():
-            start = clock()
-            jax.block_until_ready(candidate())
-            if turn >= warm:
-                seconds[name].append(clock() - start)
-    return {name: np.median(times, axis=0).tolist() for name, times in seconds.items()}
-
-
 def wall_and_cpu() -> np.ndarray:
-    """Return the wall time, and the CPU time of this process and its finished child processes, in seconds."""
+    """Return the wall time, and the CPU time of this process and its finished children, in seconds."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return np.array([time.perf_counter(), time.process_time() + children.ru_utime + children.ru_stime])
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
-    """Return a table with the time of each candidate in seconds.
-
-    The last column contains the time divided by the time of the candidate named `of`.
-    """
+    """Return a table with the time of each candidate in seconds, and relative to the candidate `of`."""
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 
 
 def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
-    """Return a dictionary from names to functions that multiply the eigenvector matrices of X and Y.
+    """Return functions that multiply the eigenvector matrices of X and Y `ITERATIONS` times, by name.
 
-    All functions compute the same product, but in different ways: by JAX or NumPy, in blocks or as a whole.
-    Each function computes the product `ITERATIONS` times. The time of the fastest function is a lower bound
-    for the time of an exhaustive search.
+    The time of the fastest function is a lower bound for the time of an exhaustive search.
     """
     # Each block of products fits into the processor's cache. Only the maximum of each row is kept.
     rows = x.eigenvectors
@@ -165,7 +128,7 @@ def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
         return jax.lax.map(lambda block: jnp.max(block @ b.T, axis=1), a)
 
     usual, ours = jax.jit(blocked), compiled(blocked)
-    found: dict[str, Callable[[], object]] = {
+    ways: dict[str, Callable[[], object]] = {
         "products, JAX in blocks": lambda: [ours(blocks, y.eigenvectors) for _ in range(ITERATIONS)],
         f"products, JAX in blocks{XLA_DEFAULTS}": lambda: [
             usual(blocks, y.eigenvectors) for _ in range(ITERATIONS)
@@ -175,9 +138,9 @@ def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
         product = jax.jit(lambda a, b: a @ b.T)
         a, b = np.asarray(rows), np.asarray(y.eigenvectors)
         out = np.empty((a.shape[0], b.shape[0]), a.dtype)
-        found["products, JAX"] = lambda: [product(rows, y.eigenvectors) for _ in range(ITERATIONS)]
-        found["products, NumPy"] = lambda: [np.matmul(a, b.T, out=out) for _ in range(ITERATIONS)]
-    return found
+        ways["products, JAX"] = lambda: [product(rows, y.eigenvectors) for _ in range(ITERATIONS)]
+        ways["products, NumPy"] = lambda: [np.matmul(a, b.T, out=out) for _ in range(ITERATIONS)]
+    return ways
 
 
 def refinement(options: argparse.Namespace) -> Iterator[Part]:
@@ -264,9 +227,9 @@ def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
 
 
 def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
-    """For each size, yield the wall-clock times to compute the eigenbases of two shapes concurrently.
+    """For each size, yield the times to compute the eigenbases of two shapes concurrently.
 
-    The processes start before the timed runs, so the times exclude the start of the processes.
+    The times exclude the start of the processes.
     """
     for size in options.sizes:
         pair = creature_pair(vertices=size)
@@ -297,21 +260,18 @@ def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
 
 
 kept_meshes: list[Mesh] = []
-"""The meshes that `keep` stored in this process."""
+"""The meshes whose eigenbases this process computes."""
 
 
 def keep(meshes: Sequence[Mesh]) -> None:
-    """Store the meshes for `eigenbasis_of` in this process."""
     kept_meshes[:] = meshes
 
 
 def eigenbasis_of(number: int) -> None:
-    """Compute the eigenbasis of `kept_meshes[number]`."""
     eigenpairs(kept_meshes[number], EIGENVECTORS)
 
 
 def eigenbasis_in_one_thread(number: int) -> None:
-    """Compute the eigenbasis of `kept_meshes[number]` with one BLAS thread."""
     with one_blas_thread():
         eigenbasis_of(number)
 
@@ -371,19 +331,15 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
         paper = ["--preset", "paper"]
 
         def started(*arguments: str, cache: Path | None = None, own: bool = True) -> Callable[[], object]:
-            """Return a function that runs Python with the given arguments.
+            """Return a function that runs Python, by default with an empty cache.
 
-            Without a cache, the process starts with an empty cache. With `own` False, only programs are kept
-            from earlier commands.
+            With `own` False, only programs are kept from earlier commands.
             """
 
-            def removable() -> list[Path]:
-                entries = cache.glob("*.npz") if cache and not own else ()
-                return [entry for entry in entries if not entry.name.startswith("traced-program-")]
-
             def run() -> None:
-                for entry in removable():
-                    entry.unlink()
+                for entry in cache.glob("*.npz") if cache and not own else ():
+                    if not entry.name.startswith("traced-program-"):
+                        entry.unlink()
                 with tempfile.TemporaryDirectory() as empty:
                     environment = {**os.environ, "JAXSMW_CACHE": str(cache or empty)}
                     command = [sys.executable, *arguments]
@@ -438,10 +394,7 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
 
 
 def people(options: argparse.Namespace, number: int) -> list[tuple[Mesh, Mesh]]:
-    """Return pairs of people of the remeshed FAUST set if `--data` is given, else pairs of creatures.
-
-    The meshes have about 5000 vertices.
-    """
+    """Return pairs of people of the remeshed FAUST set, or without `--data` of creatures of like size."""
     if options.data is None:
         pairs = (creature_pair(vertices=5000, seed=seed) for seed in range(number))
         return [(pair.source, pair.target) for pair in pairs]
@@ -475,14 +428,7 @@ def later_pairs(options: argparse.Namespace) -> Iterator[Part]:
 
 
 class Truth(NamedTuple):
-    """A pair of meshes with ground truth.
-
-    **Attributes:**
-
-    - `meshes`: source and target.
-    - `rows`: the vertices of the source that have ground truth (r,).
-    - `targets`: the true match of each vertex in `rows` (r,).
-    """
+    """Source and target, the vertices of the source with ground truth (r,), and their true matches (r,)."""
 
     meshes: tuple[Mesh, Mesh]
     rows: Int64[np.ndarray, " r"]
@@ -491,14 +437,13 @@ class Truth(NamedTuple):
     def error(self, pointwise_map: np.ndarray, target: Mesh, number: int | None = None) -> float:
         """Return the mean geodesic error in thousandths of the square root of the target's area.
 
-        The argument `target` may be a subdivided version of the target in `meshes` (see `finer`). Each match
-        is replaced by the nearest vertex of the target in `meshes`. If `number` is given, the error is
-        measured at this number of random vertices, because distances to far matches take long to compute.
+        The `target` may be subdivided (see `finer`). Each match is replaced by the nearest vertex of the
+        target in `meshes`. The error is measured at `number` random vertices; None for all.
         """
-        chosen = np.random.default_rng(0).permutation(len(self.rows))[:number]
-        coarse, matches = self.meshes[1], pointwise_map[self.rows[chosen]]
+        drawn = np.random.default_rng(0).permutation(len(self.rows))[:number]
+        coarse, matches = self.meshes[1], pointwise_map[self.rows[drawn]]
         _, nearest = KDTree(coarse.vertices).query(target.vertices[matches])
-        distances = geodesic_distances_between(coarse, self.targets[chosen], nearest)
+        distances = geodesic_distances_between(coarse, self.targets[drawn], nearest)
         return 1000 * float(distances.mean()) / coarse.area**0.5
 
 
@@ -521,8 +466,7 @@ def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
     """Split the longest edges of a mesh until it has `number_of_vertices` vertices, and move the vertices.
 
     The vertices move by random noise, whose standard deviation is 10 % of the mean edge length. The vertices
-    of the given mesh keep their indices. If the given mesh already has enough vertices, it is returned
-    without noise.
+    of the given mesh keep their indices. A mesh with enough vertices is returned without noise.
     """
     vertices, faces = mesh.vertices, mesh.faces
     while (missing := number_of_vertices - len(vertices)) > 0:
@@ -544,19 +488,12 @@ def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
 def split_faces(
     faces: Int64[np.ndarray, "f 3"], middles: Int64[np.ndarray, "f 3"], number: int
 ) -> Int64[np.ndarray, "g 3"]:
-    """Subdivide those faces that have exactly `number` split edges.
+    """Subdivide those faces (f, 3) that have exactly `number` split edges.
 
-    **Arguments:**
-
-    - `faces`: the faces of the mesh (f, 3).
-    - `middles`: for each corner, the new vertex on the edge to the next corner (f, 3); -1 if the edge is not
-      split.
-    - `number`: the number of split edges, 0 to 3. With 3 split edges, a face becomes four similar faces.
-
-    **Returns:** The subdivided faces (g, 3).
+    `middles` contains for each corner the new vertex on the edge to the next corner; -1 without a split.
     """
-    chosen = (middles >= 0).sum(axis=1) == number
-    faces, middles = faces[chosen], middles[chosen]
+    affected = (middles >= 0).sum(axis=1) == number
+    faces, middles = faces[affected], middles[affected]
     # Rotate the corners of each face. If only one edge is split, it becomes the first edge. If only one edge
     # is unsplit, it becomes the last edge.
     first = (np.argmin(middles >= 0, axis=1) + 1) % 3
@@ -575,33 +512,21 @@ def split_faces(
 
 
 def peak_memory() -> float:
-    """Return the peak memory of this process so far, in GiB.
-
-    On Linux, the function reads `VmHWM`, because the peak of `getrusage` can include the memory of the parent
-    process.
-    """
+    """Return the peak memory of this process so far, in GiB."""
     status = Path("/proc/self/status")
-    if status.exists():
+    if status.exists():  # the peak of `getrusage` can include the memory of the parent process
         (kilobytes,) = re.findall(r"VmHWM:\s*(\d+) kB", status.read_text("utf-8"))
         return int(kilobytes) / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
 
 
 class FromFiles(NamedTuple):
-    """The measurements of a match from two mesh files to the map.
+    """The measurements of a match from two mesh files to the map."""
 
-    **Attributes:**
-
-    - `seconds`: a dictionary from the name of each step to its wall time in seconds.
-    - `cpu`: the CPU time in seconds.
-    - `peak`: the peak memory of the process in GiB.
-    - `maps`: the initial map and the refined map.
-    """
-
-    seconds: dict[str, float]
-    cpu: float
-    peak: float
-    maps: tuple[np.ndarray, np.ndarray]
+    seconds: dict[str, float]  # the wall time of each step
+    cpu: float  # seconds
+    peak: float  # memory of the process in GiB
+    maps: tuple[np.ndarray, np.ndarray]  # initial and refined
 
 
 def matched_from_files(files: list[str], preset: PresetName) -> FromFiles:
@@ -632,8 +557,8 @@ def in_new_process(cache: Path, function: Callable[..., FromFiles], *arguments: 
 def scale(options: argparse.Namespace) -> Iterator[Part]:
     """For each of the presets `paper` and `accurate`, yield times and memory for shapes of several sizes."""
     large = () if options.quick else LARGE
-    yield scaled(options, "paper", (10_000, 30_000, *large))
-    yield scaled(options, "accurate", (10_000, 30_000, *large))
+    for preset in ("paper", "accurate"):
+        yield scaled(options, preset, (10_000, 30_000, *large))
 
 
 def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]) -> Part:
@@ -650,21 +575,11 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
                 in_new_process(Path(directory) / "cache", matched_from_files, files, preset) for _ in range(2)
             )
         errors = [truth.error(pointwise_map, meshes[1]) for pointwise_map in cold.maps]
-        totals = {
-            "cold": sum(cold.seconds.values()),
-            "cold, CPU": cold.cpu,
-            "warm": sum(warm.seconds.values()),
-            "warm, CPU": warm.cpu,
-        }
-        measured.append(
-            {
-                "vertices": size,
-                "seconds": cold.seconds,
-                "totals": totals,
-                "peak_gib": cold.peak,
-                "errors": errors,
-            }
-        )
+        totals = {}
+        for name, run in (("cold", cold), ("warm", warm)):
+            totals |= {name: sum(run.seconds.values()), f"{name}, CPU": run.cpu}
+        numbers = {"vertices": size, "seconds": cold.seconds, "totals": totals}
+        measured.append(numbers | {"peak_gib": cold.peak, "errors": errors})
     # Some stages run only for some sizes, and only then have steps of their own.
     names = [
         list(dict.fromkeys(name for each in measured for name in each[kind]))
@@ -708,10 +623,7 @@ def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]
 
 
 def peers(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the times of several libraries for one pair.
-
-    Each library reads the files, computes its eigenbases and refines a map.
-    """
+    """Yield the times of several libraries to read a pair, to compute eigenbases and to refine a map."""
     truth = pair_with_truth(options)
     missing = [name for name in ("pyFM", "geomfum") if not find_spec(name)]
     if missing:
@@ -773,11 +685,7 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
 
 
 def throughput(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the pairs per minute and the errors of several libraries, for pairs of ten meshes of people.
-
-    jaxsmw matches all pairs in one process, with an empty cache at first. Each other library matches some of
-    the pairs in ten processes, each with one BLAS thread.
-    """
+    """Yield the pairs per minute and the errors of several libraries, for pairs of ten meshes of people."""
     if options.data is None:
         print("\nthroughput: left out, because it needs the option --data.")
         return
@@ -802,14 +710,19 @@ def throughput(options: argparse.Namespace) -> Iterator[Part]:
                 maps.append(found.pointwise_map)
             add(f"jaxsmw, {preset}", pairs, maps, time.perf_counter() - start)
         os.environ["JAXSMW_CACHE"] = "off"
-    for name, library, run, chosen in (
-        ("pyFM, its defaults, ZoomOut on to 100", "pyFM", pyfm_wider_from_files, pairs[::2]),
+    for name, library, run, matched in (
+        (
+            "pyFM, its defaults, ZoomOut on to 100",
+            "pyFM",
+            partial(pyfm_defaults_from_files, step=5),
+            pairs[::2],
+        ),
         ("pyFM, ZoomOut 20 to 100 from our start", "pyFM", pyfm_from_files, pairs[::2]),
         ("geomfum, ZoomOut 20 to 100 from our start", "geomfum", geomfum_from_files, pairs[::6]),
     ):
         if find_spec(library):
-            arguments = [([files[x], files[y]], starts[x, y]) for x, y in chosen]
-            add(name, chosen, *in_ten_processes(run, arguments, library))
+            arguments = [([files[x], files[y]], starts[x, y]) for x, y in matched]
+            add(name, matched, *in_ten_processes(run, arguments, library))
         else:
             print(f"\nthroughput: {library} not installed: install with pip install 'jaxsmw[peers]'.")
     rows = [["", "pairs", "seconds", "pairs per minute", "error x10^-3"]]
@@ -832,8 +745,7 @@ def in_ten_processes(
 ) -> tuple[list[np.ndarray], float]:
     """Call a function in ten processes, each with one BLAS thread.
 
-    **Returns:** The first result of each call, and the seconds of all calls together. The seconds leave out
-    the start of the processes and the import of the library.
+    **Returns:** The first result of each call, and the seconds of all calls together after the imports.
     """
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(10, spawned, initializer=import_alone, initargs=(library,)) as pool:
@@ -862,10 +774,13 @@ def ours_from_files(
     return result.pointwise_map, result.seconds["refinement"]
 
 
-def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarray, float]:
+def pyfm_defaults_from_files(
+    files: list[str], first: object = None, step: int = 1
+) -> tuple[np.ndarray, float]:
     """Match with `pyFM.functional.FunctionalMapping`, its default descriptors, and ZoomOut.
 
-    ZoomOut starts from 50 eigenvectors and takes ten steps, each of which adds `step` eigenvectors.
+    ZoomOut starts from 50 eigenvectors and takes ten steps, each of which adds `step` eigenvectors. The
+    initial map `first` is not used.
     """
     from pyFM.functional import FunctionalMapping
     from pyFM.mesh import TriMesh
@@ -877,11 +792,6 @@ def pyfm_defaults_from_files(files: list[str], step: int = 1) -> tuple[np.ndarra
     start = time.perf_counter()
     found = model.get_p2p(model.zoomout_refine(step=step))
     return np.asarray(found), time.perf_counter() - start
-
-
-def pyfm_wider_from_files(files: list[str], _: np.ndarray) -> tuple[np.ndarray, float]:
-    """Match as in `pyfm_defaults_from_files`, with ZoomOut to 100 eigenvectors and without an initial map."""
-    return pyfm_defaults_from_files(files, step=5)
 
 
 def pyfm_from_files(files: list[str], first: np.ndarray) -> tuple[np.ndarray, float]:
@@ -933,10 +843,7 @@ ZOOMOUT_STEPS = 16
 
 
 def draw(numbers: dict[str, Any], file: Path) -> None:
-    """Plot the times of the parts `refinement`, `eigenbasis` and `scale` against the number of vertices.
-
-    The plot of `scale` also shows the peak memory.
-    """
+    """Plot the times of `refinement`, `eigenbasis` and `scale`, and the peak memory, against the size."""
     panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
     for part in ("refinement", "eigenbasis"):
         for measured in numbers.get(part, []):
@@ -986,47 +893,13 @@ PARTS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = make_parser(__doc__, parts=PARTS, faust=True, output="speed")
     parser.add_argument("--quick", action="store_true", help="measure only the smallest sizes")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), metavar="PART")
-    parser.add_argument(
-        "--data", type=Path, metavar="FAUST_R", help="the directory of the remeshed FAUST set"
-    )
-    parser.add_argument("--output", type=Path, default=Path("speed"), metavar="DIR")
     options = parser.parse_args()
     options.sizes, options.repeats = (SIZES[:1], 3) if options.quick else (SIZES, 9)
     os.environ["JAXSMW_CACHE"] = "off"
 
     measure_parts("Speed", PARTS, options, draw)
-
-
-def measure_parts(
-    title: str,
-    parts: Mapping[str, Callable[[argparse.Namespace], Iterator[Part]]],
-    options: argparse.Namespace,
-    draw: Callable[[dict[str, Any], Path], object] | None = None,
-) -> None:
-    """Measure the parts named in `options.only`, and print each table when it is measured.
-
-    The tables and all numbers are written to files in `options.output`, with names made from the title. The
-    function `draw` draws the numbers to a file.
-    """
-    file = make_directory(options.output) / title.lower()
-    origin = provenance()
-    texts, numbers = [f"# {title}\n\n{json.dumps(origin)}"], {"provenance": origin}
-    print(texts[0])
-    for name in options.only:
-        numbers[name] = []
-        for heading, note, rows, measured in parts[name](options):
-            texts.append(f"## {heading}\n\n{note}\n\n{markdown(rows)}")
-            print(f"\n{texts[-1]}", flush=True)
-            numbers[name].append(measured)
-            file.with_suffix(".md").write_text("\n\n".join(texts), "utf-8")
-            file.with_suffix(".json").write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")
-            if draw is not None:
-                draw(numbers, file.with_suffix(".png"))
 
 
 if __name__ == "__main__":

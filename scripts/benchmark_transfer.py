@@ -23,8 +23,6 @@ molars and six pairs of mandibles, and these three were the best. Molars of oppo
 
 from __future__ import annotations
 
-import argparse
-import csv
 import functools
 import itertools
 import time
@@ -32,6 +30,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from common import common_landmarks, make_parser, measure_pairs, scan_files, side_of
 from jaxtyping import Float64
 
 from jaxsmw import Mesh, geodesic_error, match, read_ground_truth, read_mesh
@@ -41,9 +40,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry import farthest_point_samples, nearest_surface_points
 from jaxsmw.geometry.alignment import align_rigidly
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal
-from jaxsmw.io import Landmarks, read_landmark_file
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.runtime.compilation import release_programs
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.transfer import RegisteredMesh, transfer_landmarks
 
@@ -53,29 +50,22 @@ _POINTS = 1000
 
 def main() -> None:
     """Measure the data sets that the command line names, and print a summary of each."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, output="transfer", pairs=20)
     parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument("sets", nargs="+", metavar="DATA_SET")
     parser.add_argument(
-        "--pairs", type=int, default=20, help="number of pairs of each data set (default: 20)"
-    )
-    parser.add_argument(
         "--init", choices=get_args(MatchInit), default="auto", help="initial map of scans (default: auto)"
     )
-    parser.add_argument("--output", type=Path, default=Path("transfer"), help="directory of the results")
     options = parser.parse_args()
-    options.output.mkdir(parents=True, exist_ok=True)
     for name in options.sets:
         measure = _measure_body if name in _BODIES else functools.partial(_measure_scan, init=options.init)
-        journal = Journal(options.output / f"{name}.csv", ("source", "target"))
-        for source, target in _draw(options.directory / name, options.pairs):
-            if (source.stem, target.stem) not in journal:
-                release_programs()
-                row = {"source": source.stem, "target": target.stem, **measure(source, target)}
-                journal.append([row])
-                print(row, flush=True)
+        pairs = _draw(options.directory / name, options.pairs)
+        journal = measure_pairs(
+            options.output / f"{name}.csv",
+            pairs,
+            lambda pair: (pair[0].stem, pair[1].stem),
+            lambda pair, measure=measure: measure(*pair),
+        )
         print(f"{name}: {_summary(journal)}\n{made_with()}", flush=True)
 
 
@@ -90,15 +80,14 @@ def _draw(directory: Path, number: int) -> list[tuple[Path, Path]]:
     listing = directory / "test_pairs.txt"
     if listing.exists():
         by_name = {file.stem: file for file in directory.rglob("*.off")}
-        pairs = [tuple(by_name[name.removesuffix(".off")] for name in line.split()[:2])
-                 for line in listing.read_text("utf-8").splitlines()]  # fmt: skip
+        lines = (line.split() for line in listing.read_text("utf-8").splitlines())
+        pairs = [(by_name[Path(x).stem], by_name[Path(y).stem]) for x, y, *_ in lines]
     else:
-        files = sorted(file for file in directory.rglob("*") if file.suffix in (".off", ".ply", ".vtk"))
-        pairs = list(itertools.combinations(files, 2))
+        pairs = list(itertools.combinations(scan_files(directory), 2))
     if not pairs:
         raise InputError(f"{directory}: contains no meshes: give the directory of the data sets.")
-    chosen = [pairs[i] for i in np.random.default_rng(0).permutation(len(pairs))]
-    return [*chosen, *(pair[::-1] for pair in chosen)][:number]  # type: ignore[misc]
+    drawn = [pairs[i] for i in np.random.default_rng(0).permutation(len(pairs))]
+    return [*drawn, *((y, x) for x, y in drawn)][:number]
 
 
 def _measure_body(source: Path, target: Path) -> dict[str, Any]:
@@ -132,10 +121,8 @@ def _register(
 def _measure_scan(source: Path, target: Path, init: MatchInit) -> dict[str, Any]:
     """Measure the distances of carried landmarks to manual landmarks, by several methods."""
     mesh_x, mesh_y = read_mesh(source), read_mesh(target)
-    marks_x, marks_y = read_scan_landmarks(source), read_scan_landmarks(target)
-    names = [name for name in marks_x.names if name in set(marks_y.names)]
-    marks_x, marks_y = marks_x.select(names), marks_y.select(names)
-    mirrored = _side(source) != _side(target)
+    marks_x, marks_y = common_landmarks(source, target)
+    mirrored = side_of(source) != side_of(target)
     found, registered, seconds = _register(mesh_x, mesh_y, mirrored=mirrored, init=init)
     on_source, off_source = nearest_surface_points(marks_x.positions, mesh_x)
     _, off_target = nearest_surface_points(marks_y.positions, mesh_y)
@@ -152,30 +139,6 @@ def _measure_scan(source: Path, target: Path, init: MatchInit) -> dict[str, Any]
         row |= {f"{method}_mean": distances.mean(), f"{method}_median": float(np.median(distances))}
     noise = (off_source / bounding_box_diagonal(mesh_x) * 1e3).mean(), (off_target / unit).mean()
     return {**row, "manual_noise": float(np.mean(noise)), **seconds}
-
-
-def read_scan_landmarks(file: Path) -> Landmarks:
-    """Read the manual landmarks of a scan from `SCAN.mrk.json`, `SCAN.csv` or `landmarks.csv`."""
-    markups = file.with_suffix(".mrk.json")
-    if markups.exists():
-        return read_landmark_file(markups)
-    table = file.with_suffix(".csv")
-    if table.exists():
-        return read_landmark_file(table)
-    with open(file.parent / "landmarks.csv", encoding="utf-8") as rows:
-        own = [row for row in csv.DictReader(rows) if row["mesh"] == file.name]
-    positions = np.array([[float(row[axis]) for axis in "xyz"] for row in own])
-    return Landmarks(tuple(row["landmark"] for row in own), positions, name=str(file))
-
-
-def _side(file: Path) -> str:
-    """Return the side of a tooth, or an empty string for scans without a side."""
-    table = file.parent / "chirality.csv"
-    if not table.exists():
-        return ""
-    with open(table, encoding="utf-8") as rows:
-        sides = {row["name"]: row["side"] for row in csv.DictReader(rows)}
-    return sides.get(file.stem, sides.get(file.stem.removesuffix("_sas"), ""))
 
 
 def _aligned(

@@ -24,7 +24,6 @@ and prints four tables:
 
 from __future__ import annotations
 
-import argparse
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -33,20 +32,20 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from common import make_parser, write_text
 from jaxtyping import Float64
 from scipy.optimize import minimize
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
 from jaxsmw import InputError, geodesic_error, match, read_mesh
-from jaxsmw.benchmark.datasets import DataPair, DataSet, choose_pairs, open_data_set
+from jaxsmw.benchmark.datasets import DataPair, choose_pairs, open_data_set
 from jaxsmw.benchmark.tables import markdown
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.judge import dirichlet_energy_ratio, distortion, wrong_probability
 from jaxsmw.matching.settings import WrongProbabilitySettings
 from jaxsmw.matching.stages import PRESETS, PresetName
 from jaxsmw.runtime.compilation import release_programs
-from jaxsmw.runtime.files import atomic_write
 from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
@@ -59,15 +58,9 @@ WITHOUT_REPAIR = PRESETS["accurate"].stages[1:]
 
 
 class Measured(NamedTuple):
-    """The measurements of one pair.
+    """The measurements of one pair: errors of the evaluated vertices (p,), and scores of the whole map.
 
-    **Attributes:**
-
-    - `true`, `expected`: the true and the expected errors of the evaluated vertices (p,).
-    - `distortion`: the distortion of the map.
-    - `mean_expected`: the mean expected error of all vertices.
-    - `scores`: a dictionary from the name of each score to its values for the result and for the mirrored
-      map. The dictionary is empty if there is no mirrored map.
+    For each score, `scores` contains its values for the result and for the mirrored map, if there is one.
     """
 
     true: Float64[np.ndarray, " p"]
@@ -174,8 +167,7 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
         )
     yield (
         "Errors x 10⁻³ √area. The last column is the share of all gross errors that belong to the 10 % of "
-        "each "
-        "pair's vertices with the largest expected errors.\n\n" + markdown(rows)
+        "each pair's vertices with the largest expected errors.\n\n" + markdown(rows)
     )
 
     everything = [pair for pairs in measured.values() for pair in pairs]
@@ -210,9 +202,7 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("data_sets", metavar="DATA_SET_DIRECTORY", nargs="+", type=Path)
     parser.add_argument(
         "--pairs",
@@ -232,20 +222,19 @@ def main() -> None:
     options = parser.parse_args()
     warnings.simplefilter("ignore")  # hides warnings about the quality of each mesh
 
-    chosen: list[tuple[DataSet, DataPair]] = []
+    drawn: list[tuple[str, DataPair]] = []
     for directory in options.data_sets:
         data_set = open_data_set(directory)
-        chosen += [(data_set, pair) for pair in choose_pairs(data_set, options.pairs, options.seed)]
+        drawn += [(data_set.name, pair) for pair in choose_pairs(data_set, options.pairs, options.seed)]
     measured: dict[str, list[Measured]] = {}
-    for preset, (data_set, pair) in tqdm(list(product(options.preset, chosen)), unit="map"):
-        name = data_set.name if len(options.preset) == 1 else f"{data_set.name}, {preset}"
+    for preset, (data_set_name, pair) in tqdm(list(product(options.preset, drawn)), unit="map"):
+        name = data_set_name if len(options.preset) == 1 else f"{data_set_name}, {preset}"
         measured.setdefault(name, []).append(measure(pair, options.seed, preset))
         release_programs()
     page = "\n".join((*tables(measured), made_with() + "\n"))
     print(page)
     if options.output:
-        with atomic_write(options.output) as temporary:
-            temporary.write_text(page, "utf-8")
+        write_text(options.output, page)
 
 
 if __name__ == "__main__":

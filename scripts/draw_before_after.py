@@ -9,12 +9,11 @@ after, and the target. The two directories contain one map per pair. The map of 
 
 from __future__ import annotations
 
-import argparse
-import io
 from pathlib import Path
 
 import numpy as np
-from draw_documentation import save_small
+from common import make_parser
+from draw_documentation import picture_of, save_small
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial import KDTree
@@ -36,9 +35,7 @@ def body(
     mesh: jaxsmw.Mesh, colors: Float[np.ndarray, "n 3"] | None, up: str | None
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return the picture of a body, which fits into a square."""
-    buffer = io.BytesIO()
-    draw_mesh(mesh, colors, up=up).savefig(buffer, format="png", dpi=200)
-    picture = Image.open(buffer).convert("RGB")
+    picture = picture_of(draw_mesh(mesh, colors, up=up))
     picture.thumbnail((BODY, BODY), Image.Resampling.LANCZOS)
     square = Image.new("RGB", (BODY, BODY), "white")
     square.paste(picture, ((BODY - picture.width) // 2, (BODY - picture.height) // 2))
@@ -46,9 +43,7 @@ def body(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("data_set", metavar="DATA_SET_DIRECTORY", type=Path)
     parser.add_argument("pairs", metavar="PAIRS.txt", help="a list of pairs, one pair per line")
     parser.add_argument("before", metavar="BEFORE", type=Path, help="directory of maps")
@@ -78,10 +73,7 @@ def main() -> None:
     sheet = Image.new("RGB", (PAIRS_PER_ROW * width, rows * height), "white")
     for number, panel in enumerate(panels):
         sheet.paste(panel, (number % PAIRS_PER_ROW * width, number // PAIRS_PER_ROW * height))
-    full = options.picture.with_suffix(".full.png")
-    sheet.save(full)
-    save_small(options.picture, full)
-    full.unlink()
+    save_small(options.picture, sheet)
 
 
 if __name__ == "__main__":

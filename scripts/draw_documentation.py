@@ -9,7 +9,6 @@ The first case is a pair of SHREC'16 topology (`shrec16_topology`). The second c
 TOSCA (`tosca_nonisometric`). The script takes several minutes.
 """
 
-import argparse
 import io
 import os
 import re
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple
 
 import igl
 import numpy as np
+from common import make_parser
 from jaxtyping import Float
 from matplotlib.colors import hsv_to_rgb
 from matplotlib.figure import Figure
@@ -42,15 +42,9 @@ COLORS = 256
 
 
 class Case(NamedTuple):
-    """A failure case: a pair of meshes that `jaxsmw.match` does not match correctly with certain options.
+    """A pair of meshes that `jaxsmw.match` does not match correctly with the options `failing`.
 
-    **Attributes:**
-
-    - `name`: the name of the failure case and of its picture.
-    - `source`, `target`, `truth`: the two meshes and their ground truth.
-    - `failing`: options of `jaxsmw.match` with which the match fails.
-    - `cure`: options with which the match succeeds; None if there are no such options.
-    - `up`: the vertical axis of both shapes; None if the drawing function chooses the axis.
+    With the options `cure`, if there are any, the match succeeds. `up` is the vertical axis of both shapes.
     """
 
     name: str
@@ -166,19 +160,19 @@ def draw_case(case: Case) -> str:
             figure = draw_correspondence(
                 case.source, case.target, result.pointwise_map, errors=panels, up=case.up
             )
-            save_small(PICTURES / f"failure_{case.name}.png", figure)
+            save_small(PICTURES / f"failure_{case.name}.png", picture_of(figure))
     return f"| {case.name} | {' | '.join(cells)} |"
 
 
-def save_small(path: Path, figure: Figure | Path) -> None:
-    """Write a figure or an image file as a PNG at most 1200 pixels wide, with few colours."""
-    if isinstance(figure, Path):
-        image = Image.open(figure)
-    else:
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=200)
-        image = Image.open(buffer)
-    image = image.convert("RGB")
+def picture_of(figure: Figure) -> Image.Image:
+    """Return a figure as an image."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=200)
+    return Image.open(buffer).convert("RGB")
+
+
+def save_small(path: Path, image: Image.Image) -> None:
+    """Write an image as a PNG at most 1200 pixels wide, with few colours."""
     if image.width > 1200:
         image = image.resize((1200, round(image.height * 1200 / image.width)), Image.Resampling.LANCZOS)
     few = image.quantize(palette=image.quantize(COLORS), dither=Image.Dither.FLOYDSTEINBERG)
@@ -201,7 +195,7 @@ def draw_tutorial() -> None:
         finally:
             os.chdir(previous_directory)
         for name in re.findall(r"\]\(pictures/(\w+\.png)\)", page):
-            save_small(PICTURES / name, Path(directory) / name)
+            save_small(PICTURES / name, Image.open(Path(directory) / name).convert("RGB"))
 
 
 def draw_transfers() -> None:
@@ -289,26 +283,18 @@ def fold_lines(mesh: jaxsmw.Mesh) -> Float[np.ndarray, "n 3"]:
 
 def draw_side_by_side(name: str, panels: dict[str, tuple[jaxsmw.Mesh, Float[np.ndarray, "n 3"]]]) -> None:
     """Write a picture with one coloured mesh per panel."""
-    images = []
-    for mesh, colors in panels.values():
-        buffer = io.BytesIO()
-        draw_mesh(mesh, colors, up="y").savefig(buffer, format="png", dpi=200)
-        images.append(Image.open(buffer).convert("RGB"))
+    images = [picture_of(draw_mesh(mesh, colors, up="y")) for mesh, colors in panels.values()]
     height = max(image.height for image in images)
     sheet = Image.new("RGB", (sum(image.width for image in images), height), "white")
     left = 0
     for image in images:
         sheet.paste(image, (left, height - image.height))
         left += image.width
-    with tempfile.TemporaryDirectory() as directory:
-        sheet.save(Path(directory) / f"{name}.png")
-        save_small(PICTURES / f"{name}.png", Path(directory) / f"{name}.png")
+    save_small(PICTURES / f"{name}.png", sheet)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("data", nargs="?", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument(
         "--only",
@@ -318,14 +304,14 @@ def main() -> None:
     )
     options = parser.parse_args()
     PICTURES.mkdir(exist_ok=True)
-    if not options.only or "tutorial" in options.only:
-        draw_tutorial()
-    if not options.only or "transfers" in options.only:
-        draw_transfers()
-    if not options.only or "another_kind" in options.only:
-        draw_another_kind()
-    if not options.only or "collection" in options.only:
-        draw_without_repair()
+    for name, draw in (
+        ("tutorial", draw_tutorial),
+        ("transfers", draw_transfers),
+        ("another_kind", draw_another_kind),
+        ("collection", draw_without_repair),
+    ):
+        if not options.only or name in options.only:
+            draw()
     cases = [*procedural_cases(), *(real_cases(options.data) if options.data else ())]
     print("| case | error | expected | error, cured | expected, cured |\n| --- | --- | --- | --- | --- |")
     for case in cases:

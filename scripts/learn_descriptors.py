@@ -49,7 +49,6 @@ from learning import (
     Trained,
     comparison,
     errors,
-    measure,
     padded,
     parser,
     reading,
@@ -57,7 +56,6 @@ from learning import (
     root_mean_square,
     running,
     smoothed,
-    train,
     unit_area_positions,
 )
 
@@ -91,26 +89,14 @@ WATCHED_PAIRS = 4
 
 @dataclass(frozen=True)
 class Sizes:
-    """The sizes of a network, which determine the shapes of all its arrays.
+    """The sizes of a network, which determine the shapes of all its arrays; all are positive integers."""
 
-    **Attributes:**
-
-    - `inputs`: the number of SHOT entries per vertex.
-    - `waves`: the number of entries of the wave kernel signature per vertex.
-    - `width`: the number of channels in each block.
-    - `blocks`: the number of `WaveletBlock`s.
-    - `filters`: the number of filters of the Meyer frame in each block.
-    - `outputs`: the number of descriptors per vertex.
-
-    **Raises:** `ValueError` if a size is not a positive integer.
-    """
-
-    inputs: int = SHOT_DIMENSION
-    waves: int = 32
-    width: int = 64
+    inputs: int = SHOT_DIMENSION  # entries of SHOT per vertex
+    waves: int = 32  # entries of the wave kernel signature per vertex
+    width: int = 64  # channels in each block
     blocks: int = 3
-    filters: int = 6
-    outputs: int = 32
+    filters: int = 6  # of the Meyer frame in each block
+    outputs: int = 32  # descriptors per vertex
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
@@ -247,15 +233,9 @@ def described(mesh: Mesh) -> Spectrum:
 
 
 class Matched(NamedTuple):
-    """The soft maps and the functional map that `matched` computes from the descriptors of two shapes.
+    """The soft maps that a layer recovers from descriptors and from its functional map, and this map.
 
-    **Attributes:**
-
-    - `by_descriptors`: the soft map that the layer recovers from the descriptors alone.
-    - `by_layer`: the soft map that the layer recovers from its functional map.
-    - `functional_map`: the functional map of the layer.
-    - `energy`: the wavelet-preservation energy of `functional_map` and `by_layer`, divided by the number of
-      eigenvectors.
+    `energy` is the wavelet-preservation energy of the functional map, divided by the number of eigenvectors.
     """
 
     by_descriptors: SoftMap | SparseSoftMap
@@ -288,11 +268,9 @@ def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[A
 def inconsistency(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
     """Return the loss `cycles`, which needs no ground truth.
 
-    The loss is a weighted sum of these terms:
-
-    - the wavelet-preservation energies of the forward and the backward functional map;
-    - the squared deviation of the product of both functional maps from the identity;
-    - the distances between points of X and their images under the forward map followed by the backward map.
+    The loss is a weighted sum of the wavelet-preservation energies of both functional maps, of the squared
+    deviation of their product from the identity, and of the distances of points of X from their images under
+    the forward map followed by the backward map.
     """
     forward, backward = matched(network, pair.x, pair.y), matched(network, pair.y, pair.x)
     round_trip = product(forward.functional_map, backward.functional_map)
@@ -328,10 +306,7 @@ def save(network: DescriptorNetwork, path: Path) -> None:
 
 
 def load(path: Path) -> DescriptorNetwork:
-    """Read a network that `save` wrote.
-
-    **Raises:** `InputError` if the file is damaged or was not written by `save`.
-    """
+    """Read a network that `save` wrote; `InputError` if the file is damaged."""
     with reading(path) as stream:
         header = json.loads(stream.readline(_LONGEST_HEADER))
         sizes, dtype = Sizes(**header["sizes"]), jnp.dtype(header["dtype"])
@@ -372,7 +347,7 @@ def descriptor_errors(
 REFERENCE, START, REFINED = "SHOT", ", start", ", refined"
 
 
-def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Iterator[str]:
+def summary(measured: Measured, steps: int, seed: int) -> Iterator[str]:
     """Yield the parts of `summary.md`."""
     yield "# Learned descriptors\n"
     yield (
@@ -390,7 +365,6 @@ def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Itera
             for data_set, pairs in measured.items()
         }
         yield comparison(here, names, seed)
-    yield begun_with + "\n"
 
 
 def draw(curves: Mapping[str, Trained], path: Path) -> None:
@@ -416,33 +390,21 @@ def main() -> None:
         optimizer = optax.chain(optax.clip_by_global_norm(LARGEST_GRADIENT), optax.adam(steps))
         curves = {}
         for name, loss in LOSSES.items():
-            curves[name] = train(
+            curves[name] = run.train(
                 name,
                 loss,
                 DescriptorNetwork(key),
                 run.data.seen + run.data.seen_further,
                 prepared,
                 optimizer,
-                steps=run.steps,
-                seed=run.seed,
-                directory=run.directory,
                 watched=run.data.unseen[: min(WATCHED_PAIRS, run.test_pairs)],
             )
             path = run.directory / f"descriptors_{name}.eqx"
             save(curves[name].model, path)
             networks[f"learned from {name}"] = load(path)
-        measured = measure(
-            run.data,
-            lambda pair: descriptor_errors(pair, networks, run.seed),
-            number_of_pairs=run.test_pairs,
-            seed=run.seed,
-            directory=run.directory,
-        )
-        page = "\n".join(summary(measured, run.steps, run.seed, run.begun_with))
-        with atomic_write(run.directory / "summary.md") as temporary:
-            temporary.write_text(page, "utf-8")
+        measured = run.measure(lambda pair: descriptor_errors(pair, networks, run.seed))
+        run.write_summary(summary(measured, run.steps, run.seed))
         draw({f"from {name}": curve for name, curve in curves.items()}, run.directory / "curves.png")
-    print(page)
 
 
 if __name__ == "__main__":

@@ -43,13 +43,11 @@ from learning import (
     Measured,
     comparison,
     errors,
-    measure,
     parser,
     refined,
     root_mean_square,
     running,
     smoothed,
-    train,
     unit_area_positions,
 )
 from scipy.spatial import KDTree
@@ -78,16 +76,10 @@ TEMPERATURE, LEARNING_RATE, FLOOR = 0.1, 0.3, 0.05
 
 
 class Sampled(NamedTuple):
-    """A training pair, restricted to s samples of each shape.
+    """A training pair, restricted to s samples of each shape, with initial maps between the samples.
 
-    **Attributes:**
-
-    - `spectrum_x`, `spectrum_y`: the spectra of both shapes at the samples.
-    - `positions_x`, `positions_y`: the positions of the samples, in units of the square root of the shape's
-      area.
-    - `initial_map`: the initial map from the samples of X to the samples of Y.
-    - `reverse_initial_map`: the initial map from the samples of Y to the samples of X.
-    - `truth`: the position of the true match on Y for each sample of X, in the unit of `positions_y`.
+    Positions are in units of the square root of the shape's area. `truth` contains the position of the true
+    match on Y for each sample of X.
     """
 
     spectrum_x: Spectrum
@@ -189,7 +181,7 @@ def refinement_errors(pair: DataPair, banks: Mapping[str, FilterBank], seed: int
     return errors(pair, mesh_x, mesh_y, maps, seed)
 
 
-def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Iterator[str]:
+def summary(measured: Measured, steps: int, seed: int) -> Iterator[str]:
     """Yield the parts of `summary.md`."""
     yield "# Learned frames\n"
     yield (
@@ -199,7 +191,6 @@ def summary(measured: Measured, steps: int, seed: int, begun_with: str) -> Itera
         "with its 95 % bootstrap interval.\n"
     )
     yield comparison(measured, list(next(iter(measured.values()))[0]), seed)
-    yield begun_with + "\n"
 
 
 def draw(banks: Mapping[str, FilterBank], losses: Mapping[str, np.ndarray], path: Path) -> None:
@@ -225,34 +216,22 @@ def main() -> None:
         optimizer = optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, run.steps))
         losses = {}
         for name, loss in LOSSES.items():
-            trained = train(
+            trained = run.train(
                 name,
                 loss,
                 like_meyer(),
                 run.data.seen,
                 sampled,
                 optimizer,
-                steps=run.steps,
-                seed=run.seed,
-                directory=run.directory,
                 # The loss varies more between pairs than between frames, so each pair's loss is normalised.
                 unit=lambda pair, loss=loss: loss(like_meyer(), pair),
             )
             losses[name] = trained.losses
             save(trained.model, run.directory / f"frame_{name}.npz")
             banks[f"learned from {name}"] = load(run.directory / f"frame_{name}.npz")
-        measured = measure(
-            run.data,
-            lambda pair: refinement_errors(pair, banks, run.seed),
-            number_of_pairs=run.test_pairs,
-            seed=run.seed,
-            directory=run.directory,
-        )
-        page = "\n".join(summary(measured, run.steps, run.seed, run.begun_with))
-        with atomic_write(run.directory / "summary.md") as temporary:
-            temporary.write_text(page, "utf-8")
+        measured = run.measure(lambda pair: refinement_errors(pair, banks, run.seed))
+        run.write_summary(summary(measured, run.steps, run.seed))
         draw(banks, losses, run.directory / "frames.png")
-    print(page)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optax
+from common import make_parser, write_text
 from jaxtyping import Array, Float, Float64, Int
 from tqdm import tqdm
 
@@ -49,21 +50,12 @@ Prepared = TypeVar("Prepared")
 
 
 class Data(NamedTuple):
-    """The pairs for training and for evaluation.
+    """The pairs for training and for evaluation."""
 
-    **Attributes:**
-
-    - `seen`: the pairs of the first `TRAINING_PEOPLE` people in FAUST's pair list, for training.
-    - `seen_further`: further pairs of the same people. These pairs have ground truth, but are not in the pair
-      list.
-    - `unseen`: the pairs of the other people in FAUST's pair list, for evaluation.
-    - `animals`: the pairs of TOSCA, for evaluation.
-    """
-
-    seen: list[DataPair]
-    seen_further: list[DataPair]
-    unseen: list[DataPair]
-    animals: list[DataPair]
+    seen: list[DataPair]  # of the first `TRAINING_PEOPLE` people in FAUST's list of pairs
+    seen_further: list[DataPair]  # further pairs of the same people
+    unseen: list[DataPair]  # of the other people in FAUST's list of pairs
+    animals: list[DataPair]  # of TOSCA
 
 
 def person(shape: str) -> int:
@@ -108,14 +100,9 @@ def root_mean_square(
 ) -> Float[Array, ""]:
     """Return the mean distance between the soft match of each point and its target position.
 
-    A soft match is a set of points with weights, which are the shares of the soft map. The distance from
-    a soft match is the weighted root mean square of the distances from the points.
-
-    **Arguments:**
-
-    - `carried`: a function that pulls functions back by one soft map, or by several soft maps in succession.
-    - `positions`: the vertex positions of the shape on which these functions are defined.
-    - `wanted`: the target position of each point.
+    A soft match is a set of weighted points; the distance from it is the weighted root mean square of the
+    distances from the points. The function `carried` pulls functions on a shape with these positions back by
+    one or several soft maps.
     """
     found = carried(jnp.concatenate([positions, jnp.sum(positions**2, axis=1, keepdims=True)], axis=1))
     squares = found[:, 3] - 2 * jnp.sum(found[:, :3] * wanted, axis=1) + jnp.sum(wanted**2, axis=1)
@@ -133,16 +120,7 @@ class State(eqx.Module):
 
 
 class Trained(NamedTuple):
-    """The outcome of training.
-
-    **Attributes:**
-
-    - `model`: the trained model.
-    - `losses`: the loss of every step.
-    - `steps`: the step numbers at which the loss on the watched pairs was evaluated. Step 0 is the start of
-      training.
-    - `watched`: the mean loss on the watched pairs at each step number in `steps`.
-    """
+    """The trained model, the loss of every step, and the mean loss on watched pairs at some `steps`."""
 
     model: Any
     losses: Float[np.ndarray, " steps"]
@@ -167,29 +145,13 @@ def train(
     """Train a model. Each step uses one pair, which is drawn at random.
 
     The state is saved regularly as `training_NAME.eqx` in `directory`. If that file exists, training
-    continues from it.
-
-    **Arguments:**
-
-    - `name`: the name of the loss, which appears in the name of the file and in the progress bar.
-    - `loss`: a function that takes the model and a prepared pair, and returns the loss.
-    - `model`: the initial model.
-    - `pairs`: the training pairs.
-    - `prepare`: a function that prepares a pair for the loss.
-    - `optimizer`: the optax optimiser.
-    - `steps`: the number of training steps.
-    - `seed`: the seed of the random draws.
-    - `directory`: an existing directory for the saved state.
-    - `unit`: a function that takes a prepared pair, and returns a number. The recorded loss of the pair is
-      divided by this number, so losses of different pairs are comparable. If `unit` is None, `train` records
-      the losses undivided.
-    - `watched`: pairs whose mean loss is recorded at regular intervals. These pairs do not influence
-      training.
+    continues from it. The recorded loss of each prepared pair is divided by its `unit`, so that losses of
+    different pairs are comparable. The mean loss on `watched` pairs, which do not influence training, is
+    recorded at regular intervals.
 
     **Raises:** `InputError` if the saved state is damaged or has other settings; `ArithmeticError` if a loss
     is not finite.
     """
-
     records = np.append(np.arange(0, steps, _WATCHED_EVERY), steps) if watched else np.zeros(0, int)
     dtype = jnp.result_type(float)
     state = State(
@@ -261,13 +223,7 @@ def _evaluate(
 
 @contextmanager
 def reading(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that equinox wrote, and yield it to a `with` block.
-
-    The block must read the whole file.
-
-    **Raises:** `InputError` if the file cannot be opened, if the block raises an error, or if the block ends
-    before the end of the file is reached.
-    """
+    """Open a file that equinox wrote for a `with` block; `InputError` if the block cannot read all of it."""
     try:
         with open(path, "rb") as stream:
             yield stream
@@ -308,56 +264,11 @@ def errors(
 
 
 Measured = dict[str, list[dict[str, float]]]
-"""A dictionary from each data set to a list.
-
-For each pair, the list contains a dictionary from map names to errors.
-"""
-
-
-def measure(
-    data: Data,
-    of_pair: Callable[[DataPair], dict[str, float]],
-    *,
-    number_of_pairs: int,
-    seed: int,
-    directory: Path,
-) -> Measured:
-    """Measure the errors of random test pairs of FAUST and TOSCA.
-
-    The errors of each pair are appended to `errors.csv` as soon as the pair is measured. Pairs that the file
-    already contains are not measured again. If the seed stays the same, the pairs for a smaller
-    `number_of_pairs` are a subset of the pairs for a larger number.
-
-    **Arguments:**
-
-    - `data`: the pairs for training and for evaluation.
-    - `of_pair`: a function that takes a pair, and returns a dictionary from map names to errors.
-    - `number_of_pairs`: the maximum number of pairs from each data set.
-    - `seed`: the seed of the random draws.
-    - `directory`: the directory of `errors.csv`.
-    """
-    generator, journal = np.random.default_rng(seed), Journal(directory / "errors.csv", ["source", "target"])
-    measured: Measured = {}
-    for title, pairs in (("people not seen", data.unseen), ("TOSCA", data.animals)):
-        chosen = [pairs[i] for i in np.sort(generator.permutation(len(pairs))[:number_of_pairs])]
-        for pair in tqdm(chosen, desc=title, unit="pair"):
-            if pair.names not in journal:
-                names = {"source": pair.source, "target": pair.target}
-                journal.append([{"data": title, **names, **of_pair(pair)}])
-        labels = "data", "source", "target"
-        measured[title] = [
-            {name: float(value) for name, value in journal[pair.names].items() if name not in labels}
-            for pair in chosen
-        ]
-    return measured
+"""For each data set, the errors of each pair by the names of the maps."""
 
 
 def comparison(measured: Measured, names: Sequence[str], seed: int) -> str:
-    """Return a Markdown table of the mean errors of the maps `names`.
-
-    For every map except the first, the table also contains the mean difference from the error of the first
-    map, with a confidence interval.
-    """
+    """Return a Markdown table of the mean errors of maps, and of their mean differences from the first."""
     rows = [["", "pairs", *names]]
     for data_set, pairs in measured.items():
         values = {name: np.array([pair[name] for pair in pairs]) for name in names}
@@ -378,11 +289,8 @@ def smoothed(values: Float[np.ndarray, " steps"]) -> tuple[np.ndarray, np.ndarra
 
 def parser(description: str, *, output: str, steps: int) -> argparse.ArgumentParser:
     """Return the parser for the arguments of a training script."""
-    made = argparse.ArgumentParser(description=description)
+    made = make_parser(description, output=output)
     made.add_argument("data", type=Path, help="directory that contains faust_r and tosca_r")
-    made.add_argument(
-        "--output", type=Path, default=Path(output), help=f"output directory (default: {output})"
-    )
     made.add_argument("--steps", type=int, default=steps, help=f"number of training steps (default: {steps})")
     made.add_argument(
         "--test-pairs", type=int, default=40, help="number of test pairs from each data set (default: 40)"
@@ -395,15 +303,7 @@ def parser(description: str, *, output: str, steps: int) -> argparse.ArgumentPar
 
 
 class Run(NamedTuple):
-    """The settings of a run.
-
-    **Attributes:**
-
-    - `data`: the pairs for training and for evaluation.
-    - `directory`: the output directory.
-    - `steps`, `test_pairs`, `seed`: see the command-line options.
-    - `begun_with`: a line of text that states commit, machine and versions at the start of the run.
-    """
+    """The data and options of a run, and a line with commit, machine and versions at its start."""
 
     data: Data
     directory: Path
@@ -412,18 +312,45 @@ class Run(NamedTuple):
     seed: int
     begun_with: str
 
+    def train(self, *arguments: Any, **options: Any) -> Trained:
+        """Train a model as `train` does, with the options of this run."""
+        return train(*arguments, steps=self.steps, seed=self.seed, directory=self.directory, **options)
+
+    def measure(self, of_pair: Callable[[DataPair], dict[str, float]]) -> Measured:
+        """Measure the errors of random test pairs of FAUST and TOSCA, by the names of the maps.
+
+        The errors of each pair are appended to `errors.csv` as soon as the pair is measured. Pairs that the
+        file already contains are not measured again. A smaller number of pairs gives a subset of the pairs of
+        a larger number.
+        """
+        generator = np.random.default_rng(self.seed)
+        journal = Journal(self.directory / "errors.csv", ["source", "target"])
+        measured: Measured = {}
+        for title, pairs in (("people not seen", self.data.unseen), ("TOSCA", self.data.animals)):
+            drawn = [pairs[i] for i in np.sort(generator.permutation(len(pairs))[: self.test_pairs])]
+            for pair in tqdm(drawn, desc=title, unit="pair"):
+                if pair.names not in journal:
+                    names = {"source": pair.source, "target": pair.target}
+                    journal.append([{"data": title, **names, **of_pair(pair)}])
+            labels = "data", "source", "target"
+            measured[title] = [
+                {name: float(value) for name, value in journal[pair.names].items() if name not in labels}
+                for pair in drawn
+            ]
+        return measured
+
+    def write_summary(self, parts: Iterable[str]) -> None:
+        """Write and print `summary.md`."""
+        page = "\n".join([*parts, self.begun_with + "\n"])
+        write_text(self.directory / "summary.md", page)
+        print(page)
+
 
 @contextmanager
 def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> Iterator[Run]:
-    """Read the arguments, open the data, and reserve the output directory for this process.
+    """Read the arguments, open the data, and claim the output directory for results with these settings.
 
-    `jaxsmw.runtime.provenance.claimed_directory` writes the provenance of the results to `provenance.json` in
-    the output directory. After bad input or an interruption, the process prints one sentence and ends.
-
-    **Arguments:**
-
-    - `arguments`: the parser that the function `parser` returned.
-    - `settings`: further settings that all results in the output directory must share.
+    After bad input or an interruption, the process prints one sentence and ends.
     """
     options = arguments.parse_args()
     steps, test_pairs = (3, 2) if options.quick else (options.steps, options.test_pairs)

@@ -94,7 +94,7 @@ def cases() -> dict[str, Callable[[Path], Row]]:
         "collection people": partial(collection, PEOPLE, mirror="no"),
         "pairs": partial(pairs, FOUR),
         "pairs in batches": partial(pairs, FOUR, batch_size=2),
-        "pairs fast": partial(pairs, FOUR, batch_size=3, preset="fast", alternatives=False),
+        "pairs fast": partial(pairs, FOUR, batch_size=3, preset="fast"),
         "batch": partial(batch, history=True),
         "batch samples": partial(batch, samples=150, batch_size=2),
         "batch partial": partial(batch, partial=True, batch_size=3, stop_when_unchanged=True),

@@ -36,6 +36,7 @@ from typing import Any, NamedTuple
 
 import igl
 import numpy as np
+from common import make_parser, write_text
 from jaxtyping import Int64
 from scipy.spatial import KDTree
 
@@ -50,7 +51,7 @@ from jaxsmw.benchmark.tables import MethodSummary, markdown, write_tables
 from jaxsmw.choices import DEFAULT_MATCH_INIT
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.io.meshes import read_mesh, write_mesh
-from jaxsmw.runtime.files import atomic_write, make_directory
+from jaxsmw.runtime.files import make_directory
 from jaxsmw.runtime.workers import open_executor
 
 TABLE2_METHODS = ("mwp", "accurate", "smooth-shells")
@@ -126,15 +127,9 @@ def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
         for kind in ("cuts", "holes"):
             pairs = tuple(pair for pair in data_set.pairs if pair.source.startswith(kind))
             if pairs:
-                subset = dataclasses.replace(data_set, pairs=pairs)
-                yield Run(
-                    "fig6",
-                    f"{data_set.name}-{kind}",
-                    subset,
-                    chosen(subset, options),
-                    methods(pairs, options),
-                    same(options),
-                )
+                name, subset = f"{data_set.name}-{kind}", dataclasses.replace(data_set, pairs=pairs)
+                some = chosen(subset, options)
+                yield Run("fig6", name, subset, some, methods(pairs, options), same(options))
 
 
 def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
@@ -176,12 +171,9 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
             finished = {
                 Path(path).name: PublishedMaps(Path(path)) for path in directories if path not in initial
             }
-            setting = same(options, init=init)
-            pairs = chosen(data_set, options)
-            yield Run(
-                "nonisometric", f"{data_set.name}-from-{Path(init).name}", data_set, pairs,
-                methods(pairs, options) | finished, setting,
-            )  # fmt: skip
+            name, pairs = f"{data_set.name}-from-{Path(init).name}", chosen(data_set, options)
+            every = methods(pairs, options) | finished
+            yield Run("nonisometric", name, data_set, pairs, every, same(options, init=init))
 
 
 def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
@@ -300,8 +292,7 @@ def derive(directory: Path, pairs: list[DataPair], name: str, remesh: Callable[[
             ):
                 write_mesh(shapes / f"{shape}.off", mesh)
                 np.savetxt(truths / f"{shape}.vts", rows + 1, fmt="%d")
-        with atomic_write(listing) as temporary:
-            temporary.write_text("".join(f"{pair.source} {pair.target}-{name}\n" for pair in pairs), "utf-8")
+        write_text(listing, "".join(f"{pair.source} {pair.target}-{name}\n" for pair in pairs))
     return open_data_set(directory)
 
 
@@ -338,12 +329,8 @@ def _cell(summary: MethodSummary | None) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-    )
+    parser = make_parser(__doc__, parts=EXPERIMENTS, output="paper")
     parser.add_argument("data", type=Path, metavar="DATA_DIRECTORY")
-    parser.add_argument("--output", type=Path, default=Path("paper"), metavar="DIR")
-    parser.add_argument("--only", nargs="+", choices=EXPERIMENTS, default=list(EXPERIMENTS))
     parser.add_argument("--sets", nargs="+", metavar="NAME", help="names of data sets to use (default: all)")
     parser.add_argument("--pairs", type=int, help="number of random pairs from each set (default: all)")
     parser.add_argument("--seed", type=int, default=0)
@@ -365,8 +352,7 @@ def main() -> None:
                     results, found[run.experiment, run.name] = perform(run, options.output, executor)
                     for what, why in results.failures.items():
                         failures[f"{run.experiment}, {run.name}, {what}"] = why
-                    with atomic_write(options.output / "README.md") as temporary:
-                        temporary.write_text(overview(found), "utf-8")
+                    write_text(options.output / "README.md", overview(found))
         Results([], {}, failures).check()
     except InputError as error:
         parser.exit(2, "\n".join([*error.lines(), ""]))

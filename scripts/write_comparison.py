@@ -15,9 +15,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+from common import write_text
 
 from jaxsmw.benchmark.tables import markdown
-from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -93,9 +93,7 @@ def written(text: str) -> str:
 
 def main() -> None:
     page = DOCS / "comparison.md"
-    text = written(page.read_text("utf-8"))
-    with atomic_write(page) as temporary:
-        temporary.write_text(text, "utf-8")
+    write_text(page, written(page.read_text("utf-8")))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Settings and fixtures for all tests."""
 
+import functools
 import gc
 import os
 import pickle
@@ -7,7 +8,7 @@ import shutil
 import signal
 import sys
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -218,11 +219,33 @@ def private_cache(common_directory: Path) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def make_one_parser() -> Iterator[None]:
+    """Give all commands of one process the same parser.
+
+    The parser contains many small functions, and the type checks take about a millisecond for each.
+    """
+    from jaxsmw.cli import run
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "make_parser", functools.cache(run.make_parser))
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_programs() -> Iterator[None]:
     """Release compiled programs after each test module, because the programs of all tests take gigabytes."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """A function that runs the command line in this process."""
+    # The type checks apply only to modules that are imported after this file.
+    from command_line import runner
+
+    return runner(capsys)
 
 
 @pytest.fixture

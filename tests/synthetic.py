@@ -1,7 +1,11 @@
 """Synthetic spectra and simple meshes that several test files share."""
 
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
@@ -24,6 +28,22 @@ def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) 
         jnp.asarray(areas, dtype),
         jnp.ones(n, bool),
     )
+
+
+def stacked(*trees: Any) -> Any:
+    """Stack the arrays of several spectra, or of other trees of equal structure."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def in_precision(tree: Any, dtype: type) -> Any:
+    """Convert the floating-point arrays of a tree to another type."""
+    return jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype == float else leaf, tree)
+
+
+def mean_error(mesh: Mesh, pointwise_map: np.ndarray, truth: np.ndarray) -> float:
+    """The mean distance between matches and true matches, in units of the square root of the area."""
+    offsets = mesh.vertices[pointwise_map] - mesh.vertices[truth]
+    return float(np.linalg.norm(offsets, axis=1).mean() / mesh.area**0.5)
 
 
 def grid_mesh(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -70,9 +90,24 @@ def sphere_mesh(subdivisions: int = 3) -> tuple[np.ndarray, np.ndarray]:
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
 
 
-def bumpy_mesh(subdivisions: int = 4) -> Mesh:
-    """A sphere that is deformed by waves without symmetry."""
-    vertices, faces = sphere_mesh(subdivisions)
+def spiral_sphere(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices and faces of the unit sphere, with any number of vertices along a spiral."""
+    height = 1 - (2 * np.arange(number) + 1) / number
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(number)
+    radius = np.sqrt(1 - height**2)
+    vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    faces = ConvexHull(vertices).simplices.astype(np.int64)
+    inward = np.linalg.det(vertices[faces]) < 0
+    faces[inward] = faces[inward, ::-1]
+    return vertices, faces
+
+
+def bumpy_mesh(subdivisions: int = 4, *, number: int | None = None) -> Mesh:
+    """A sphere that is deformed by waves without symmetry.
+
+    With `number`, it has this number of vertices, and otherwise the vertices of `sphere_mesh`.
+    """
+    vertices, faces = sphere_mesh(subdivisions) if number is None else spiral_sphere(number)
     waves = np.sin(vertices @ np.random.default_rng(0).normal(size=(3, 12)) * 3) @ np.linspace(0.02, 0.06, 12)
     return make_mesh(vertices * (1 + waves)[:, None], faces)
 

@@ -14,7 +14,7 @@ from jaxsmw.geometry.alignment import align_rigidly
 LUMP = bumpy_mesh(3)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_moved_copy_is_aligned_exactly(seed):
     generator = np.random.default_rng(seed)
     turn, shift = Rotation.random(random_state=seed), generator.normal(size=3)
@@ -97,7 +97,7 @@ def test_asymmetric_shapes_are_matched_from_both_initial_maps(monkeypatch):
         assert {"mirror test", "expected error"} <= found.seconds.keys()
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_a_bent_shape_is_matched_from_descriptors():
     """No rigid motion brings a bent shape into place, so the map from SHOT is better."""
     straight = bumpy_mesh(4).vertices * [1, 1, 3]
@@ -110,7 +110,7 @@ def test_a_bent_shape_is_matched_from_descriptors():
     assert found.init == "shot" and apart.mean() < 0.02 * target.area**0.5
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_a_mirrored_asymmetric_shape_is_aligned_as_its_mirror_image():
     settings = replace(PRESETS["accurate"], repair=RepairSettings(aligned_preference=0.0))
     found = match(LUMP, _turned(LUMP.mirrored()), preset=settings)

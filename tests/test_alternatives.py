@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from synthetic import mean_error
 
 from jaxsmw import creature_pair, geodesic_error, match, read_mesh
 from jaxsmw.benchmark.datasets import open_data_set
@@ -30,14 +31,14 @@ from jaxsmw.matching.starts import make_start
 
 REPAIR = PRESETS["accurate"].repair
 # Fewer samples and levels, which compile faster.
-FEW = {"samples": 500, "levels": (8, 11, 15, 20), "fine_levels": (15, 20, 20, 20)}
+FEW = {"samples": 250, "levels": (8, 11, 15, 20), "fine_levels": (15, 20, 20, 20)}
 REPAIR = replace(REPAIR, alternatives=replace(REPAIR.alternatives, **FEW))
 
 
 @pytest.fixture(scope="module")
 def pair():
     """Two poses of a body with different triangulations."""
-    found = creature_pair(vertices=1500)
+    found = creature_pair(vertices=900)
     return found.source, found.target, found.truth.nearest_corners(found.target)
 
 
@@ -55,10 +56,6 @@ def moved(mesh, rotation, shift=2.0):
 
 def prepared(mesh_x, mesh_y, *, creases=0, **options):
     return prepare(Pair.make(mesh_x, mesh_y, **options), Sizes(60, creases, 500)).describe(30)
-
-
-def mean_error(mesh, found, truth):
-    return float(np.linalg.norm(mesh.vertices[found] - mesh.vertices[truth], axis=1).mean() / mesh.area**0.5)
 
 
 def test_samples_belong_to_the_nearest_along_the_surface():

@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 from jax._src import monitoring
+from messages import refused
 from scipy.spatial import KDTree
 from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
@@ -170,9 +171,9 @@ def test_pairs_are_drawn_by_the_seed_or_read_from_a_list(scape, tmp_path):
 
 
 def test_unknown_methods_and_initial_maps_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"'magic' is not a method: choose from initial, mwp"):
+    with refused("'magic'", "method", "initial, mwp"):
         find_methods(["mwp", "magic"])
-    with pytest.raises(InputError, match=r"'luck' is not an initial map: choose from auto, shot"):
+    with refused("'luck'", "initial map", "auto, shot"):
         Settings("luck")
     for name in ("mwp", "mine", "other/mine"):
         (tmp_path / name).mkdir(parents=True)
@@ -284,7 +285,7 @@ def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
     (tmp_path / "perfect" / "mesh000_mesh001.map").unlink()
-    with pytest.raises(InputError, match=r"mesh000_mesh001.map: is missing \(1 of 6 maps are missing\)"):
+    with refused("mesh000_mesh001.map", "missing", "1 of 6"):
         measure(["initial", str(tmp_path / "perfect")], output=other, pairs="6")
     (tmp_path / "perfect" / "mesh000_mesh001.map").write_text("1\n2\n")
     found = measure(["initial", str(tmp_path / "perfect")], output=other, pairs="6")
@@ -567,7 +568,7 @@ def test_the_digest_covers_all_code_that_results_depend_on():
 @pytest.mark.parametrize(("target", "share"), [("b", "1 of 2 pairs"), ("c", "1 given pairs")])
 def test_the_summary_says_whether_pairs_belong_to_the_list_of_the_data_set(target, share):
     """The list of a remeshed set contains pairs of one class only, but a given list may contain others."""
-    pairs = [SimpleNamespace(source="a", target=name) for name in ("b", "d")]
+    pairs = [SimpleNamespace(names=("a", name)) for name in ("b", "d")]
     results = SimpleNamespace(rows=[{"source": "a", "target": target, "machine": "a machine"}], failures=[])
     data_set = SimpleNamespace(pairs=pairs, layout="a set")
     assert _introduction(data_set, results, Settings("shot")).startswith(share)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from sampled_cases import first_always
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 from test_shortcuts import bent_tube
@@ -84,11 +85,11 @@ def fused() -> Case:
     )
 
 
-CASES = (whole, mirrored, asymmetric, other_init, given, coarse, part, fused)
+CASES = (whole, given, part, mirrored, asymmetric, other_init, coarse, fused)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
+@pytest.mark.parametrize("case", first_always(CASES, always=3), ids=lambda case: case.__name__)
 def test_the_method_accurate_gives_the_map_of_match(case, tmp_path):
     source, target, shows, partial, init = case()
     files = tmp_path / "x.off", tmp_path / "y.off"

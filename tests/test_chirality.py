@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sampled_cases import first_always
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
@@ -61,7 +62,7 @@ def test_descriptors_of_a_mirror_image_are_those_of_the_surface_in_another_order
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("opposite", [False, True])
+@pytest.mark.parametrize("opposite", first_always([True, False]))
 def test_auto_finds_the_hand_of_a_lump(lump, opposite):
     target = turned(lump.mirrored() if opposite else lump)
     found = match(lump, target, preset="fast", mirror="auto")
@@ -103,7 +104,7 @@ def test_a_mirrored_result_is_in_terms_of_the_source():
     assert found.distortion < 1.1
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_a_creature_is_its_own_mirror_image(lump):
     pair = creature_pair(vertices=1500)
     found = match(pair.source, pair.target, preset="fast", mirror="auto")
@@ -179,6 +180,7 @@ def test_a_doubtful_hand_is_flagged(lump, monkeypatch, evidence, mirrored):
     assert found.mirror_evidence == evidence
 
 
+@pytest.mark.slow
 def test_evidence_has_opposite_signs_for_opposite_hands(lump):
     for target, sign in ((turned(lump), -1), (turned(lump.mirrored()), 1)):
         pair = Pair.make(lump, target)

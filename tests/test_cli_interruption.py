@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from command_line import SMALL, write_pair
+from sampled_cases import first_always
 from synthetic import bumpy_mesh
 
 from jaxsmw.io.meshes import write_mesh
@@ -216,7 +217,7 @@ def test_a_second_interruption_has_no_effect(pair, tmp_path):
     assert_interrupted(started(program, *call), tmp_path)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", first_always([signal.SIGTERM, signal.SIGHUP]))
 def test_other_signals_end_a_command_in_the_same_way(pair, tmp_path, number):
     program = f"""
     import jaxsmw.matching.match

@@ -5,17 +5,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from command_line import SMALL, assert_refused, runner, write_pair
+from command_line import SMALL, assert_refused, write_pair
+from messages import assert_names
 from synthetic import bumpy_mesh
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.meshes import write_mesh
 from jaxsmw.runtime.files import atomic_write, check_directory, check_writable, make_directory
-
-
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
 
 
 @pytest.fixture(scope="module")
@@ -66,10 +62,8 @@ def test_a_small_limit_of_address_space_is_refused_before_libraries_are_loaded(p
         [sys.executable, "-c", program, *words], capture_output=True, text=True, timeout=60
     )
     assert ended.returncode == 2 and not (pair / "limited.txt").exists()
-    assert ended.stderr == (
-        "jaxsmw: the address space of this process is limited to 0.30 GB, but its libraries need at least 2 GB: "
-        "raise the limit (ulimit -v).\n"
-    )
+    assert ended.stderr.count("\n") == 1
+    assert_names(ended.stderr, "address space", "0.30 GB", "2 GB", "raise the limit (ulimit -v)")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows does not remove the working directory")
@@ -515,7 +509,5 @@ def test_too_little_memory_is_reported_in_one_sentence(run, pair, tmp_path, monk
     monkeypatch.setattr("jaxsmw.matching.match.match", fail)
     outcome = run("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
     assert outcome.code == 1
-    assert outcome.errors == (
-        "jaxsmw: this machine has too little memory (Unable to allocate 75.0 GiB): give smaller meshes, or "
-        "smaller numbers of vertices, eigenvectors or samples.\n"
-    )
+    assert outcome.errors.count("\n") == 1
+    assert_names(outcome.errors, "too little memory", "75.0 GiB", "smaller meshes", "eigenvectors", "samples")

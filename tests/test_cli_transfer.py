@@ -4,18 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from command_line import SMALL, assert_refused, runner, write_pair
+from command_line import SMALL, assert_refused, write_pair
 
 import jaxsmw
 from jaxsmw.io import Landmarks, read_landmark_file, read_mesh_data, write_landmark_file, write_mesh_data
 from jaxsmw.io.mesh_data import MeshData
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
-
-
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
 
 
 @pytest.fixture(scope="module")

@@ -14,20 +14,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import assert_refused, runner
+from command_line import assert_refused
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
 from jaxsmw import InputError, make_mesh, read_mesh, write_mesh
 from jaxsmw.choices import EDGES_PER_SHAPE
-from jaxsmw.collection import edge_matcher, match_collection
+from jaxsmw.collection import edges, match_collection
 from jaxsmw.collection.files import write_registered
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io import Landmarks, MeshData, read_landmark_file, write_landmark_file
 from jaxsmw.runtime.cache import Store
 
-VERTICES = 1000
+VERTICES = 800
 
 
 def renumbered(mesh: Mesh, seed: int) -> tuple[Mesh, np.ndarray]:
@@ -70,7 +70,7 @@ def error(collection, shapes, i, j):
 def matched(monkeypatch):
     """The pairs that a call matches, as lists of names."""
     pairs = []
-    original = edge_matcher.match_edges
+    original = edges.match_edges
 
     def recording(tasks, *arguments):
         def noted():
@@ -80,7 +80,7 @@ def matched(monkeypatch):
 
         return original(noted(), *arguments)
 
-    monkeypatch.setattr(edge_matcher, "match_edges", recording)
+    monkeypatch.setattr(edges, "match_edges", recording)
     return pairs
 
 
@@ -138,6 +138,13 @@ def test_a_second_call_matches_nothing_and_gives_the_same_result(meshes, work, f
     assert again.edges == found.edges
 
 
+def test_maps_of_another_eigensolver_are_not_reused(meshes, work, found, matched, monkeypatch):
+    """A large mesh that is added to a collection changes the eigensolver of all shapes."""
+    monkeypatch.setattr("jaxsmw.collection.matching.choose_eigensolver", lambda *_: "approximate")
+    match_collection(meshes, preset="paper", edges_per_shape=2, mirror="no", directory=work)
+    assert len(matched) >= len(found.edges)
+
+
 def test_an_interrupted_call_continues(meshes, found, matched, tmp_path):
     class Interrupted(Exception):
         pass
@@ -166,6 +173,7 @@ def test_an_interrupted_call_continues(meshes, found, matched, tmp_path):
         np.testing.assert_array_equal(first.vertices, second.vertices)
 
 
+@pytest.mark.slow
 def test_an_added_mesh_is_matched_alone(meshes, matched, tmp_path):
     def run(number):
         return match_collection(
@@ -191,9 +199,10 @@ def test_an_unusable_mesh_is_left_out_and_named(meshes, found, work):
     assert any("triangle" in sentence for sentence in result.sentences())
 
 
+@pytest.mark.slow
 def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch):
     """The first match of one pair maps every vertex to the mirror image of its match."""
-    original = edge_matcher.match_edges
+    original = edges.match_edges
 
     def corrupting(tasks, *arguments):
         tasks = list(tasks)
@@ -201,16 +210,15 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
             if task.init is None and (task.x.mesh.name, task.y.mesh.name) == ("shape1", "shape3"):
                 shuffled = np.random.default_rng(0).permutation(len(edge.forward))
                 back = np.random.default_rng(1).permutation(len(edge.backward))
-                edge = edge_matcher.EdgeMap(
+                edge = edges.EdgeMap(
                     edge.forward[shuffled],
                     edge.backward[back],
                     edge.expected_error,
                     edge.distortion,
-                    edge.suspicious,
                 )
             yield edge
 
-    monkeypatch.setattr(edge_matcher, "match_edges", corrupting)
+    monkeypatch.setattr(edges, "match_edges", corrupting)
     options = {"preset": "paper", "edges_per_shape": 2, "mirror": "no", "directory": tmp_path}
     result = match_collection(meshes, **options)
     (edge,) = (edge for edge in result.edges if (edge.source, edge.target) == (1, 3))
@@ -228,7 +236,7 @@ def test_a_wrong_map_is_found_and_replaced(meshes, shapes, tmp_path, monkeypatch
 
 
 def test_a_mesh_whose_matches_all_fail_is_named(meshes, monkeypatch):
-    original = edge_matcher.match_edges
+    original = edges.match_edges
 
     def failing(tasks, *arguments):
         for task in tasks:
@@ -237,7 +245,7 @@ def test_a_mesh_whose_matches_all_fail_is_named(meshes, monkeypatch):
             else:
                 yield from original(iter([task]), *arguments)
 
-    monkeypatch.setattr(edge_matcher, "match_edges", failing)
+    monkeypatch.setattr(edges, "match_edges", failing)
     with pytest.raises(ArithmeticError, match="failed numerically: shape4"):
         match_collection(meshes, preset="paper", edges_per_shape=2, mirror="no")
 
@@ -277,7 +285,7 @@ def test_bad_arguments_are_refused(meshes, arguments, message):
 
 
 def test_tasks_of_workers_are_kept_in_the_directory(meshes, work, found, monkeypatch):
-    monkeypatch.setattr(edge_matcher, "TemporaryDirectory", None)
+    monkeypatch.setattr(edges, "TemporaryDirectory", None)
     with ThreadPoolExecutor(1) as executor:
         again = match_collection(
             meshes, preset="paper", edges_per_shape=2, mirror="no", directory=work, executor=executor
@@ -314,6 +322,7 @@ def signed_volume(mesh: Mesh) -> float:
     return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6)
 
 
+@pytest.mark.slow
 def test_meshes_of_the_other_hand_can_be_named(meshes, found):
     some = [mesh.mirrored() if number == 1 else mesh for number, mesh in enumerate(meshes)]
     result = match_collection(
@@ -368,11 +377,6 @@ def test_real_people_through_the_template(shared):
 
 
 # ----------------------------------------------------------------------------------------------- the command
-
-
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
 
 
 @pytest.fixture(scope="module")

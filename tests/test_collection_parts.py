@@ -28,8 +28,8 @@ from jaxsmw.core.banks import LowPass
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.creature import creature
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.executor import SpectralPair, Start, run_batches
 from jaxsmw.matching.search.chirality import Decision
 from jaxsmw.matching.stages import PRESETS, Preset, Stage
@@ -370,7 +370,7 @@ def test_batches_are_not_refined_a_second_time(three, monkeypatch):
 
 def test_the_first_failure_of_a_batch_is_reported(three, monkeypatch):
     """Later stages start from the map of the failure, and must not hide its reason."""
-    shape = prepare_shape(three[0], PRESETS["paper"])
+    shape = prepare_shape(three[0], PRESETS["paper"], "exact")
     eigenvectors = shape.spectrum.eigenvectors.at[0, 0].set(jnp.nan)
     broken = SpectralPair(shape.spectrum, replace(shape.spectrum, eigenvectors=eigenvectors))
     identity = np.arange(len(three[0].vertices))

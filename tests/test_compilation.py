@@ -80,7 +80,8 @@ def test_the_call_raises_the_errors_of_compiling_ahead(points):
     def refusing(queries):
         raise ValueError("no such search")
 
-    wait([compile_ahead(refusing, lambda: ((jnp.zeros((-1, 2)),), {}))])
+    with pytest.raises(TypeError):
+        compile_ahead(refusing, lambda: ((jnp.zeros((-1, 2)),), {}))
     wait([compile_ahead(refusing, lambda: ((jnp.zeros((1, 2)),), {}))])
     with pytest.raises(ValueError, match="no such search"):
         compiled(refusing)(points[0])

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from command_line import SMALL, write_pair
+from sampled_cases import first_always
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform != "linux", reason="signals need Linux")]
 
@@ -122,7 +123,7 @@ fcntl.flock = refuse
 """
 
 
-@pytest.mark.parametrize("fault", [FULL_DISK, NO_LOCKS], ids=["full disk", "no locks"])
+@pytest.mark.parametrize("fault", first_always([FULL_DISK, NO_LOCKS]), ids=["full disk", "no locks"])
 def test_a_cache_on_an_unsuitable_disk_changes_nothing(tmp_path, pair, fault):
     expected, found = tmp_path / "expected.txt", tmp_path / "found.txt"
     finished(started(pair, expected, tmp_path / "whole"))

@@ -41,6 +41,16 @@ REFINEMENTS = {
 }
 
 
+# Pages whose code takes longest, and which other tests run in large part.
+LONGEST = {
+    "docs/gradients.md",
+    "docs/tutorial.md",
+    "docs/tutorial_collection.md",
+    "docs/how_to/match_collection.md",
+    "docs/how_to/partial_shapes.md",
+}
+
+
 def code_blocks(page: str, language: str = "python") -> list[str]:
     text = (ROOT / page).read_text("utf-8")
     fences = re.findall(r"^( *)```(.*)\n((?:.*\n)*?)\1```$", text, flags=re.MULTILINE)
@@ -73,7 +83,9 @@ def pair():
 @pytest.mark.parametrize(
     "page",
     [
-        page if page == "README.md" else pytest.param(page, marks=pytest.mark.slow)
+        page
+        if page == "README.md"
+        else pytest.param(page, marks=pytest.mark.sampled if page in LONGEST else pytest.mark.slow)
         for page in PAGES
         if code_blocks(page)
     ],

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from messages import assert_names, refused
 from synthetic import bumpy_mesh, grid_mesh
 
 from jaxsmw import InputError, make_mesh, read_mesh
@@ -15,7 +16,8 @@ from jaxsmw.evaluation.ground_truth import (
     write_ground_truth,
 )
 from jaxsmw.evaluation.metrics import GeodesicError, coverage, geodesic_error
-from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
+from jaxsmw.geometry.geodesics import geodesic_distances
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.io.maps import read_landmarks, read_pointwise_map, write_pointwise_map
 
 # X has 4 vertices and 2 faces. Y has 9 vertices and 8 faces.
@@ -66,9 +68,7 @@ class TestReading:
             truth = read_ground_truth(path, part, Y)
         assert truth.source_vertices.tolist() == sorted(X.faces[0]) and len(truth.targets) == 3
         (left_out,) = set(range(4)) - set(X.faces[0].tolist())
-        with pytest.raises(
-            InputError, match="no face of part references: give the ground truth of this mesh"
-        ):
+        with refused("no face", "part", "ground truth of this mesh"):
             read_ground_truth(write("one.txt", f"{left_out} 0\n"), part, Y, index_base=0)
 
     def test_two_columns_are_pairs_of_vertices(self, write):
@@ -297,7 +297,7 @@ class TestBadFiles:
             read_ground_truth([write("x.vts", "1 2\n2 3\n"), one], X, Y)
         with pytest.raises(InputError, match="4 files were given"):
             read_ground_truth([one, two, two, two], X, Y)
-        with pytest.raises(InputError, match=r"y.vts, line 1: 9 is not one of the vertices of mesh_x"):
+        with refused("y.vts, line 1", "9", "vertices of mesh_x"):
             read_ground_truth([write("y.vts", "9\n"), write("x.vts", "1\n")], X, Y)
 
     def test_files_that_cannot_be_read_or_written_are_refused(self, tmp_path):
@@ -445,10 +445,9 @@ class TestStatistics:
 
     def test_text_and_json_contain_all_figures(self):
         error = self.error([0.1, 0.2, np.inf, 0.0])
-        assert str(error) == (
-            "mean 0.10000, median 0.15000, 25.0% within 0.02, 25.0% within 0.05, 50.0% within 0.1, area under the "
-            "curve 0.4500 (4 points, strips; 25.00% on another component)"
-        )
+        within = ("25.0% within 0.02", "25.0% within 0.05", "50.0% within 0.1")
+        assert_names(str(error), "mean 0.10000", "median 0.15000", *within)
+        assert_names(str(error), "curve 0.4500", "4 points", "strips", "25.00% on another component")
         assert "component" not in str(self.error([0.1]))
         figures = json.loads(json.dumps(error.as_dictionary(), allow_nan=False))
         curve = figures.pop("curve")

@@ -4,9 +4,10 @@ from synthetic import body_with_arms, sphere_mesh
 
 from jaxsmw import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.geometry.geodesics import SurfacePoints, geodesic_distances
+from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.search.proxies import Proxy, extremities, plausible_pairings
 
 
@@ -25,7 +26,7 @@ def ends_of(mesh):
 @pytest.fixture(scope="module")
 def creature():
     """Two poses of a body, and the extremities of both."""
-    pair = creature_pair(vertices=2000)
+    pair = creature_pair(vertices=1000)
     return pair, ends_of(pair.source), ends_of(pair.target)
 
 

@@ -1,11 +1,10 @@
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
-from synthetic import random_spectrum
+from synthetic import random_spectrum, stacked
 
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
@@ -165,9 +164,8 @@ def test_search_in_patches_ignores_descriptors(pair):
 def test_vmap_equals_a_loop(pair):
     x, y, initial_map, _ = pair
     pairs = [(x, y), (y, x)]
-    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *side) for side in zip(*pairs, strict=True)]
     both = eqx.filter_vmap(lambda *arguments: refine(*arguments, refiner=FeatureRegression((4, 8))))(
-        *stacked, jnp.stack([initial_map, initial_map])
+        *(stacked(*side) for side in zip(*pairs, strict=True)), jnp.stack([initial_map, initial_map])
     )
     for row, (one, other) in enumerate(pairs):
         alone = refine(one, other, initial_map, refiner=FeatureRegression((4, 8)))

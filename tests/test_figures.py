@@ -273,7 +273,7 @@ def test_titles_tell_files_of_one_name_apart(names: tuple[str, str], shown: tupl
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize("difference", [0, 20, 60, 119])
+@pytest.mark.parametrize("difference", [0, 119])
 def test_long_titles_tell_files_apart(difference: int) -> None:
     names = ["".join("ab"[side] if i == difference else "x" for i in range(120)) + ".off" for side in (0, 1)]
     for folder in ("", "folder/"):

@@ -13,6 +13,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mesh_samples import sample
+from messages import assert_names
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOGeometry import vtkGLTFReader
 
@@ -145,7 +146,8 @@ def test_interleaved_quantized_and_sparse_accessors_are_decoded(tmp_path):
     }
     assert data.blend_shapes["up"].tolist() == [[0, 0, 0], [1, 2, 3], [0, 0, 0], [4, 5, 6]]
     assert not data.blend_shapes["target 1"].any()
-    assert data.mesh.notes == ("The vertex data '_MATRIX' were ignored, because they are matrices.",)
+    (note,) = data.mesh.notes
+    assert_names(note, "'_MATRIX'", "ignored", "matrices")
 
 
 def test_transforms_of_nodes_are_applied_in_the_order_of_the_scene(tmp_path):
@@ -524,7 +526,7 @@ def sound(tmp_path_factory) -> bytes:
 
 
 @given(data=st.data())
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_damaged_files_are_read_or_refused(tmp_path_factory, sound, data):
     path, content = tmp_path_factory.getbasetemp() / "damaged.glb", sound
     at = data.draw(st.integers(12, len(content) - 1))

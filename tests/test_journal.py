@@ -5,6 +5,7 @@ import json
 import os
 
 import pytest
+from messages import refused
 
 from jaxsmw import InputError
 from jaxsmw.benchmark.journal import Journal
@@ -48,16 +49,16 @@ def test_tables_with_wrong_columns_or_values_are_refused(tmp_path):
     journal = Journal(path, ["name"], COLUMNS)
     journal.append([{"name": "a", "value": 1}])
     assert path.read_text() == "name,value\na,1\n"
-    with pytest.raises(InputError, match="has the columns name, value, but a result has name, other"):
+    with refused("columns name, value", "name, other"):
         journal.append([{"name": "b", "other": 1}])
     assert path.read_text() == "name,value\na,1\n"
 
 
 def test_unreadable_and_unwritable_files_are_named(tmp_path):
     (tmp_path / "table.csv").mkdir()
-    with pytest.raises(InputError, match=r"table.csv: cannot be read \(Is a directory\)"):
+    with refused("table.csv", "cannot be read", "Is a directory"):
         Journal(tmp_path / "table.csv", ["name"])
-    with pytest.raises(InputError, match=r"table.csv: cannot be written \(No such file or directory\)"):
+    with refused("table.csv", "cannot be written", "No such file or directory"):
         Journal(tmp_path / "nowhere" / "table.csv", ["name"]).append([{"name": "a"}])
 
 
@@ -68,7 +69,7 @@ def test_damaged_provenance_is_refused(tmp_path, contents):
     origin = {"settings": {"seed": 0}}
     (tmp_path / "provenance.json").write_text(contents)
     with (
-        pytest.raises(InputError, match=r"provenance.json: the file is damaged: give another --output"),
+        refused("provenance.json", "damaged", "another --output"),
         claimed_directory(tmp_path, origin),
     ):
         pass

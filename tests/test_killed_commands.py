@@ -165,6 +165,7 @@ def dask() -> Iterator[str]:
         yield cluster.scheduler_address
 
 
+@pytest.mark.sampled
 @pytest.mark.parametrize("processes", ["two workers", "one worker", "Dask"][:KILLS])
 def test_a_killed_benchmark_loses_no_pair_and_measures_none_twice(tmp_path, data, processes, request):
     options: dict[str, tuple[str, ...]] = {
@@ -204,6 +205,7 @@ def leftovers(directory: Path) -> list[str]:
     return [name for name in files(directory) if re.fullmatch(r"\.[0-9a-f]{32}.*", Path(name).name)]
 
 
+@pytest.mark.sampled
 def test_a_killed_collection_continues(tmp_path, data):
     out, reference = tmp_path / "out", tmp_path / "reference"
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from messages import assert_names, refused
 from synthetic import sphere_mesh
 
 from jaxsmw.errors import InputError
@@ -165,9 +166,8 @@ def test_undefined_points_are_left_out_with_a_note(tmp_path):
     )
     landmarks = read_landmark_file(path)
     assert landmarks.names == ("2", "a") and landmarks.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert landmarks.notes == (
-        "2 of 4 points left out because Slicer has no defined position for them: number 1, 3.",
-    )
+    (note,) = landmarks.notes
+    assert_names(note, "2 of 4", "left out", "no defined position", "1, 3")
     path = tmp_path / "p.fcsv"
     path.write_text(FCSV.format("LPS") + "1,1,2,3,0,0,0,1,1,1,0,a,,,0,0\n2,1,2,3,0,0,0,1,1,1,0,b,,,2,0\n")
     assert read_landmark_file(path).names == ("b",) and "number 1." in read_landmark_file(path).notes[0]
@@ -423,7 +423,7 @@ def test_single_landmarks_off_the_surface_cause_a_warning():
     assert "'c' is " in warning and warning.endswith("% of the diagonal of the mesh.")
     # Neither frame and no other unit fits, so the message suggests no change.
     elsewhere = Landmarks(("a", "b"), (mesh.vertices + 0.5 * mesh.vertex_normals)[[0, 50]])
-    with pytest.raises(InputError, match="give landmarks of this mesh, in its unit and coordinates"):
+    with refused("landmarks of this mesh", "unit", "coordinates"):
         check_frame(elsewhere, mesh)
 
 

@@ -254,7 +254,7 @@ def test_the_summary_states_the_differences_and_the_figure_is_written(tmp_path):
         {"SHOT, start": 220.0, "learned, start": 110.0, "SHOT, refined": 10.0, "learned, refined": 10.5},
         {"SHOT, start": 210.0, "learned, start": 120.0, "SHOT, refined": 12.0, "learned, refined": 11.0},
     ]
-    page = "\n".join(summary({"people": rows}, 5, 0, "Commit 1."))
+    page = "\n".join(summary({"people": rows}, 5, 0))
     assert "| people, initial map | 3 | 210.0 | 110.0 (−100.0 [" in page
     assert "| people, refined | 3 | 14.0 | 14.2 (+0.2 [" in page
     curve = learning.Trained(None, np.linspace(1, 0.5, 30), np.array([0, 20, 30]), np.array([1.0, 0.8, 0.7]))

@@ -122,5 +122,5 @@ def test_the_summary_states_the_difference_from_meyer():
         {"Meyer": 10.0, "learned": 9.0},
         {"Meyer": 12.0, "learned": 12.5},
     ]
-    page = "\n".join(summary({"people": rows}, 5, 0, "Commit 1."))
+    page = "\n".join(summary({"people": rows}, 5, 0))
     assert "| people | 3 | 14.0 | 13.2 (−0.8 [" in page

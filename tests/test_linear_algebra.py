@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import jax.scipy as jsp
 import numpy as np
 import pytest
+from sampled_cases import first_always
 from synthetic import random_spectrum
 
 from jaxsmw.core import linear_algebra
@@ -67,9 +68,8 @@ def refine_batch(name, vertices, eigenvectors):
     print("refined")
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "regression" else pytest.mark.slow) for name in REFINERS]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", first_always(sorted(REFINERS, key=lambda name: name != "regression")))
 def test_a_batch_of_pairs_does_not_wait_for_ever(name):
     """Without a loop around LAPACK, the batch of `FeatureRegression` waits for ever (jaxlib 0.10)."""
     here = Path(__file__).parent
@@ -90,7 +90,9 @@ def lapack_calls(function, *arguments):
     return re.findall(r'@lapack_.*num_batch_dims = "(\d+)"', text)
 
 
-@pytest.mark.parametrize("name", [*REFINERS, *PATCHES])
+@pytest.mark.parametrize(
+    "name", first_always(["registration", *sorted({*REFINERS, *PATCHES} - {"registration"})])
+)
 def test_batches_of_pairs_call_lapack_matrix_by_matrix(name):
     x, y, maps = batch_of_pairs(40, 6)
     samples = None if name in PATCHES else (jnp.arange(0, 40, 2), jnp.arange(1, 40, 2))
@@ -106,7 +108,9 @@ def test_batches_of_pairs_call_lapack_matrix_by_matrix(name):
     assert calls and set(calls) == {"0"}
 
 
-@pytest.mark.parametrize("name", SOLUTIONS)
+@pytest.mark.parametrize(
+    "name", first_always(["least squares", "nearest orthogonal", "filtering", "regularized"], always=2)
+)
 def test_derivatives_of_batches_call_lapack_matrix_by_matrix(name):
     x, y, maps = batch_of_pairs(40, 6)
     refiner = WaveletPreservation(solution=SOLUTIONS[name])
@@ -158,7 +162,7 @@ FACTORISATIONS = {
 }
 
 
-@pytest.mark.parametrize("name", FACTORISATIONS)
+@pytest.mark.parametrize("name", first_always(FACTORISATIONS, always=4))
 def test_factorisations_and_their_derivatives_equal_those_of_jax(name):
     function, expected, shape, right_shape = FACTORISATIONS[name]
     generator = np.random.default_rng(0)

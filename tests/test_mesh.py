@@ -17,6 +17,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from messages import assert_names
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Diagnosis, Mesh, coincident_vertices, diagnose, make_mesh
@@ -156,12 +157,11 @@ def test_cleaning_drops_faces_and_keeps_vertices():
     mesh = make_mesh([*SQUARE, [9, 9, 9]], faces, notes=["From afar."])
     assert mesh.faces.tolist() == SQUARE_FACES, "the first of several equal faces must keep its place"
     assert len(mesh.vertices) == 5 and mesh.referenced_vertices.tolist() == [True] * 4 + [False]
-    assert mesh.notes == (
-        "From afar.",
-        "1 face dropped because of a repeated vertex.",
-        "3 faces dropped because of an earlier face with equal vertices.",
-        "1 unreferenced vertex (in no face) among 5 vertices.",
-    )
+    given, repeated, equal, unreferenced = mesh.notes
+    assert given == "From afar."
+    assert_names(repeated, "1 face dropped", "repeated vertex")
+    assert_names(equal, "3 faces dropped", "equal vertices")
+    assert_names(unreferenced, "1 unreferenced vertex", "5 vertices")
 
 
 def unwelded(mesh: Mesh) -> Mesh:
@@ -345,11 +345,10 @@ def test_brief_sentences_contain_all_numbers_that_the_notes_do_not():
     vertices = np.concatenate([POINTS, [POINTS[0] * 0.5 + POINTS[1] * 0.5]])
     faces = [[0, 1, 2], [1, 0, 3], [0, 1, 4], [5, 6, 7], [5, 6, 8], [5, 9, 10], [0, 1, 12]]
     mesh = make_mesh(vertices, faces)
-    assert diagnose(mesh).brief_sentences() == (
-        "13 vertices, 7 faces, 2 connected components, open.",
-        "Unusual elements: 15 boundary edges in 2 loops, 1 non-manifold edge (more than two faces), 1 non-manifold "
-        "vertex, 1 edge between faces of opposite orientation, 1 degenerate triangle without area.",
-    )
+    counts, unusual = diagnose(mesh).brief_sentences()
+    assert_names(counts, "13 vertices", "7 faces", "2 connected components", "open")
+    assert_names(unusual, "15 boundary edges in 2 loops", "1 non-manifold edge", "1 non-manifold vertex")
+    assert_names(unusual, "1 edge between faces of opposite orientation", "1 degenerate triangle")
     assert "1 unreferenced vertex (in no face) among 13 vertices." in mesh.notes
     assert diagnose(OCTAHEDRON).brief_sentences() == diagnose(OCTAHEDRON).sentences()
 
@@ -559,10 +558,9 @@ def test_welding_reports_that_it_changed_nothing(saved):
     path = saved("s.stl", binary_stl(np.array(SQUARE)[SQUARE_FACES]))
     plain, welded = read_mesh(path), read_mesh(path, weld=True)
     assert same_mesh(plain, welded) and diagnose(plain).components == 1
-    assert welded.notes == (
-        *plain.notes,
-        "Welding changed nothing: no two vertices of faces have the same position.",
-    )
+    *notes, last = welded.notes
+    assert tuple(notes) == plain.notes
+    assert_names(last, "welding changed nothing", "same position")
     mesh = make_mesh([*SQUARE, SQUARE[0]], SQUARE_FACES, weld=True)
     assert mesh.faces.tolist() == SQUARE_FACES and "Welding changed nothing" in mesh.notes[0]
 
@@ -929,7 +927,7 @@ def read_or_refuse(path: Path) -> None:
 
 
 @given(junk=st.binary(max_size=300), start=st.sampled_from(STARTS), suffix=st.sampled_from(SUFFIXES))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_junk_is_refused_in_one_sentence(scratch, junk, start, suffix):
     path = scratch / f"junk{suffix}"
     path.write_bytes(start + junk)
@@ -954,7 +952,7 @@ SPLICES = st.one_of(
 
 
 @given(data=st.data(), sound=st.sampled_from(SOUND))
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_damaged_files_are_read_or_refused(scratch, data, sound):
     suffix, content = sound
     for _ in range(data.draw(st.integers(1, 3))):
@@ -974,7 +972,7 @@ COORDINATES = st.one_of(
 
 
 @given(vertices=hnp.arrays(np.float64, st.tuples(st.integers(3, 8), st.just(3)), elements=COORDINATES))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_written_meshes_are_read_back_bit_for_bit(scratch, vertices):
     vertices = np.concatenate([vertices, np.array(SQUARE) * 1e45])
     faces = np.array(SQUARE_FACES) + len(vertices) - 4

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.io
-from command_line import assert_refused, runner, write_pair
+from command_line import assert_refused, write_pair
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mesh_samples import sample
@@ -242,11 +242,6 @@ def test_textures_that_cannot_be_read_are_left_out(tmp_path, name):
     assert fault in note and note.endswith(".")
 
 
-@pytest.fixture
-def run(capsys):
-    return runner(capsys)
-
-
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory) -> Path:
     return write_pair(tmp_path_factory.mktemp("pair"))
@@ -324,7 +319,7 @@ def sound(tmp_path_factory) -> dict[str, bytes]:
 
 
 @given(data=st.data())
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=200, deadline=None)
 def test_damaged_files_are_read_or_refused(tmp_path_factory, sound, data):
     name = data.draw(st.sampled_from(sorted(sound)))
     content = sound[name]

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh, random_spectrum
 
-from jaxsmw.benchmark.opponents.base import MethodInput
+from jaxsmw.benchmark.opponents.base import HostMethod, MethodInput
 from jaxsmw.benchmark.opponents.baselines import Refined, Unrefined, ZoomOut
 from jaxsmw.benchmark.opponents.registry import METHODS, PEERS, known_methods
 from jaxsmw.benchmark.opponents.smooth_shells import SmoothShells
@@ -116,9 +116,35 @@ def test_other_libraries_run_the_same_zoomout():
         for s in (x.pad(320), y.pad(310))
     )
     shifted = jnp.roll(jnp.pad(initial_map + 1, (0, 20)), 1)
+    mesh = make_mesh(generator.normal(size=(301, 3)), np.arange(1, 301).reshape(-1, 3))
     for name, peer in peers.items():
-        found = peer(MethodInput(SpectralPair(x, y, samples), shifted))
+        found = peer(MethodInput(SpectralPair(x, y, samples), shifted, (mesh, mesh)))
         found = np.asarray(found)[1:301] - 1
         assert np.mean(found != order) < 0.02
         if name == "pyfm-zoomout":
             np.testing.assert_array_equal(found, expected)
+
+
+def test_unreferenced_vertices_receive_matches_and_are_never_matches():
+    """Methods in NumPy receive meshes in which all vertices are referenced."""
+    mesh = bumpy_mesh(2)
+    n = len(mesh.vertices)
+    stray = make_mesh(np.concatenate([[[5.0, 0, 0]], mesh.vertices, [[0, 9.0, 0]]]), mesh.faces + 1)
+    spectrum = compute_spectrum(stray, 20).with_descriptors(jnp.ones((n + 2, 3)))
+    order = np.random.default_rng(0).permutation(n)
+
+    class Shuffled(HostMethod):
+        def match(self, initial_map, x, y):
+            np.testing.assert_array_equal(x.mesh.vertices, mesh.vertices)
+            np.testing.assert_array_equal(x.mesh.faces, mesh.faces)
+            np.testing.assert_array_equal(initial_map, np.arange(n))
+            np.testing.assert_array_equal(y.eigenvectors, np.asarray(spectrum.eigenvectors)[1:-1])
+            assert x.descriptors.shape == (n, 3) and x.vertex_areas.shape == (n,)
+            return order
+
+    padded = spectrum.pad(n + 20)
+    pair = MethodInput(SpectralPair(padded, padded), jnp.arange(n + 20), (stray, stray))
+    found = Shuffled()(pair)
+    assert found.shape == (n + 2,)
+    np.testing.assert_array_equal(found[1:-1], order + 1)
+    assert stray.referenced_vertices[found].all()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from messages import refused
 from report_helpers import TALL, decode, ellipsoid, embedded, renumbered
 from synthetic import random_spectrum
 
@@ -133,7 +134,7 @@ def test_page_holds_the_placements_and_the_registered_source(tmp_path: Path) -> 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("registered", [TALL.vertices[1:], TALL.vertices * np.nan, TALL.vertices[:, :2]])
 def test_registered_positions_that_do_not_fit_are_refused(registered: np.ndarray) -> None:
-    with pytest.raises(InputError, match="three finite numbers for each of the 642 vertices of ellipsoid"):
+    with refused("three finite numbers", "642 vertices", "ellipsoid"):
         _page(TALL, TALL, np.arange(len(TALL.vertices)), registered=registered)
 
 

@@ -4,6 +4,7 @@ import struct
 
 import numpy as np
 import pytest
+from messages import assert_names
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
@@ -97,7 +98,7 @@ def test_normals_without_a_direction_are_ignored(value):
     normals = np.full_like(BUMPY.vertices, value)
     cloud = triangulate_points(BUMPY.vertices, normals)
     assert triangles(cloud) == triangles(triangulate_points(BUMPY.vertices))
-    assert cloud.notes[0] == "Normals ignored: 2562 normals without a direction."
+    assert_names(cloud.notes[0], "normals ignored", "2562", "without a direction")
     normals[:2000] = BUMPY.vertex_normals[:2000]
     assert triangulate_points(BUMPY.vertices, normals).area == pytest.approx(cloud.area, rel=0.05)
 
@@ -207,7 +208,8 @@ def test_files_of_points_are_read(tmp_path, name):
     mesh = read_mesh(tmp_path / name)
     np.testing.assert_allclose(mesh.vertices, POINTS, rtol=1e-6)
     assert triangles(mesh) == triangles(triangulate_points(mesh.vertices))
-    assert ("Columns ignored: 4 to 6, which are not unit normals." in mesh.notes) == (name == "colours.xyz")
+    ignored = [note for note in mesh.notes if "columns ignored: 4 to 6" in note.casefold()]
+    assert len(ignored) == (name == "colours.xyz")
 
 
 @pytest.mark.parametrize("name", NPY_NAMES)

@@ -4,9 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
+from sampled_cases import first_always
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from synthetic import bumpy_mesh
+from synthetic import bumpy_mesh, in_precision, stacked
 
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import Problem
@@ -212,9 +213,8 @@ def test_signs_padding_and_vmap_do_not_change_the_map(pair):
     np.testing.assert_array_equal(wide.pointwise_map[:m], plain.pointwise_map)
     np.testing.assert_allclose(wide.history.energy, plain.history.energy, rtol=1e-9, atol=1e-12)
     reverse_map = jnp.asarray(KDTree(np.asarray(y.positions)).query(np.asarray(x.positions))[1], jnp.int32)
-    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *sides) for sides in ((x, y), (y, x))]
     both = eqx.filter_vmap(lambda *arguments: refine(*arguments, refiner=refiner))(
-        *stacked, jnp.stack([initial_map, reverse_map])
+        stacked(x, y), stacked(y, x), jnp.stack([initial_map, reverse_map])
     )
     np.testing.assert_array_equal(both.pointwise_map[0], plain.pointwise_map)
     np.testing.assert_array_equal(
@@ -248,7 +248,8 @@ def test_the_shapes_can_have_different_numbers_of_eigenvectors(pair):
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.9
 
 
-@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.slow
+@pytest.mark.parametrize("sampled", first_always([True, False]))
 @pytest.mark.parametrize("refiner", [Registration((20, 30)), FeatureRegression((20, 30))])
 def test_both_maps_of_a_state_are_recovered_together(pair, refiner, sampled):
     x, y, initial_map, truth, _ = pair
@@ -256,7 +257,7 @@ def test_both_maps_of_a_state_are_recovered_together(pair, refiner, sampled):
     prepared = refiner.prepare(Problem(x, y, samples))
     start = initial_map[samples[0]] if sampled else initial_map
     state, _ = refiner.update(prepared, start, None)
-    state, _ = refiner.update(prepared, refiner.recover(prepared, state), state)
+    state, _ = refiner.update(prepared, *refiner.recover_both(prepared, state))
     found, completed = refiner.recover_both(prepared, state)
     np.testing.assert_array_equal(found, refiner.recover(prepared, state))
     assert state.reverse_map is None
@@ -286,9 +287,7 @@ def test_a_partial_shape_keeps_its_size(pair):
 
 def test_float32_stays_float32_and_agrees(pair):
     x, y, initial_map, truth, _ = pair
-    single = [
-        jax.tree.map(lambda leaf: leaf.astype(np.float32) if leaf.dtype == float else leaf, s) for s in (x, y)
-    ]
+    single = in_precision((x, y), np.float32)
     found = refine(*single, initial_map, refiner=Registration((20, 40)), iterations=4)
     assert {leaf.dtype for leaf in jax.tree.leaves(found.state)} == {
         np.dtype(np.float32),

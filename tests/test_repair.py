@@ -20,6 +20,7 @@ from jaxsmw.matching.judge import Judge, detours, distortion, overlap
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.search import repair
 from jaxsmw.matching.search.repair import refine_and_repair, refine_further
 from jaxsmw.matching.settings import RepairSettings
 from jaxsmw.matching.stages import PRESETS, Preset, Stage
@@ -66,11 +67,35 @@ def prepared_body(body, initial_map, origin="map"):
     return prepared, Start(np.asarray(initial_map, np.int64), origin)
 
 
-def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), init=None, **options):
+@pytest.fixture
+def given_alternatives(monkeypatch):
+    """Return a function that lets repair try given maps instead of computed alternatives."""
+
+    def give(*maps):
+        class Given:
+            has_creases, deformation = False, None
+
+            def __init__(self, *_):
+                pass
+
+            def best(self, *_, **__):
+                if not maps:
+                    raise AssertionError("an alternative initial map was computed")
+                return iter(maps)
+
+            def different(self, _, others):
+                return tuple(others)
+
+        monkeypatch.setattr(repair, "Alternatives", Given)
+
+    return give
+
+
+def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), init="map"):
     """Return the share of the area that has wrong matches, and the scored map."""
-    prepared, start = prepared_body(body, initial_map, "map" if init is None else init)
+    prepared, start = prepared_body(body, initial_map, init)
     preset, mesh = Preset(repeated=tuple(stages), repair=repair), body[0]
-    found = refine_and_repair(prepared, start, preset, **options)
+    found = refine_and_repair(prepared, start, preset)
     found = refine_further(prepared, start.origin, preset, found)
     assert found.successful
     wrong = found.pointwise_map != np.arange(len(mesh.vertices))
@@ -93,20 +118,24 @@ def test_padding_changes_nothing(body, swapped, monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_alternative_initial_map_helps_where_a_single_round_does_not(body, swapped, mirrored, identity):
+def test_an_alternative_initial_map_helps_where_a_single_round_does_not(
+    body, swapped, mirrored, identity, given_alternatives
+):
     """A single round keeps the mirrored map, but alternative initial maps lead to the right map."""
     mesh, spectrum = body
-    repair = replace(REPAIR, rounds=1)
+    settings = replace(REPAIR, rounds=1)
     assert distortion(Pair(mesh, mesh), mirrored, spectrum) > 1.3
-    wrong, found = outcome(body, mirrored, repair, alternatives=[swapped, identity])
+    given_alternatives(swapped, identity)
+    wrong, found = outcome(body, mirrored, settings, init="shot")
     assert wrong < 0.02 and not np.array_equal(found.outcome.initial_map, mirrored) and not found.suspicious
-    wrong, alone = outcome(body, mirrored, repair)
+    wrong, alone = outcome(body, mirrored, settings)
     assert wrong > 0.5 and alone.suspicious and alone.distortion > 1.3
 
 
-def test_the_map_of_the_best_score_is_chosen(body, mirrored, identity, monkeypatch):
+def test_the_map_of_the_best_score_is_chosen(body, mirrored, identity, monkeypatch, given_alternatives):
     monkeypatch.setattr(Judge, "score", lambda self, outcome: -outcome.distortion)
-    wrong, found = outcome(body, mirrored, replace(REPAIR, rounds=0), alternatives=[identity])
+    given_alternatives(identity)
+    wrong, found = outcome(body, mirrored, replace(REPAIR, rounds=0), init="shot")
     assert wrong > 0.5 and found.suspicious
 
 
@@ -224,27 +253,28 @@ def test_a_rival_replaces_the_map_if_its_score_is_better_after_the_passes(body, 
         assert not found.suspicious
 
 
-def test_rivals_of_a_map_that_looks_right_look_right_as_well(body, mirrored, identity):
+def test_rivals_of_a_map_that_looks_right_look_right_as_well(body, mirrored, identity, given_alternatives):
+    given_alternatives(identity)
     settings = replace(REPAIR, suspicious=1.0, suspicious_area=1.0, doubtful=1.0, rounds=0)
     for doubtful, margin, number in ((1.0, 100.0, 1), (1.0, 0.0, 0), (1.1, 100.0, 0), (100.0, 100.0, 1)):
         _, found = outcome(
             body,
             mirrored,
             replace(settings, doubtful=doubtful, rival_margin=margin, non_isometric=10.0),
-            alternatives=[identity],
+            init="shot",
         )
         assert len(found.rivals) == number and found.suspicious == (doubtful == 1)
 
 
-def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity):
-    def none():
-        raise AssertionError("an alternative initial map was computed")
-        yield
-
-    wrong, found = outcome(body, identity, alternatives=none())
+def test_alternative_initial_maps_are_computed_only_if_needed(body, swapped, identity, given_alternatives):
+    given_alternatives()
+    wrong, found = outcome(body, identity, init="shot")
     assert wrong < 0.02
     np.testing.assert_array_equal(found.outcome.initial_map, identity)
-    outcome(body, swapped, None, alternatives=none())
+    outcome(body, swapped, None, init="shot")
+    outcome(body, swapped)
+    with pytest.raises(AssertionError, match="an alternative initial map was computed"):
+        outcome(body, swapped, init="shot")
 
 
 @pytest.mark.slow

@@ -294,7 +294,7 @@ def test_specificity_agrees_with_distances_of_random_shapes(number_of_modes: int
         )
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_shapes_of_a_real_kind_have_a_compact_model() -> None:
     """Few modes describe poses of one body, and more modes describe new shapes better."""
     meshes = [creature("quadruped", vertices=600, pose=pose) for pose in CREATURES["quadruped"]]

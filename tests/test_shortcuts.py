@@ -177,6 +177,7 @@ NEVER = RepairSettings(suspicious=1e3, compared=1e3, non_isometric=1e3)
 REPAIRED = Preset(repeated=(SHORT,), repair=NEVER)
 
 
+@pytest.mark.slow
 def test_match_cuts_both_meshes_if_the_preset_repairs(fused, separate):
     """Maps refer to the vertices of the given meshes, and vertices that a cut isolates have matches."""
     assert not PRESETS["paper"].cuts_shortcuts
@@ -246,6 +247,7 @@ def test_points_on_a_cut_surface_keep_their_positions(fused):
     assert np.array_equal(on_fused.weights, points.weights)
 
 
+@pytest.mark.slow
 def test_collections_are_cut(fused, separate):
     """The points of the template lie on the given surfaces."""
     found = match_collection(

@@ -105,17 +105,6 @@ def test_a_turned_copy_is_recovered_exactly():
     assert np.mean(alone != order) > 0.2
 
 
-def test_unreferenced_vertices_receive_matches_and_are_never_matches():
-    mesh = bumpy_mesh(2)
-    stray = make_mesh(np.concatenate([[[5.0, 0, 0]], mesh.vertices, [[0, 9.0, 0]]]), mesh.faces + 1)
-    found = smooth_shells(
-        stray, stray, no_descriptors(stray), no_descriptors(stray), number_of_eigenvectors=500, proposals=1
-    )
-    assert found.shape == (len(stray.vertices),) and found.dtype == np.int64
-    np.testing.assert_array_equal(found[1:-1], np.arange(1, len(stray.vertices) - 1))
-    assert stray.referenced_vertices[found].all()
-
-
 @pytest.mark.parametrize("wrong", [{"number_of_eigenvectors": 0}, {"proposals": 0}])
 def test_impossible_settings_are_refused(wrong):
     mesh = bumpy_mesh(2)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from report_helpers import TALL, ellipsoid, renumbered
+from sampled_cases import first_always
 from synthetic import grid_mesh
 
 from jaxsmw.creature import creature_pair
@@ -61,7 +62,7 @@ def in_convention(mesh: Mesh, up: str) -> Mesh:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["biped", "quadruped"])
+@pytest.mark.parametrize("kind", first_always(["biped", "quadruped"]))
 def test_up_is_guessed_in_every_convention(kind: str) -> None:
     pair = creature_pair(kind, vertices=1500)
     for up in ("y", "z", "-y"):

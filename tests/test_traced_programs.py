@@ -141,6 +141,7 @@ def test_everything_that_changes_a_program_is_a_part_of_its_key(directory, argum
         assert stored() == number
     start_anew()
     changed = tmp_path / "changed.py"
+    monkeypatch.setattr(traced_programs, "LIBRARY", tmp_path)
     changed.write_text("x = 1", "utf-8")
     monkeypatch.setattr(traced_programs, "measured_code", lambda: [changed])
     compiled(refine)(*arguments, iterations=1)

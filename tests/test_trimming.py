@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from sampled_cases import first_always
 from scipy.spatial import KDTree
 
 from jaxsmw import creature_pair, geodesic_error, make_mesh, match, read_mesh
@@ -32,7 +33,7 @@ WHOLE = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=0))
 @pytest.fixture(scope="module")
 def pose():
     """Two poses of a body with different triangulations, and the true map of the vertices of the first."""
-    found = creature_pair(vertices=1500)
+    found = creature_pair(vertices=1300)
     return found.source, found.target, found.truth.nearest_corners(found.target)
 
 
@@ -94,7 +95,7 @@ def test_small_pieces_of_the_trimmed_shape_are_left_out(pose, part):
     assert not kept[far] and kept.any()
 
 
-@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize("reverse", first_always([False, True]))
 def test_a_trimmed_pair_is_matched_better(pose, part, reverse):
     """The map of the part is more accurate after trimming. The part may also be the target."""
     _, target, truth = pose
@@ -156,6 +157,7 @@ def test_the_trimmed_stage_is_the_last_stage_with_lower_levels(pose, part):
         assert trimmed_stage(other, replace(TRIMMED, repair=settings)) is None
 
 
+@pytest.mark.slow
 def test_full_shapes_and_parts_of_similar_area_are_not_trimmed(pose, part):
     source, target, truth = pose
     same = nearest(part, part.vertices)
@@ -165,6 +167,7 @@ def test_full_shapes_and_parts_of_similar_area_are_not_trimmed(pose, part):
         assert np.asarray(found.spectrum_y.mask).sum() == meshes[1].referenced_vertices.sum()
 
 
+@pytest.mark.slow
 def test_all_trims_share_one_program_that_is_compiled_ahead(pose, part, compilations):
     _, target, truth = pose
     twice = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=2))

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
+from messages import refused
 from test_benchmark import scape  # noqa: F401 (a fixture)
 
 from jaxsmw import InputError
@@ -119,18 +120,18 @@ def test_missing_provenance_is_named(tmp_path):
 
 def test_results_of_another_data_set_are_refused(scape, tmp_path):  # noqa: F811
     stored = StoredResults(write_results(tmp_path, rows=ROW), "shot")
-    with pytest.raises(InputError, match="contains the pair a to b, which is not in"):
+    with refused("pair a to b", "not in"):
         stored.draw(open_data_set(scape), 0)
 
 
 def test_methods_with_maps_from_a_directory_must_be_given(tmp_path):
     stored = StoredResults(write_results(tmp_path, rows=ROW + ROW.replace("mwp", "theirs")), "shot")
-    with pytest.raises(InputError, match="contains the method theirs, whose maps come from a directory"):
+    with refused("method theirs", "maps", "directory"):
         stored.chosen_methods(None, ["mwp"])
     assert stored.chosen_methods(None, ["mwp", "theirs"]) == ["mwp", "theirs"]
     assert stored.chosen_methods(["mwp"], ["mwp"]) == ["mwp"]
     assert stored.chosen_methods([str(tmp_path / "theirs")], ["mwp"]) == [str(tmp_path / "theirs")]
-    with pytest.raises(InputError, match="no results of the method zoomout: choose from mwp, theirs"):
+    with refused("zoomout", "no results", "mwp, theirs"):
         stored.chosen_methods(["zoomout"], ["mwp"])
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from jaxsmw.benchmark.datasets import DataPair, DataSet
+from jaxsmw.benchmark.datasets import DataPair, DataSet, first_three
 from jaxsmw.benchmark.journal import Journal, Row
 from jaxsmw.benchmark.measurement import (
     RESULT_COLUMNS,
@@ -37,11 +37,10 @@ class Results(NamedTuple):
 
     **Attributes:**
 
-    - `rows`: a list of dictionaries, each with the keys of `RESULT_COLUMNS`. The list contains one row for
-      each pair and method. A pair is left out if any method has no result for this pair.
-    - `shapes`: a dictionary from the name of each measured shape to a row with the keys of `SHAPE_COLUMNS`.
-    - `failures`: a dictionary of error messages, with one entry per shape or pair that could not be measured.
-      The key is the name of the shape, or the text "SOURCE to TARGET" for a pair.
+    - `rows`: one row with the keys of `RESULT_COLUMNS` for each pair and method. A pair is left out if any
+      method has no result for this pair.
+    - `shapes`: one row with the keys of `SHAPE_COLUMNS` for each measured shape, by the name of the shape.
+    - `failures`: the error message of each shape or pair that could not be measured, by its name.
     """
 
     rows: list[Row]
@@ -49,11 +48,7 @@ class Results(NamedTuple):
     failures: dict[str, str]
 
     def check(self) -> None:
-        """Check that every shape and every pair was measured.
-
-        **Raises:** `InputError` if a measurement failed. The exception has one note for each cause. The note
-        names the cause, and the first three shapes or pairs that failed.
-        """
+        """Raise `InputError` if a measurement failed, with one note for each cause."""
         if not self.failures:
             return
         causes: dict[str, list[str]] = {}
@@ -64,18 +59,8 @@ class Results(NamedTuple):
             "again (all other results are kept):"
         )
         for cause, names in causes.items():
-            error.add_note(f"{_some(names)}: {cause}")
+            error.add_note(f"{first_three(names)}: {cause}")
         raise error
-
-
-def _some(names: Sequence[str]) -> str:
-    """Return a text that contains the first three names and the number of further names."""
-    more = len(names) - _NAMED_FAILURES
-    return ", ".join(names[:_NAMED_FAILURES]) + (f" and {more} more" if more > 0 else "")
-
-
-# For each cause of failures, the error message names at most this many shapes or pairs.
-_NAMED_FAILURES = 3
 
 
 def run_benchmark(
@@ -90,24 +75,17 @@ def run_benchmark(
 ) -> Results:
     """Run every method on every pair, and store the errors and times in CSV files.
 
-    If `output` already contains the result of a method on a pair, the method is not run again on this pair.
-    Each new result is stored immediately. If a shape or pair cannot be measured, the benchmark continues with
-    the remaining shapes and pairs.
+    Each new result is stored immediately, and stored results are not measured again. If a shape or pair
+    cannot be measured, the benchmark continues with the others, and `Results.failures` contains the message.
 
     **Arguments:**
 
-    - `data_set`: the `DataSet` that contains the pairs.
-    - `pairs`: the pairs to match, each a `DataPair` of `data_set`.
+    - `data_set`, `pairs`: the `DataSet`, and its pairs to match.
     - `output`: an existing directory for the files `results.csv`, `shapes.csv` and `provenance.json`.
-    - `methods`: a dictionary from the name of each method to the method, for example `METHODS`. The names are
-      written to the column `method` of `results.csv`.
-    - `settings`: the `Settings` of the benchmark. Results that `output` already contains must have been
-      measured with the same settings.
+    - `methods`: the methods by name, for example `METHODS`.
+    - `settings`: the `Settings`, which must be those of all results that `output` contains.
     - `executor`: the executor that runs the tasks; see `jaxsmw.runtime.workers.open_executor`.
     - `quiet`: whether to hide the progress bars.
-
-    **Returns:** The `Results` of these pairs and methods. If a shape or pair cannot be measured,
-    `Results.failures` contains the error message. No error is raised until `Results.check` is called.
 
     **Raises:** `InputError` if `output` contains damaged results, or results that were measured with other
     data, settings or software versions. `InputError` is also raised if another process is adding results to
@@ -127,11 +105,8 @@ def run_benchmark(
 
 
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
-    """Return the number of eigenvectors to precompute, which suffices for `methods` and for all of `METHODS`.
-
-    The time of the precomputation depends on this number, so all results in a directory have the same number.
-    A later benchmark of other methods usually has this number as well, and can add its results.
-    """
+    # The time of the precomputation depends on this number, so all results in a directory share it. It also
+    # suffices for all of `METHODS`, so that a later benchmark of other methods can add its results.
     return max(method.number_of_eigenvectors for method in (*METHODS.values(), *methods.values()))
 
 
@@ -168,7 +143,7 @@ class _Store:
                 )
 
     def missing_shapes(self) -> dict[str, tuple[str, Path]]:
-        """Return a dictionary from the name of each unmeasured shape to a tuple (name, mesh file)."""
+        """Return the name and the mesh file of each unmeasured shape, by name."""
         return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
 
     def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, tuple[DataPair, dict[str, Method]]]:
@@ -182,8 +157,8 @@ class _Store:
 
     def collected(self, methods: Mapping[str, Method], failed: Mapping[str, BaseException]) -> Results:
         """Return the results of the pairs for which every method has a result, so methods are comparable."""
-        known = [pair for pair in self.pairs if all((name,) in self.shapes for name in pair.names)]
-        by_pair = [[(*pair.names, name) for name in methods] for pair in known]
+        measured = [pair for pair in self.pairs if all((name,) in self.shapes for name in pair.names)]
+        by_pair = [[(*pair.names, name) for name in methods] for pair in measured]
         finished = [keys for keys in by_pair if all(key in self.results for key in keys)]
         return Results(
             [self.results[key] for keys in finished for key in keys],

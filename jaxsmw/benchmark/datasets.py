@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
@@ -26,21 +26,15 @@ if TYPE_CHECKING:
 class DataPair:
     """A pair of shapes in a data set: their names, their mesh files, and the files of their ground truth.
 
-    `open_data_set` creates the pairs of a data set. The method `ground_truth` reads the files of the ground
-    truth, and returns a `GroundTruth`.
-
     **Attributes:**
 
     - `source`, `target`: the names of the source X and the target Y.
-    - `source_file`, `target_file`: the paths of the mesh files of X and Y.
-    - `truth`: a tuple with the paths of one to three ground-truth files, in a format that
-      `read_ground_truth` reads. If the tuple is empty, vertex i of X corresponds to vertex i of Y.
-    - `mirrored_truth`: a tuple with the paths of the files of the mirrored ground truth; None if the data set
-      has no mirrored ground truth. In the mirrored ground truth, left and right are exchanged.
-    - `index_base`: the index of the first vertex in the ground-truth files, 0 or 1; None selects the default
-      of the file format.
-    - `partial`: whether X is a part of the full shape Y. The meshes of a partial pair have the same unit of
-      length.
+    - `source_file`, `target_file`: the mesh files of X and Y.
+    - `truth`: one to three files for `read_ground_truth`. Without files, vertex i of X corresponds to vertex
+      i of Y.
+    - `mirrored_truth`: the files of a ground truth in which left and right are exchanged; None without one.
+    - `index_base`: the index of the first vertex in these files, 0 or 1; None for the default of the format.
+    - `partial`: whether X is a part of the full shape Y. Their meshes then have the same unit of length.
     """
 
     source: str
@@ -68,19 +62,15 @@ class DataPair:
         return self.source_file, self.target_file
 
     def ground_truth(self, mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool = False) -> GroundTruth:
-        """Read and return the direct or the mirrored ground truth of the pair.
+        """Read and return the direct or the mirrored `GroundTruth` of the pair.
 
         **Arguments:**
 
-        - `mesh_x`, `mesh_y`: the meshes of X and Y, as read from `source_file` and `target_file`.
+        - `mesh_x`, `mesh_y`: the meshes in `source_file` and `target_file`.
         - `mirrored`: whether to return the mirrored ground truth instead of the direct ground truth.
 
-        **Returns:** A `GroundTruth`, with vertices of X (`source_vertices`) and their true points on Y
-        (`targets`).
-
-        **Raises:** `InputError` if a ground-truth file cannot be read or does not fit the meshes; if
-        `mirrored` is True, but `mirrored_truth` is None; or if `truth` is empty, but X and Y have different
-        numbers of vertices.
+        **Raises:** `InputError` if a file cannot be read or does not fit the meshes, or if there is no
+        mirrored ground truth.
         """
         import numpy as np
 
@@ -106,19 +96,14 @@ class DataPair:
 class DataSet:
     """A data set: the shapes and pairs in a directory, as `open_data_set` returns them.
 
-    The property `name` is the name of the directory. The property `shapes` is a dictionary from the names of
-    shapes to the paths of their mesh files. The dictionary contains every shape that occurs in a pair.
-
     **Attributes:**
 
     - `directory`: the path of the directory that contains the files.
     - `layout`: the name of the recognised layout, a key of `jaxsmw.benchmark.datasets.LAYOUTS`, such as
       `"SHREC'16 partial"`.
-    - `pairs`: the pairs to match, as a tuple of `DataPair`. If the data set contains a list of pairs, the
-      tuple contains the listed pairs in the order of the list.
-    - `others`: a tuple of `DataPair`, with all pairs that have ground truth but are not in `pairs`. In a
-      remeshed set, the tuple also contains the pairs of shapes of different classes. Only some remeshed sets
-      have ground truth for such pairs.
+    - `pairs`: the pairs to match, each a `DataPair`, in the order of the data set's list of pairs.
+    - `others`: all other pairs with ground truth. In a remeshed set, they include all pairs of shapes of
+      different classes, although only some remeshed sets have ground truth for them.
     """
 
     directory: Path
@@ -133,15 +118,13 @@ class DataSet:
 
     @property
     def shapes(self) -> dict[str, Path]:
-        """A dictionary from the names of shapes to their mesh files, for all shapes that occur in a pair."""
-        found = {}
-        for pair in self.known_pairs.values():
-            found[pair.source], found[pair.target] = pair.source_file, pair.target_file
-        return found
+        """The mesh files of all shapes that occur in a pair, by the names of the shapes."""
+        pairs = self.known_pairs.values()
+        return {name: file for pair in pairs for name, file in zip(pair.names, pair.meshes, strict=True)}
 
     @property
     def known_pairs(self) -> dict[tuple[str, str], DataPair]:
-        """A dictionary from the names of each pair with ground truth to the pair."""
+        """All pairs with ground truth, by the names of their source and target."""
         return {pair.names: pair for pair in (*self.pairs, *self.others)}
 
 
@@ -180,12 +163,7 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
     same class form pairs. The class of a shape is its name without the number at the end, for example `cat`
     for `cat0`. In DeformingThings4D, the class is the folder of the shape.
 
-    **Arguments:**
-
-    - `directory`: the path of the directory of one unpacked data set.
-
-    **Returns:** A `DataSet`. Its attribute `pairs` is a tuple of `DataPair`, and its property `shapes` is a
-    dictionary from the names of shapes to their mesh files.
+    **Returns:** A `DataSet`.
 
     **Raises:** `InputError` if the directory does not exist, has no known layout, lacks a file, cannot be
     read, or contains several data sets.
@@ -196,7 +174,7 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
     directory = Path(directory)
     try:
         inner = [folder for folder in sorted(directory.iterdir()) if folder.is_dir() and _is_a_set(folder)]
-        found = _recognise(directory) if len(inner) < 2 else None
+        recognised = _recognise(directory) if len(inner) < 2 else None
     except OSError as error:
         raise InputError(
             f"{error.filename or directory}: cannot be read ({error.strerror}): check its permissions."
@@ -206,13 +184,13 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
             f"{directory}: contains several data sets ({', '.join(folder.name for folder in inner)}): give "
             "the directory of one data set."
         )
-    if found is None:
+    if recognised is None:
         expected = "; ".join(f"{name}: {layout.files}" for name, layout in LAYOUTS.items())
         raise InputError(
             f"{directory}: is not laid out like a known data set ({expected}): give the "
             "directory of an unpacked data set."
         )
-    layout, (pairs, others) = found
+    layout, (pairs, others) = recognised
     if not pairs:
         raise InputError(
             f"{directory}: has the layout of {layout}, but no two of its shapes form a pair: add the missing "
@@ -222,7 +200,6 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
 
 
 def _recognise(directory: Path) -> tuple[str, _Pairs] | None:
-    """Return the name of the first layout that fits a directory, and its pairs; None if no layout fits."""
     for name, layout in LAYOUTS.items():
         if (pairs := layout.open(directory)) is not None:
             return name, pairs
@@ -242,58 +219,45 @@ def _natural(name: str) -> list[tuple[int, str]]:
 
 
 def _meshes(directory: Path) -> dict[str, Path]:
-    """Return a dictionary from the name of each mesh in a directory to its file, sorted by `_natural`."""
+    """Return the mesh files in a directory by name, sorted by `_natural`."""
     from jaxsmw.io.meshes import MESH_SUFFIXES
 
     if not directory.is_dir():
         return {}
     files = [file for file in directory.iterdir() if file.suffix.lower() in MESH_SUFFIXES and file.is_file()]
-    found: dict[str, Path] = {}
-    for file in sorted(files, key=lambda file: MESH_SUFFIXES.index(file.suffix.lower())):
-        # If a shape has files in several formats, the first suffix in MESH_SUFFIXES takes precedence.
-        found.setdefault(file.stem, file)
-    return {name: found[name] for name in sorted(found, key=_natural)}
+    # If a shape has files in several formats, the first suffix in MESH_SUFFIXES takes precedence.
+    files.sort(key=lambda file: MESH_SUFFIXES.index(file.suffix.lower()), reverse=True)
+    by_name = {file.stem: file for file in files}
+    return {name: by_name[name] for name in sorted(by_name, key=_natural)}
 
 
 def _mesh_folder(directory: Path, names: re.Pattern[str]) -> dict[str, Path]:
     """Return the meshes whose names match a pattern, in the first folder that contains such a mesh."""
     folders = [directory, *sorted(folder for folder in directory.rglob("*") if folder.is_dir())]
     for folder in folders:
-        found = {name: file for name, file in _meshes(folder).items() if names.fullmatch(name)}
-        if found:
-            return found
+        if meshes := {name: file for name, file in _meshes(folder).items() if names.fullmatch(name)}:
+            return meshes
     return {}
 
 
 def _listed_pairs(directory: Path, shapes: Mapping[str, Path]) -> list[tuple[str, str]] | None:
-    """Read the list of pairs in a data set, and return the names of each pair; None if there is no list."""
+    """Read the list of pairs in a data set; return None if there is no list."""
     lists = sorted([*directory.glob("test_pairs.txt"), *directory.rglob("PAIRS_list*.txt")])
-    if not lists:
-        return None
-    return read_pairs(lists[0], shapes)
+    return read_pairs(lists[0], shapes) if lists else None
 
 
 def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tuple[str, str]]:
-    """Read a list of pairs of shapes.
+    """Read the names of the sources and targets of pairs from a text file.
 
-    Each line contains the names of the source and the target, separated by spaces, a comma or a semicolon.
-    Text after `#` is a comment.
+    Each line names two of the `shapes`, separated by spaces, a comma or a semicolon. Text after `#` is a
+    comment.
 
-    **Arguments:**
-
-    - `path`: the text file.
-    - `shapes`: the names of all shapes of the data set.
-
-    **Returns:** One tuple for each pair, with the names of its source and its target, in the order of the
-    file.
-
-    **Raises:** `InputError` if the file cannot be read, if a line does not name two of the shapes, or if the
-    file names no pair.
+    **Raises:** `InputError` if the file cannot be read, a line is not as described, or there is no pair.
     """
-    path, known, pairs = Path(path), set(shapes), []
+    path, possible, pairs = Path(path), set(shapes), []
     for number, line in _lines(path, "pairs").items():
         names = re.split(r"[,;\s]+", line)
-        wrong = [name for name in names if name not in known]
+        wrong = [name for name in names if name not in possible]
         if len(names) != 2 or wrong:
             fault = f"{wrong[0][:60]!a} is not one of the shapes" if wrong else "does not name two shapes"
             raise InputError(f"{path}, line {number}: {fault}: correct the line, or complete the data set.")
@@ -304,10 +268,7 @@ def read_pairs(path: str | os.PathLike[str], shapes: Iterable[str]) -> list[tupl
 
 
 def read_shapes(path: str | os.PathLike[str]) -> list[str]:
-    """Read a list of shapes, one name per line, and return the names. Text after `#` is a comment.
-
-    **Raises:** `InputError` if the file cannot be read.
-    """
+    """Read a list of shapes, one name per line. Text after `#` is a comment."""
     return list(_lines(Path(path), "shapes").values())
 
 
@@ -326,15 +287,11 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
 
     **Arguments:**
 
-    - `data_set`: the data set.
-    - `wanted`: a number of pairs as text, the path of a list of pairs, or None. If `wanted` is the text of a
-      number, this many pairs are drawn at random without replacement. If the data set has fewer pairs, all
-      pairs are chosen. If `wanted` is a path, the pairs in this text file are chosen (see `read_pairs`), and
-      repeated pairs are chosen once. If `wanted` is None, all pairs of the data set are chosen.
+    - `wanted`: a number of pairs as text, which are drawn at random without replacement; or the path of a
+      list of pairs (see `read_pairs`), which are chosen once each; or None for all pairs.
     - `seed`: the seed of the random draw.
 
-    **Returns:** The chosen pairs. If `wanted` is a path, the pairs have the order of the text file; otherwise
-    they have the order of the data set.
+    **Returns:** The pairs, in the order of the list or of the data set.
 
     **Raises:** `InputError` if the number is not positive, if the list cannot be read, or if a listed pair
     has no ground truth.
@@ -350,14 +307,20 @@ def choose_pairs(data_set: DataSet, wanted: str | None, seed: int) -> list[DataP
             raise InputError(f"{count} pairs cannot be measured: give at least 1.")
         rows = np.random.default_rng(seed).permutation(len(pairs))[:count]
         return [pairs[row] for row in np.sort(rows)]
-    known = data_set.known_pairs
+    by_names = data_set.known_pairs
     listed = read_pairs(wanted, data_set.shapes)
-    if unknown := [names for names in listed if names not in known]:
+    if unknown := [names for names in listed if names not in by_names]:
         raise InputError(
             f"{wanted}: {data_set.directory} has no ground truth for {' to '.join(unknown[0])}: remove the "
             "pair from the list."
         )
-    return [known[names] for names in dict.fromkeys(listed)]
+    return [by_names[names] for names in dict.fromkeys(listed)]
+
+
+def first_three(names: Sequence[str]) -> str:
+    """Return a text with the first three names and the number of further names."""
+    more = len(names) - 3
+    return ", ".join(names[:3]) + (f" and {more} more" if more > 0 else "")
 
 
 def class_of(name: str) -> str:
@@ -397,15 +360,13 @@ def _remeshed(directory: Path) -> _Pairs | None:
     _check_complete(directory, shapes, plain)
 
     def pair(x: str, y: str) -> DataPair:
-        mirrored = None
-        if f"{x}.sym" in files:
-            mirrored = (files[f"{x}.sym"], plain[y])
+        mirrored = (files[f"{x}.sym"], plain[y]) if f"{x}.sym" in files else None
         return DataPair(x, y, shapes[x], shapes[y], (plain[x], plain[y]), mirrored)
 
     pairs, others = _listed_first(pair, _listed_pairs(directory, shapes), _within_classes(shapes))
     # In some sets, such as SMAL, the .vts files also match shapes of different classes. The files do not tell
     # whether a set is of this kind, so all pairs are allowed.
-    present = {one.names for one in (*pairs, *others)}
+    present = {present.names for present in (*pairs, *others)}
     return pairs, others + [pair(*names) for names in permutations(shapes, 2) if names not in present]
 
 
@@ -538,13 +499,9 @@ def _identical(names: str) -> Callable[[Path], _Pairs | None]:
 
 
 class Layout(NamedTuple):
-    """A layout of data sets.
+    """A layout of data sets: the files by which it is recognised, as text for messages, and its reader.
 
-    **Attributes:**
-
-    - `files`: the files by which the layout is recognised, as text for messages.
-    - `open`: a function that returns the lists `pairs` and `others` of the `DataSet` in a directory, or None
-      if the directory has another layout.
+    The reader returns the lists `pairs` and `others` of a `DataSet`, or None if it has another layout.
     """
 
     files: str

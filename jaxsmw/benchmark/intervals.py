@@ -13,21 +13,14 @@ RESAMPLES = 9999
 
 
 class Interval(NamedTuple):
-    """A mean and the two ends of its bootstrap confidence interval, in the unit of the sample.
-
-    If the sample has fewer than three values, both ends are NaN.
-    """
+    """A mean and the two ends of its bootstrap confidence interval; NaN for fewer than three values."""
 
     mean: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        """The mean and the interval as text, with signs and one decimal, for example `+1.8 [+0.7, +4.8]`.
-
-        If the ends of the interval are NaN, the text contains only the mean. If the mean is NaN, the text is
-        a dash.
-        """
+        """The mean and the interval as text, with signs and one decimal, for example `+1.8 [+0.7, +4.8]`."""
         if np.isnan(self.mean):
             return "—"
         if np.isnan(self.low):
@@ -36,19 +29,7 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
-    """Return the mean of a sample and a confidence interval of this mean.
-
-    The interval is computed by the bias-corrected and accelerated (BCa) bootstrap (Efron 1987).
-
-    **Arguments:**
-
-    - `values`: the sample (p,).
-    - `seed`: the seed of the random resampling.
-
-    **Returns:** An `Interval` with confidence level 0.95 (`CONFIDENCE`), computed from 9999 resamples
-    (`RESAMPLES`). The ends of the interval are NaN if the sample has fewer than three values. The
-    mean is also NaN if the sample is empty.
-    """
+    """Return the mean of a sample (p,), and its confidence interval by the BCa bootstrap (Efron 1987)."""
     if len(values) == 0:
         return Interval(np.nan, np.nan, np.nan)
     mean = float(values.mean())
@@ -56,7 +37,7 @@ def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
         return Interval(mean, np.nan, np.nan)
     if np.ptp(values) == 0:  # the bootstrap interval of equal values is undefined
         return Interval(mean, mean, mean)
-    found = bootstrap(
+    ends = bootstrap(
         (values,),
         np.mean,
         n_resamples=RESAMPLES,
@@ -64,4 +45,4 @@ def mean_interval(values: Float64[np.ndarray, " p"], seed: int) -> Interval:
         method="BCa",
         rng=np.random.default_rng(seed),
     ).confidence_interval
-    return Interval(mean, float(found.low), float(found.high))
+    return Interval(mean, float(ends.low), float(ends.high))

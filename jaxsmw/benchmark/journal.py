@@ -14,13 +14,12 @@ from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write
 
 Row = dict[str, Any]
-"""A row of a journal: a dictionary from column names to values. In rows from a file, all values are text."""
+"""A row of a journal, by column names. In rows from a file, all values are text."""
 
 Columns = Mapping[str, Callable[[str], Any]]
-"""A mapping from the names of a journal's columns, in order, to functions that parse the values of a column.
+"""The columns of a journal in order, with functions that parse a value, or raise `ValueError`."""
 
-Such a function takes the text of a value, and raises `ValueError` if the text is invalid.
-"""
+_CURE = "restore the file, or remove it to measure its rows again"
 
 
 class Journal:
@@ -34,13 +33,10 @@ class Journal:
 
     - `path`: the file, which need not exist yet.
     - `key`: the names of the key columns. If two rows have the same key, the second row is ignored.
-    - `columns`: a mapping from the name of each required column to the function that checks its values. If
-      None, the file must have the key columns, and may have any other columns.
-    - `read_only`: whether the file is only read. An unfinished line is then not removed, but ignored with
-      a warning.
+    - `columns`: the required columns. If None, the file may have any columns besides the key columns.
+    - `read_only`: whether an unfinished line is not removed, but ignored with a warning.
 
-    **Raises:** `InputError` if the file cannot be read, or does not contain a table with these columns. If
-    this error is raised, the file is not changed.
+    **Raises:** `InputError` if the file cannot be read, or does not contain a table with these columns.
     """
 
     def __init__(
@@ -55,7 +51,7 @@ class Journal:
         try:
             contents = path.read_bytes()
         except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror}): {self._cure}.") from error
+            raise InputError(f"{path}: cannot be read ({error.strerror}): {_CURE}.") from error
         whole = contents.rfind(b"\n") + 1
         if whole:
             self._read(contents[:whole], columns or {})
@@ -70,7 +66,7 @@ class Journal:
 
     @property
     def rows(self) -> list[Row]:
-        """All rows, in the order in which their keys first appeared. All values are text."""
+        """All rows, in the order in which their keys first appeared."""
         return list(self._rows.values())
 
     def __contains__(self, key: Sequence[Any]) -> bool:
@@ -80,15 +76,11 @@ class Journal:
         return self._rows[tuple(map(str, key))]
 
     def append(self, rows: Sequence[Row]) -> None:
-        """Append rows to the file, and return after the rows have been written to disk.
+        """Append rows to the file, and return after they have been written to disk.
 
-        **Arguments:**
+        The first row of an empty file defines its columns.
 
-        - `rows`: rows with the columns of the file. If the file has no columns yet, the first row defines the
-          columns.
-
-        **Raises:** `InputError` if the columns of a row differ from the columns of the file, or if the file
-        cannot be written.
+        **Raises:** `InputError` if a row has other columns, or if the file cannot be written.
         """
         if not rows:
             return
@@ -117,29 +109,21 @@ class Journal:
         self._remember({name: str(value) for name, value in row.items()} for row in rows)
 
     def sort(self, keys: Iterable[Sequence[Any]]) -> None:
-        """Sort the rows of the file in the order of `keys`, and remove all other rows.
-
-        Before this call the order of rows is arbitrary, because workers finish tasks in an arbitrary order.
-
-        **Raises:** `KeyError` if the journal has no row for a key; `InputError` if the file cannot be
-        written.
-        """
-        self._rows = {tuple(map(str, key)): self._rows[tuple(map(str, key))] for key in keys}
+        """Sort the rows of the file, which workers finish in any order, by `keys`, and remove all others."""
+        texts = (tuple(map(str, key)) for key in keys)
+        self._rows = {key: self._rows[key] for key in texts}
         with atomic_write(self.path) as temporary, temporary.open("w", newline="") as file:
             writer = csv.DictWriter(file, self._fields, lineterminator="\n")
             writer.writeheader()
             writer.writerows(self.rows)
 
     def _read(self, contents: bytes, columns: Columns) -> None:
-        """Parse complete lines, check their values, and store their rows in memory.
-
-        **Raises:** `InputError` if the contents are not a table with these columns.
-        """
+        """Parse complete lines, check their values, and store their rows in memory."""
         try:
             reader = csv.reader(io.StringIO(contents.decode(), newline=""), strict=True)
             lines = [(reader.line_num, fields) for fields in reader]
         except (UnicodeDecodeError, csv.Error) as error:
-            raise InputError(f"{self.path}: is not a table of results ({error}): {self._cure}.") from error
+            raise InputError(f"{self.path}: is not a table of results ({error}): {_CURE}.") from error
         _, header = lines[0]
         if columns and header != self._fields:
             raise self._fault(1, f"is not the header {','.join(self._fields)}")
@@ -159,11 +143,7 @@ class Journal:
         self._remember(dict(zip(header, fields, strict=True)) for _, fields in lines[1:])
 
     def _fault(self, line: int, what: str) -> InputError:
-        return InputError(f"{self.path}, line {line}: {what}: {self._cure}.")
-
-    @property
-    def _cure(self) -> str:
-        return "restore the file, or remove it to measure its rows again"
+        return InputError(f"{self.path}, line {line}: {what}: {_CURE}.")
 
     def _remember(self, rows: Iterable[Row]) -> None:
         for row in rows:

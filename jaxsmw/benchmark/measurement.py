@@ -1,16 +1,12 @@
-"""The measurements of a benchmark.
-
-`measure_shape` measures the precomputation for one shape. `measure_pair` measures several methods on one
-pair.
-"""
+"""The measurements of a benchmark: of the precomputation for a shape, and of several methods on a pair."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -54,14 +50,7 @@ Geodesic errors and thresholds are in units of the square root of the area of Y.
 
 
 def read_curve(text: str) -> list[float]:
-    """Parse a correspondence quality curve, as it is stored in `results.csv`.
-
-    **Arguments:**
-
-    - `text`: one share for each threshold in `CURVE`, separated by spaces.
-
-    **Returns:** A list with one number for each threshold in `CURVE`: the share of points whose error is at
-    most the threshold.
+    """Parse the shares of a stored correspondence quality curve, one for each threshold in `CURVE`.
 
     **Raises:** `ValueError` if the text does not contain one number for each threshold.
     """
@@ -110,14 +99,12 @@ class Settings:
 
     **Attributes:**
 
-    - `init`: the initial map from which all methods start. It is either a directory with initial maps in
-      files named `X_Y.map`, or a name that `jaxsmw.match` accepts. With `"auto"` (default), all methods start
-      from `"shot"`; `accurate`, which calls `match`, also starts from `"aligned"` for asymmetric shapes.
-    - `mirrored`: whether each map is compared with both the direct and the mirrored ground truth. If True,
-      errors are computed for both ground truths, and the errors with the smaller mean are stored. Use this
-      setting for methods and initial maps that do not distinguish left from right.
-    - `evaluated_points`: the number of ground-truth points at which each map is evaluated. The points are the
-      same for all methods. If None, each map is evaluated at all points.
+    - `init`: the initial map from which all methods start: a directory with maps `X_Y.map`, or a name that
+      `jaxsmw.match` accepts. With `"auto"` (default), all methods start from `"shot"`; `accurate`, which
+      calls `match`, also starts from `"aligned"` for asymmetric shapes.
+    - `mirrored`: whether errors are computed for both the direct and the mirrored ground truth, and those
+      with the smaller mean are stored, for initial maps that do not distinguish left from right.
+    - `evaluated_points`: the number of ground-truth points at which each map is evaluated; None for all.
     - `seed`: the seed of the random draw of these points.
 
     **Raises:** `InputError` if `init` is neither the name of an initial map nor a directory.
@@ -142,21 +129,13 @@ class Settings:
         return self.init in get_args(MatchInit)
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """Check that the directory `init` contains a map for every pair.
-
-        If `init` is the name of an initial map, nothing is checked.
-
-        **Raises:** `InputError` if a file with an initial map is missing.
-        """
+        """Raise `InputError` if the directory `init` does not contain a map for every pair."""
         if not self.is_named:
             PublishedMaps(Path(self.init)).check(pairs)
 
 
 def file_digest(file: Path) -> str:
-    """Return a short hash of the contents of a file.
-
-    **Raises:** `InputError` if the file cannot be read.
-    """
+    """Return a short hash of the contents of a file."""
     try:
         return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
     except OSError as error:
@@ -166,14 +145,9 @@ def file_digest(file: Path) -> str:
 
 
 def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[Row]:
-    """Compute and cache the spectrum and the SHOT descriptors of a shape, and measure their wall times.
+    """Compute and cache the spectrum and SHOT of a shape (name, mesh file), and measure their wall times.
 
-    **Arguments:**
-
-    - `shape`: the name of the shape and its mesh file.
-    - `number_of_eigenvectors`: the number of eigenvectors of the spectrum.
-
-    **Returns:** A list with one row, which has the keys of `SHAPE_COLUMNS`. Times are in seconds.
+    **Returns:** A list with one row, which has the keys of `SHAPE_COLUMNS`.
 
     **Raises:** `InputError` if the file cannot be read, or if its spectrum cannot be computed.
     """
@@ -195,14 +169,7 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[
 def measure_pair(
     task: tuple[DataPair, Mapping[str, Method]], settings: Settings, number_of_eigenvectors: int
 ) -> list[Row]:
-    """Match a pair with several methods, and measure the errors of the maps.
-
-    **Arguments:**
-
-    - `task`: the pair, and a dictionary from the names of the methods to the methods.
-    - `settings`: the settings of the benchmark.
-    - `number_of_eigenvectors`: the number of eigenvectors to compute for each shape, at least the
-      `number_of_eigenvectors` of every method.
+    """Match a pair with several methods, given by name, and measure the errors of the maps.
 
     **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. The statistics
     and the seconds of a method that failed are NaN.
@@ -215,11 +182,13 @@ def measure_pair(
     truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
     if settings.mirrored:
         truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
-    given = Path(settings.init)
+    init: Any = settings.init
+    if not settings.is_named:
+        init = read_published_map(Path(settings.init), data.names, (mesh_x, mesh_y))
     pair = MethodInput.prepare(
         Pair(mesh_x, mesh_y, data.partial),
         names=data.names,
-        init=settings.init if settings.is_named else read_published_map(given, data.names, (mesh_x, mesh_y)),
+        init=init,
         number_of_eigenvectors=number_of_eigenvectors,
         number_of_descriptors=max(method.number_of_descriptors for method in methods.values()),
     )
@@ -239,39 +208,38 @@ def measure_pair(
 def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], float]:
     """Run a method, and return its map and its seconds without compilation; see `Method.measure`."""
     for _ in range(2):
-        with _CompilationClock() as compilation, one_blas_thread():
+        with _compilation_seconds() as compilation, one_blas_thread():
             pointwise_map, seconds = method.measure(pair)
-            seconds -= compilation.seconds
-        warm = name in _warm and not compilation.seconds
+            seconds -= sum(compilation)
+        warm = name in _warm and not compilation
         _warm.add(name)
-        # The first run of a method takes longer than later runs, for example because of imports, so the
-        # method runs a second time. A long first run is not repeated, because the time for imports is
-        # negligible in comparison.
+        # The first run of a method takes longer, for example because of imports, so the method runs a second
+        # time. In a long first run, the time for imports is negligible.
         if warm or seconds > _LONG:
             break
     return np.asarray(pointwise_map), seconds
 
 
-# A run that takes longer than this number of seconds is not repeated.
+# A run that takes longer than this number of seconds is long.
 _LONG = 60
 # The names of the methods that have run in this process.
 _warm: set[str] = set()
 
 
-class _CompilationClock:
-    """A context manager that adds up the seconds that XLA spends on compilation in this process."""
+@contextmanager
+def _compilation_seconds() -> Iterator[list[float]]:
+    """Collect the seconds of each compilation of XLA in this process within the block."""
+    seconds: list[float] = []
 
-    def __enter__(self) -> _CompilationClock:
-        self.seconds = 0.0
-        jax.monitoring.register_event_duration_secs_listener(self._listen)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        jax.monitoring.unregister_event_duration_listener(self._listen)
-
-    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event == "/jax/core/compile/backend_compile_duration":
-            self.seconds += duration_secs
+            seconds.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield seconds
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 # The statistics of a method that failed.
@@ -291,8 +259,7 @@ def _evaluate(
         )
         for name, truth in truths.items()
     }
-    nearest = min(errors, key=lambda name: errors[name].mean)
-    error = errors[nearest]
+    truth, error = min(errors.items(), key=lambda named: named[1].mean)
     figures = (
         error.mean,
         error.median,
@@ -303,7 +270,7 @@ def _evaluate(
     )
     curve = error.correspondence_quality_curve(CURVE)
     return {
-        "truth": nearest,
+        "truth": truth,
         **{name: f"{value:.7f}" for name, value in zip(FIGURES, figures, strict=True)},
         "curve": " ".join(f"{share:.5f}" for share in curve),
     }

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import chain, permutations
 
-from jaxsmw.benchmark.datasets import DataPair, DataSet, class_of, read_shapes
+from jaxsmw.benchmark.datasets import DataPair, DataSet, class_of, first_three, read_shapes
 from jaxsmw.errors import InputError
 
 
@@ -33,14 +33,7 @@ class Protocol:
 
 
 def protocol_pairs(name: str, data_set: DataSet) -> list[DataPair]:
-    """Return the pairs of a published protocol.
-
-    **Arguments:**
-
-    - `name`: a key of `PROTOCOLS`.
-    - `data_set`: a complete copy of the data set, as `open_data_set` returns it.
-
-    **Returns:** The pairs, each a `DataPair` of the data set.
+    """Return the pairs of a published protocol, each a `DataPair` of a complete `DataSet`.
 
     **Raises:** `InputError` if there is no such protocol, or if the data set has another layout or lacks
     files that the protocol needs.
@@ -70,12 +63,11 @@ def _between(data_set: DataSet, names: Iterable[tuple[str, str]]) -> list[DataPa
     """Return the pairs with the given names, or raise `_MissingError`."""
     names, shapes = list(names), data_set.shapes
     if missing := [shape for shape in dict.fromkeys(chain.from_iterable(names)) if shape not in shapes]:
-        count = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-        raise _MissingError(f"lacks the shapes {', '.join(missing[:3])}{count}")
-    known = data_set.known_pairs
-    if unknown := [pair for pair in names if pair not in known]:
+        raise _MissingError(f"lacks the shapes {first_three(missing)}")
+    by_names = data_set.known_pairs
+    if unknown := [pair for pair in names if pair not in by_names]:
         raise _MissingError(f"lacks the ground truth of {' to '.join(unknown[0])}")
-    return [known[pair] for pair in names]
+    return [by_names[pair] for pair in names]
 
 
 def _among(*shapes: str) -> Callable[[DataSet], list[DataPair]]:
@@ -106,8 +98,8 @@ _TOSCA_CLASSES = {"cat", "centaur", "david", "dog", "gorilla", "horse", "michael
 
 
 def _tosca(data_set: DataSet) -> list[DataPair]:
-    if found := [pair for pair in data_set.pairs if class_of(pair.source) in _TOSCA_CLASSES]:
-        return found
+    if pairs := [pair for pair in data_set.pairs if class_of(pair.source) in _TOSCA_CLASSES]:
+        return pairs
     raise _MissingError("lacks the shapes of TOSCA, such as cat0")
 
 
@@ -115,8 +107,8 @@ def _kind(kind: str) -> Callable[[DataSet], list[DataPair]]:
     """Return a function that chooses the partial shapes of one kind, cuts or holes."""
 
     def choose(data_set: DataSet) -> list[DataPair]:
-        if found := [pair for pair in data_set.pairs if pair.source.startswith(f"{kind}_")]:
-            return found
+        if pairs := [pair for pair in data_set.pairs if pair.source.startswith(f"{kind}_")]:
+            return pairs
         raise _MissingError(f"lacks the folder {kind}/")
 
     return choose
@@ -135,11 +127,10 @@ def _test_characters(same: bool) -> Callable[[DataSet], list[DataPair]]:
         if same:
             pairs = permutations(shapes, 2)
             return _between(data_set, (pair for pair in pairs if class_of(pair[0]) == class_of(pair[1])))
-        wanted = set(shapes)
-        found = [pair for pair in data_set.others if wanted.issuperset(pair.names)]
-        if not found:
+        between = [pair for pair in data_set.others if set(shapes).issuperset(pair.names)]
+        if not between:
             raise _MissingError("lacks the folder corres/cross_category_corres")
-        return found
+        return between
 
     return choose
 

@@ -28,23 +28,16 @@ class MethodSummary(NamedTuple):
 
     **Attributes:**
 
-    - `mean`, `median`: the mean and the median of the errors of all pairs. The error of a pair is its mean
-      geodesic error, in thousandths of the square root of the target's area.
-    - `difference`: an `Interval` with the attributes `mean`, `low` and `high`. For each pair, the error of
-      the method `REFERENCE` is subtracted from the error of this method. `difference` contains the mean of
-      these differences and the confidence interval of this mean, in the same unit as the errors. Pairs on
-      which `REFERENCE` failed are left out. `difference` is NaN for `REFERENCE` itself.
-    - `within`: the share of points with an error of at most 0.05 times the square root of the target's area.
-      The value is the mean over all pairs.
-    - `area_under_curve`: the mean area under the correspondence quality curves of all pairs, at most 1.
-    - `coverage`: the share of a target's area that belongs to matched vertices, in [0, 1]. The value is the
-      mean over all pairs.
+    - `mean`, `median`: the mean and the median over all pairs of the mean geodesic error, in thousandths of
+      the square root of the target's area.
+    - `difference`: the mean over the pairs of the error minus the error of the method `REFERENCE`, with its
+      confidence interval; NaN for `REFERENCE` itself.
+    - `within`, `area_under_curve`, `coverage`: the means over all pairs of the share of points with an error
+      of at most 0.05, of the area under the correspondence quality curve, and of the coverage.
     - `seconds`: the median time in seconds from the initial map to the result; NaN for published maps.
-    - `pipeline_seconds`: the median time in seconds from the meshes to the result, which includes the
-      precomputation of both shapes.
+    - `pipeline_seconds`: the same with the precomputation of both shapes.
     - `failures`: the number of pairs on which the method failed.
-    - `curve`: the mean correspondence quality curve (t,) at the thresholds
-      `jaxsmw.benchmark.measurement.CURVE`.
+    - `curve`: the mean correspondence quality curve (t,) at the thresholds `CURVE`.
     """
 
     mean: float
@@ -60,33 +53,26 @@ class MethodSummary(NamedTuple):
 
 
 def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSummary]:
-    """Summarise the results of a benchmark for each method.
+    """Summarise the results of a benchmark by the names of the methods; `seed` is that of the bootstrap.
 
-    **Arguments:**
-
-    - `results`: the result of `jaxsmw.benchmark.benchmark.run_benchmark`.
-    - `seed`: the seed of the bootstrap intervals.
-
-    **Returns:** A dictionary from the name of each method to its summary. Means and medians are NaN if the
-    method failed on all pairs.
+    Means and medians are NaN if the method failed on all pairs.
     """
-    found = {}
+    summaries = {}
     reference = _mean_errors([row for row in results.rows if row["method"] == REFERENCE])
     for name in dict.fromkeys(row["method"] for row in results.rows):
         own = [row for row in results.rows if row["method"] == name]
         good = [row for row in own if row["result"] == "successful"]
         errors = _mean_errors(good)
-        differences = np.array(
-            [error - reference[pair] for pair, error in errors.items() if pair in reference]
-        )
+        compared = errors.keys() & reference.keys() if name != REFERENCE else ()
+        differences = np.array([errors[pair] - reference[pair] for pair in errors if pair in compared])
         means = np.array(list(errors.values()))
         precomputing = np.array([_precomputing(row, results.shapes) for row in good])
         seconds = _column(good, "seconds")
         curves = np.array([np.array(row["curve"].split(), float) for row in good]).reshape(-1, len(CURVE))
-        found[name] = MethodSummary(
+        summaries[name] = MethodSummary(
             mean=_mean(means),
             median=_median(means),
-            difference=mean_interval(differences if name != REFERENCE else differences[:0], seed),
+            difference=mean_interval(differences, seed),
             within=_mean(_column(good, "within_0.05")),
             area_under_curve=_mean(_column(good, "area_under_curve")),
             coverage=_mean(_column(good, "coverage")),
@@ -95,7 +81,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
             failures=len(own) - len(good),
             curve=curves.mean(axis=0) if len(good) else np.full(len(CURVE), np.nan),
         )
-    return found
+    return summaries
 
 
 def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
@@ -121,12 +107,8 @@ def _median(values: Float64[np.ndarray, " r"]) -> float:
 
 def _precomputing(row: Row, shapes: Mapping[str, Row]) -> float:
     """Return the precomputation time of both shapes of a pair, in seconds."""
-    sides = {row["source"], row["target"]}
-    return sum(
-        float(shapes[side][column])
-        for side in sides
-        for column in ("seconds_spectrum", "seconds_descriptors")
-    )
+    columns = "seconds_spectrum", "seconds_descriptors"
+    return sum(float(shapes[side][column]) for side in {row["source"], row["target"]} for column in columns)
 
 
 def _text(form: str, value: float) -> str:
@@ -164,10 +146,7 @@ _LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "
 
 
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
-    """Return a LaTeX table with one row for each method in `summaries`.
-
-    The horizontal lines of the table need the LaTeX package booktabs. The smallest mean error is in bold.
-    """
+    """Return a LaTeX table (with booktabs) with one row for each method. The smallest mean error is bold."""
     best = min((s.mean for s in summaries.values() if np.isfinite(s.mean)), default=np.nan)
     lines = [r"\begin{tabular}{l" + "r" * len(_COLUMNS) + "}", r"\toprule"]
     lines += [" & ".join(["method", *(title for title, _ in _COLUMNS)]) + r" \\", r"\midrule"]
@@ -182,15 +161,7 @@ def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
 def write_tables(
     directory: Path, data_set: DataSet, results: Results, settings: Settings, methods: Mapping[str, Method]
 ) -> dict[str, MethodSummary]:
-    """Write `summary.md`, `table.tex`, `curves.png` and `results.parquet` to a directory.
-
-    **Arguments:**
-
-    - `directory`: an existing directory. Existing files of the same names are replaced.
-    - `methods`: a dictionary from the name of each method to a `Method`. The dictionary must contain every
-      method in `results`.
-
-    **Returns:** A dictionary from the name of each method to its summary.
+    """Write `summary.md`, `table.tex`, `curves.png` and `results.parquet`, and return the summaries.
 
     **Raises:** `InputError` if a file cannot be written, or if matplotlib is missing.
     """
@@ -203,8 +174,9 @@ def write_tables(
         "`results.csv` and `results.parquet` contain the results of each pair, `shapes.csv` contains the "
         "times of each shape, and `provenance.json` contains the provenance of the results.",
     ]
-    _write(directory / "summary.md", "\n\n".join(parts) + "\n")
-    _write(directory / "table.tex", latex_table(summaries))
+    for name, text in (("summary.md", "\n\n".join(parts) + "\n"), ("table.tex", latex_table(summaries))):
+        with atomic_write(directory / name) as temporary:
+            temporary.write_text(text, "utf-8")
     curves = {name: (CURVE, summary.curve) for name, summary in summaries.items()}
     means = {name: summary.mean / 1e3 for name, summary in summaries.items()}
     save_figure(directory / "curves.png", draw_quality_curves(curves, mean_errors=means))
@@ -216,13 +188,14 @@ def _introduction(data_set: DataSet, results: Results, settings: Settings) -> st
     """Return the paragraph above the table of `summary.md`."""
     pairs = {(row["source"], row["target"]) for row in results.rows}
     # A user's list of pairs can contain pairs that the data set does not list.
-    listed = pairs <= {(pair.source, pair.target) for pair in data_set.pairs}
+    listed = pairs <= {pair.names for pair in data_set.pairs}
     share = f"{len(pairs)} of {len(data_set.pairs)}" if listed else f"{len(pairs)} given"
     points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
     machines = "; ".join(sorted({row["machine"] for row in results.rows}))
+    initial = DEFAULT_INITIAL_MAP if settings.init == DEFAULT_MATCH_INIT else Path(settings.init).name
     sentences = [
         f"{share} pairs of the data set ({data_set.layout}) were measured. All methods start "
-        f"from the same initial map ({_initial_map(settings)}).",
+        f"from the same initial map ({initial}).",
         "Errors are mean geodesic errors in thousandths of the square root of the target's area, at "
         f"{points} of the ground truth.",
         "The mean and the median are computed over the pairs on which a method did not fail. The column "
@@ -236,26 +209,8 @@ def _introduction(data_set: DataSet, results: Results, settings: Settings) -> st
     return " ".join(sentences)
 
 
-def _initial_map(settings: Settings) -> str:
-    return DEFAULT_INITIAL_MAP if settings.init == DEFAULT_MATCH_INIT else Path(settings.init).name
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, "utf-8")
-
-
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows of results to a Parquet file with typed columns, for pandas and polars.
-
-    **Arguments:**
-
-    - `path`: the file to create or to replace.
-    - `rows`: rows with the columns `RESULT_COLUMNS`. All values in these rows are text. In the file, the
-      column `curve` contains lists of shares.
-
-    **Raises:** `InputError` if the file cannot be written.
-    """
+    """Write rows of results to a Parquet file with typed columns, for pandas and polars."""
     import pyarrow
     import pyarrow.parquet
 

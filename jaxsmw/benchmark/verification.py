@@ -34,8 +34,7 @@ class Comparison(NamedTuple):
     **Attributes:**
 
     - `source`, `target`, `method`: the names of the shapes and of the method.
-    - `stored`, `measured`: the mean geodesic errors, in units of the square root of the target's area. An
-      error is NaN if the method failed.
+    - `stored`, `measured`: the mean geodesic errors; NaN if the method failed.
     """
 
     source: str
@@ -63,9 +62,8 @@ class StoredResults:
 
     **Arguments:**
 
-    - `path`: the file `results.csv` of a benchmark. The file `provenance.json` must be in the same directory.
-    - `init`: the directory with initial maps, if the results were measured from such a directory; None
-      otherwise.
+    - `path`: the file `results.csv` of a benchmark, beside its `provenance.json`.
+    - `init`: the directory with initial maps, if the results were measured from such a directory.
 
     **Attributes:**
 
@@ -95,15 +93,12 @@ class StoredResults:
         self.settings = Settings(init, **{name: stored[name] for name in kept})
 
     def chosen_methods(self, given: Sequence[str] | None, known: Container[str]) -> list[str]:
-        """Return the methods to measure again, as names or directories with maps.
+        """Return the methods to measure again, as names or directories with maps of stored methods.
 
-        **Arguments:**
+        By default, these are all stored methods, which must be `known` methods that need no directory.
 
-        - `given`: names of methods, or directories with maps of stored methods; None for all stored methods.
-        - `known`: the names of methods that need no directory.
-
-        **Raises:** `InputError` if there are no stored results of a given method. If no methods are given,
-        `InputError` is raised if a stored method needs a directory.
+        **Raises:** `InputError` if there are no stored results of a method, or a stored method needs a
+        directory.
         """
         if given is None:
             if unknown := [name for name in self.methods if name not in known]:
@@ -124,16 +119,16 @@ class StoredResults:
 
         **Raises:** `InputError` if the data set lacks a stored pair.
         """
-        known = data_set.known_pairs
+        by_names = data_set.known_pairs
         stored = list(dict.fromkeys(_key(row)[:2] for row in self.rows))
-        if unknown := [names for names in stored if names not in known]:
+        if unknown := [names for names in stored if names not in by_names]:
             raise InputError(
                 f"{self.path}: contains the pair {' to '.join(unknown[0])}, which is not in "
                 f"{data_set.directory}: give the data set of these results."
             )
         count = max(1, round(_SHARE * len(stored)))
-        chosen = np.random.default_rng(seed).permutation(len(stored))[:count]
-        return [known[stored[number]] for number in np.sort(chosen)]
+        drawn = np.random.default_rng(seed).permutation(len(stored))[:count]
+        return [by_names[stored[number]] for number in np.sort(drawn)]
 
     def measure_again(
         self,
@@ -144,13 +139,7 @@ class StoredResults:
         *,
         quiet: bool = False,
     ) -> list[Comparison]:
-        """Measure methods on the given pairs again, in a temporary directory.
-
-        **Arguments:**
-
-        - `data_set`, `pairs`, `methods`, `executor`, `quiet`: see `run_benchmark`.
-
-        **Returns:** One `Comparison` for each stored error of these pairs and methods.
+        """Measure pairs again as `run_benchmark` does, and return a `Comparison` for each stored error.
 
         **Raises:** `InputError` if a pair cannot be measured.
         """

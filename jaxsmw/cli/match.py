@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Int64, Shaped
 
-    from jaxsmw.geometry.geodesics import SurfacePoints
+    from jaxsmw.geometry.surface_points import SurfacePoints
     from jaxsmw.matching.correspondence import Correspondence
 
 HELP = "match two meshes and write the map"

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.evaluation.metrics import GeodesicError
-    from jaxsmw.geometry.geodesics import SurfacePoints
     from jaxsmw.geometry.mesh import Mesh
+    from jaxsmw.geometry.surface_points import SurfacePoints
     from jaxsmw.matching.correspondence import Correspondence
 
     Maps: TypeAlias = Mapping[str, Int64[np.ndarray, " m"] | SurfacePoints]

@@ -15,6 +15,7 @@ from jaxsmw.cli.arguments import (
     add_reading,
     add_source_and_target,
     add_up,
+    path,
     positive_number,
     refuse_without,
 )
@@ -59,15 +60,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="coordinate system of both meshes, to which landmarks are converted. By default, the coordinate "
         "system of the landmark file is assumed",
     )
-    add_paths(
-        parser,
-        {
-            "--attributes FILE": "write the target with the attributes of the source to this file: colours "
-            "and other data of vertices and faces, texture coordinates, blend shapes and skin weights. The "
-            "suffix determines the format",
-            "--report DIR": "write pictures, an interactive 3D page and a summary to this directory, like "
-            "match --report",
-        },
+    parser.add_argument(
+        "--attributes",
+        metavar="FILE",
+        type=path,
+        help="write the target with the attributes of the source to this file: colours and other data of "
+        "vertices and faces, texture coordinates, blend shapes and skin weights. The suffix determines the "
+        "format",
     )
     parser.add_argument(
         "--stiffness",
@@ -75,6 +74,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_number,
         help="length below which noise of the map is smoothed, in units of the square root of the target's "
         "area (default: 0.005)",
+    )
+    parser.add_argument(
+        "--report",
+        metavar="DIR",
+        type=path,
+        help="write pictures, an interactive 3D page and a summary to this directory, like match --report",
     )
     add_up(parser)
     add_partial(parser, with_scale=True)

@@ -73,11 +73,11 @@ def edge_errors(
 ) -> Float[Array, " e"]:
     """Estimate the error of each edge's map from the errors of cycles.
 
-    If all three maps of a cycle are right, the error of the cycle is small. If only two of the maps are
-    right, the error of the cycle is the error of the third map. Each iteration averages the errors of all
-    cycles through an edge. The weight of a cycle decreases exponentially with the estimated errors of its two
-    other edges (cycle-edge message passing; Lerman, Shi, "Robust group synchronization via cycle-edge message
-    passing", Foundations of Computational Mathematics 2022). The function is traced JAX code.
+    If two maps of a cycle are right, the error of the cycle is the error of the third map. Each iteration
+    averages the errors of all cycles through an edge. The weight of a cycle decreases exponentially with the
+    estimated errors of its two other edges (cycle-edge message passing; Lerman, Shi, "Robust group
+    synchronization via cycle-edge message passing", Foundations of Computational Mathematics 2022). The
+    function is traced JAX code.
 
     **Arguments:**
 
@@ -89,8 +89,7 @@ def edge_errors(
     **Returns:** The estimated errors (e,), in the unit of `errors`. An edge without cycles keeps its prior.
     """
     number = prior.shape[0]
-    # Each edge receives the errors of its cycles. The weight of a cycle depends on the two other edges of the
-    # cycle.
+    # Each edge receives the errors of its cycles, whose weights depend on their two other edges.
     receiver = cycles.T.reshape(-1)
     others = jnp.concatenate([cycles[:, [1, 2]], cycles[:, [0, 2]], cycles[:, [0, 1]]])
     message = jnp.tile(errors, 3)
@@ -116,10 +115,10 @@ def estimate_edge_errors(
     **Returns:** The arguments and the result of `edge_errors`: the estimated errors of the edges, the errors
     of the triangles, and the edges of the triangles.
     """
-    found = triangles(edges)
+    shapes = triangles(edges)
     row = {frozenset(edge): number for number, edge in enumerate(edges)}
     cycles = np.array(
-        [[row[frozenset(side)] for side in ((i, j), (j, k), (i, k))] for i, j, k in found], np.int64
+        [[row[frozenset(side)] for side in ((i, j), (j, k), (i, k))] for i, j, k in shapes], np.int64
     ).reshape(-1, 3)
     errors = np.array(
         [
@@ -129,10 +128,10 @@ def estimate_edge_errors(
                     for a, b, c in ((i, j, k), (j, k, i), (k, i, j))
                 ]
             )
-            for i, j, k in found
+            for i, j, k in shapes
         ]
-    ).reshape(-1)
-    if not len(found):
+    )
+    if not len(shapes):
         return prior, errors, cycles
     estimated = edge_errors(jnp.asarray(cycles), jnp.asarray(errors), jnp.asarray(prior))
     return np.asarray(estimated, np.float64), errors, cycles

@@ -12,7 +12,7 @@ from jaxsmw.collection.consistency import Edge, estimate_edge_errors
 from jaxsmw.collection.edges import EdgeMap
 from jaxsmw.collection.result import MatchedEdge
 from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
-from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.preparation import PreparedShape
 
 # Lengths are in units of the square root of the area of each shape. Table R26 is in `docs/research_log.md`.
@@ -37,7 +37,6 @@ class ConsistentMaps:
 
     **Attributes:**
 
-    - `shapes`: the N shapes.
     - `maps`: the map of each edge. An edge whose match failed has no map.
     - `network`: the shapes, the maps and their estimated errors.
     - `template`: the index of the template in `shapes`.
@@ -45,7 +44,6 @@ class ConsistentMaps:
     - `cycle_errors`: the error of each triangle of edges (c,), in units of the square root of the area.
     """
 
-    shapes: Sequence[PreparedShape]
     maps: Mapping[Edge, EdgeMap]
     network: Network
     template: int
@@ -58,12 +56,12 @@ class ConsistentMaps:
         meshes, units = [shape.mesh for shape in shapes], [shape.mesh.area**0.5 for shape in shapes]
         points = _both_directions(maps)
         # The distortion of an isometry is 1.
-        distortions = [max(found.distortion, 1.0) for found in maps.values()]
+        distortions = [max(edge.distortion, 1.0) for edge in maps.values()]
         distorted = _DISTORTION_WEIGHT * np.log(distortions) ** 2
-        prior = np.array([found.expected_error for found in maps.values()]) + distorted
+        prior = np.array([edge.expected_error for edge in maps.values()]) + distorted
         estimated, cycle_errors, _ = estimate_edge_errors(
             list(maps),
-            {(i, j): found.nearest_corners(meshes[j]) for (i, j), found in points.items()},
+            {(i, j): images.nearest_corners(meshes[j]) for (i, j), images in points.items()},
             [mesh.vertices / unit for mesh, unit in zip(meshes, units, strict=True)],
             [_cycle_samples(shape) for shape in shapes],
             prior,
@@ -74,7 +72,7 @@ class ConsistentMaps:
         errors = np.maximum(estimated, prior / 2) + distorted
         network = Network(meshes, points, dict(zip(maps, errors.tolist(), strict=True)))
         medoid = network.medoid()
-        return cls(shapes, maps, network, medoid, synchronize(network, medoid), cycle_errors)
+        return cls(maps, network, medoid, synchronize(network, medoid), cycle_errors)
 
     def through(self, template: int) -> ConsistentMaps:
         """Return the consistent maps through another template."""
@@ -102,33 +100,33 @@ class ConsistentMaps:
         A new map with a larger distortion probably started from a wrong consistent map, and is left out.
         """
         better = {}
-        errors = {edge: found.expected_error for edge, found in again.items()}
-        new = Network(self.network.meshes, _both_directions(again), errors)
-        for edge, found in again.items():
-            old, before = np.inf, np.inf
-            if edge in self.maps:
-                old, before = self.maps[edge].distortion, self.residual(edge)
-            not_more_distorted = found.distortion <= old * _DISTORTION_TOLERANCE
-            if self.residual(edge, new) < before and not_more_distorted:
-                better[edge] = found
+        errors = {edge: new.expected_error for edge, new in again.items()}
+        network = Network(self.network.meshes, _both_directions(again), errors)
+        for edge, new in again.items():
+            old = self.maps.get(edge)
+            residual = np.inf if old is None else self.residual(edge)
+            largest_distortion = np.inf if old is None else old.distortion * _DISTORTION_TOLERANCE
+            if self.residual(edge, network) < residual and new.distortion <= largest_distortion:
+                better[edge] = new
         return better
 
     def matched_edge(self, edge: Edge, replaced: Container[Edge]) -> MatchedEdge:
         """Return the scores of an edge, given the edges whose first maps were replaced."""
         if edge not in self.maps:
             return MatchedEdge(*edge, np.inf, np.inf, np.inf, np.inf, "contradicted", True)
-        found, residual = self.maps[edge], self.residual(edge)
+        matched, residual = self.maps[edge], self.residual(edge)
         wrong = residual >= _CONTRADICTED_FROM
         decision = "contradicted" if wrong else "replaced" if edge in replaced else "kept"
         error = self.network.error(*edge)
         doubtful = wrong or error >= OUTLIER_FROM
-        return MatchedEdge(*edge, found.expected_error, found.distortion, error, residual, decision, doubtful)
+        scores = matched.expected_error, matched.distortion, error, residual
+        return MatchedEdge(*edge, *scores, decision, doubtful)
 
 
 def _both_directions(maps: Mapping[Edge, EdgeMap]) -> dict[tuple[int, int], SurfacePoints]:
     """Return the maps of all edges (i, j) with the keys (i, j) and (j, i)."""
-    forward = {edge: found.forward for edge, found in maps.items()}
-    return forward | {(j, i): found.backward for (i, j), found in maps.items()}
+    forward = {edge: matched.forward for edge, matched in maps.items()}
+    return forward | {(j, i): matched.backward for (i, j), matched in maps.items()}
 
 
 def _cycle_samples(shape: PreparedShape) -> Int64[np.ndarray, " s"]:

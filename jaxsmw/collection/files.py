@@ -8,7 +8,7 @@ import logging
 import os
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -52,21 +52,25 @@ def write_maps(collection: Collection, directory: Path) -> list[Path]:
 def write_registered(collection: Collection, template: MeshData, directory: Path, suffix: str) -> list[Path]:
     """Write the registered mesh of each shape, with the attributes of the template."""
     folder = make_directory(directory / "registered")
-    written = []
-    for shape, registered in enumerate(collection.registered):
-        data = registered_data(template, registered)
-        if collection.mirrored[shape] != collection.mirrored[collection.template]:
-            data = _turned(data)
-        written.append(folder / f"{collection.names[shape]}{suffix}")
-        _write_mesh(written[-1], data, first=shape == 0)
+    other_hand = collection.mirrored != collection.mirrored[collection.template]
+
+    def meshes() -> Iterator[tuple[Path, MeshData]]:
+        for name, registered, turned in zip(collection.names, collection.registered, other_hand, strict=True):
+            data = registered_data(template, registered)
+            yield folder / f"{name}{suffix}", _turned(data) if turned else data
+
+    return _write_meshes(meshes())
+
+
+def _write_meshes(meshes: Iterable[tuple[Path, MeshData]]) -> list[Path]:
+    """Write meshes, and log the data that the file format cannot contain for the first mesh alone."""
+    written: list[Path] = []
+    for path, data in meshes:
+        warnings = write_mesh_data(path, data)
+        for warning in () if written else warnings:
+            logger.warning("%s", warning)
+        written.append(path)
     return written
-
-
-def _write_mesh(path: Path, data: MeshData, *, first: bool) -> None:
-    """Write a mesh. For the first mesh of a collection, log the data that the file format cannot contain."""
-    warnings = write_mesh_data(path, data)
-    for warning in warnings if first else ():
-        logger.warning("%s", warning)
 
 
 def _turned(data: MeshData) -> MeshData:
@@ -81,14 +85,14 @@ def write_attributes(
 ) -> list[Path]:
     """Transfer the attributes of the mesh `source` to all other meshes, and write these meshes."""
     folder = make_directory(directory / "attributes")
-    written: list[Path] = []
-    for target, name in enumerate(collection.names):
-        if target != source:
-            registered = collection.registered_mesh(source, target)
-            carried = transfer_attributes(data[source], registered, data[target])
-            _write_mesh(folder / f"{name}{suffix}", carried, first=not written)
-            written.append(folder / f"{name}{suffix}")
-    return written
+    return _write_meshes(
+        (
+            folder / f"{name}{suffix}",
+            transfer_attributes(data[source], collection.registered_mesh(source, target), data[target]),
+        )
+        for target, name in enumerate(collection.names)
+        if target != source
+    )
 
 
 def write_landmarks(
@@ -103,10 +107,10 @@ def write_landmarks(
     notes: tuple[str, ...] = ()
     for target, name in enumerate(collection.names):
         if target != source:
-            found = transfer_landmarks(landmarks, collection.registered_mesh(source, target))
-            notes = found.notes  # the same for all targets, because the notes describe the source
+            carried = transfer_landmarks(landmarks, collection.registered_mesh(source, target))
+            notes = carried.notes  # the same for all targets, because the notes describe the source
             written.append(folder / f"{name}{suffix}")
-            write_landmark_file(written[-1], found.landmarks)
+            write_landmark_file(written[-1], carried.landmarks)
     return written, notes
 
 
@@ -243,9 +247,9 @@ Kind = TypeVar("Kind")
 def _in_summary(path: Path, name: str, kind: type[Kind]) -> Kind | None:
     """Return a value in a `collection.json`; None if the file is damaged or the value is of another kind."""
     with suppress(OSError, ValueError, RecursionError):
-        found = json.loads(path.read_text("utf-8"))
-        if isinstance(found, dict) and isinstance(found.get(name), kind):
-            return found[name]
+        summary = json.loads(path.read_text("utf-8"))
+        if isinstance(summary, dict) and isinstance(summary.get(name), kind):
+            return summary[name]
     return None
 
 

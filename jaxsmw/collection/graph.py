@@ -23,10 +23,10 @@ _RANDOM_SHARE = 0.25
 def shape_distances(shapes: Sequence[PreparedShape]) -> Float64[np.ndarray, "N N"]:
     """Compute how much the shapes of a collection differ, without matching them.
 
-    The distance of two shapes is the root mean square of two parts, each divided by its median over all
-    pairs. The first part compares the logarithms of the eigenvalues of the Laplacian, which hardly change
-    with the pose (Reuter, Wolter, Peinecke, "Laplace-Beltrami spectra as Shape-DNA of surfaces and solids",
-    2006). The second part compares the second moments of the descriptors over the surface, which do change.
+    The distance is the root mean square of two parts, each divided by its median over all pairs. The first
+    part compares the logarithms of the eigenvalues, which hardly change with the pose (Reuter, Wolter,
+    Peinecke, "Laplace-Beltrami spectra as Shape-DNA of surfaces and solids", 2006). The second part compares
+    the second moments of the descriptors over the surface, which do change.
 
     **Arguments:**
 
@@ -76,12 +76,10 @@ def choose_edges(
     - `distances`: the distances of the shapes (N, N), in any unit; see `shape_distances`.
     - `edges_per_shape`: the number of edges divided by N, if there are so many pairs.
     - `random_share`: the share of random edges, from 0 to 1.
-    - `given`: edges that are already matched and are kept, as tuples (i, j) of 0-based numbers. If shapes
-      were added to a collection, only edges of the added shapes are new.
+    - `given`: edges that are already matched and are kept. Only edges of the other shapes are then new.
     - `seed`: the seed of the random edges, an integer of at least 0.
 
-    **Returns:** A list of the edges in ascending order. An edge is a tuple (i, j) of the 0-based numbers of
-    two shapes, with i < j.
+    **Returns:** The edges in ascending order, as tuples (i, j) of 0-based numbers with i < j.
 
     **Raises:** `InputError` if an argument is not as described.
     """

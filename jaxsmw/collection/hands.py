@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool
 
+from jaxsmw.choices import Eigensolver
 from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.graph import choose_edges, shape_distances
 from jaxsmw.collection.shapes import shape_key
@@ -15,7 +16,7 @@ from jaxsmw.matching.preparation import PreparedShape
 from jaxsmw.matching.search.chirality import Decision, Hands
 from jaxsmw.matching.stages import Preset
 from jaxsmw.runtime.cache import Store
-from jaxsmw.runtime.progress import Progress, no_progress
+from jaxsmw.runtime.progress import Progress
 
 # The number of pairs whose hands are compared, divided by the number of shapes.
 _COMPARED_PER_SHAPE = 1.5
@@ -26,17 +27,16 @@ _COMPARED_FIRST = 5
 def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.ndarray, " N"]:
     """Choose one of two hands for each shape of a collection, from the evidence of all edges.
 
-    The evidence of an edge is positive if the two shapes seem to be of opposite hands. A symmetric matrix
-    contains the negated evidence of each edge. The signs of the leading eigenvector of this matrix give the
-    first hands (synchronisation over the group of two elements; Singer, "Angular synchronization by
-    eigenvectors and semidefinite programming", 2011). The function then reverses the hands of single shapes,
-    one after another, as long as each reversal improves the agreement with the evidence.
+    The signs of the leading eigenvector of the matrix of evidence give the first hands (synchronisation over
+    the group of two elements; Singer, "Angular synchronization by eigenvectors and semidefinite programming",
+    2011). The hands of single shapes are then reversed, one after another, as long as this improves the
+    agreement with the evidence.
 
     **Arguments:**
 
-    - `number`: the number N of shapes. The shapes are numbered from 0 to N - 1, in any fixed order.
-    - `decisions`: the `Decision` of each compared edge (i, j), where i and j are the 0-based numbers of two
-      shapes. Decisions without evidence, and decisions on symmetric shapes, are ignored.
+    - `number`: the number N of shapes.
+    - `decisions`: the `Decision` of each compared edge (i, j), with the 0-based numbers of two shapes. Those
+      without evidence and those on symmetric shapes are ignored.
 
     **Returns:** A Boolean array (N,), whose entry i is True if the mirror image of shape i is matched. At
     most half of the entries are True.
@@ -55,36 +55,22 @@ def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.nda
             break
         hands[gain.argmax()] *= -1
     mirrored = hands < 0
-    return (
-        ~mirrored
-        if 2 * mirrored.sum() > number or (2 * mirrored.sum() == number and mirrored[0])
-        else mirrored
-    )
+    twice = 2 * mirrored.sum()
+    return ~mirrored if twice > number or (twice == number and mirrored[0]) else mirrored
 
 
 def compare_hands(
     shapes: Sequence[PreparedShape],
     preset: Preset,
+    eigensolver: Eigensolver,
     *,
-    seed: int = 0,
-    store: Store = Store(),  # noqa: B008 (immutable)
-    progress: Progress = no_progress,
+    seed: int,
+    store: Store,
+    progress: Progress,
 ) -> dict[Edge, Decision]:
-    """Compare the hands of pairs of shapes.
+    """Compare the hands of the pairs of a sparse graph, and keep each `Decision` in the store.
 
-    The pairs are the edges of a sparse graph. A few pairs are compared first. If one of the first pairs is
-    asymmetric, all other pairs are compared as well.
-
-    **Arguments:**
-
-    - `shapes`: the shapes of the collection.
-    - `preset`: the preset with which the shapes were prepared.
-    - `seed`: the seed of the random edges of the graph.
-    - `store`: the store in which decisions are kept.
-    - `progress`: a function that is called for each edge of the graph. The function is not called if only the
-      first pairs are compared.
-
-    **Returns:** The `Decision` of each compared edge; see `jaxsmw.matching.search.chirality.Hands`.
+    A few pairs are compared first. If one of them is asymmetric, all other pairs are compared as well.
     """
 
     def decision(edge: Edge) -> Decision:
@@ -95,7 +81,8 @@ def compare_hands(
             evidence = np.nan if found.evidence is None else found.evidence
             return {"decision": np.array([found.mirrored, evidence, found.doubtful, found.asymmetric], float)}
 
-        arrays = store.get("hand", (*shape_key(x, preset), *shape_key(y, preset)), compute)
+        key_x, key_y = (shape_key(shape, preset, eigensolver) for shape in (x, y))
+        arrays = store.get("hand", (*key_x, *key_y), compute)
         mirrored, evidence, doubtful, asymmetric = arrays["decision"].tolist()
         return Decision(
             bool(mirrored), None if np.isnan(evidence) else evidence, bool(doubtful), bool(asymmetric)

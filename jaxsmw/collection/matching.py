@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
@@ -13,16 +13,16 @@ import numpy as np
 from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, EDGES_PER_SHAPE, MirrorCollection
 from jaxsmw.collection.consistency import Edge, find_outliers
 from jaxsmw.collection.consistent_maps import OUTLIER_FROM, ConsistentMaps
-from jaxsmw.collection.edge_matcher import EdgeMatcher
-from jaxsmw.collection.edges import EdgeMap
+from jaxsmw.collection.edges import EdgeMap, EdgeMatcher
 from jaxsmw.collection.graph import extended_graph
 from jaxsmw.collection.hands import choose_hands, compare_hands
 from jaxsmw.collection.result import Collection
 from jaxsmw.collection.shapes import describe_shapes, prepare_usable_shapes
 from jaxsmw.errors import InputError, check_choice, check_number, check_whole_number
-from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
 from jaxsmw.geometry.shortcuts import points_on_uncut
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.preparation import PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.runtime.batches import check_devices
@@ -110,32 +110,33 @@ def match_collection(
     check_devices(devices)
     if directory is not None and not Path(directory).is_dir():
         raise InputError(f"{directory}: is not a directory: create it first.")
-    given = _named_meshes(meshes, names)
-    chosen, report = choose_preset(preset), progress or no_progress
+    named = _named_meshes(meshes, names)
+    preset, report = choose_preset(preset), progress or no_progress
     store = Store(None if directory is None else Path(directory))
+    eigensolver = choose_eigensolver(*named) if named else "exact"
     seconds: dict[str, float] = {}
     with timed("shapes", seconds):
-        usable, left_out = prepare_usable_shapes(given, chosen, report)
-    _check_usable(given, usable, left_out, template)
-    kept, shapes = [given[number] for number in usable], list(usable.values())
+        usable, left_out = prepare_usable_shapes(named, preset, eigensolver, report)
+    _check_usable(named, usable, left_out, template)
+    kept, shapes = [named[number] for number in usable], list(usable.values())
     with timed("hands", seconds):
         decisions = {}
         if mirror == "no":
             mirrored = np.zeros(len(shapes), bool)
         elif mirror == "auto":
-            decisions = compare_hands(shapes, chosen, seed=seed, store=store, progress=report)
+            decisions = compare_hands(shapes, preset, eigensolver, seed=seed, store=store, progress=report)
             mirrored = choose_hands(len(shapes), decisions)
         else:
             mirrored = np.array([bool(mirror[number]) for number in usable])
-        shapes = [one.mirrored() if other else one for one, other in zip(shapes, mirrored, strict=True)]
+        shapes = [s.mirrored() if other else s for s, other in zip(shapes, mirrored, strict=True)]
     with timed("descriptors", seconds):
-        shapes, axes = describe_shapes(shapes, chosen, store)
+        shapes, axes = describe_shapes(shapes, preset, store)
     with timed("graph", seconds):
         edges = extended_graph(shapes, edges_per_shape, seed=seed, store=store)
     # Asymmetric shapes are matched from two initial maps, and expected errors decide between the two results.
     # Without repair, expected errors do not lead to the correct choice.
-    aligned = chosen.repair is not None and any(decision.asymmetric for decision in decisions.values())
-    matcher = EdgeMatcher(shapes, axes, chosen, aligned, store, executor, devices, report)
+    aligned = preset.repair is not None and any(decision.asymmetric for decision in decisions.values())
+    matcher = EdgeMatcher(shapes, axes, preset, eigensolver, aligned, store, executor, devices, report)
     with timed("edges", seconds):
         maps = matcher.match(dict.fromkeys(edges), "edges")
         _check_connected(maps, shapes)
@@ -172,37 +173,32 @@ def match_collection(
 
 def _named_meshes(meshes: Sequence[Mesh | MeshLike], names: Sequence[str] | None) -> list[Mesh]:
     """Convert the meshes with `as_mesh`, and give each mesh a different name."""
-    if names is None:
-        given = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
-    else:
-        given = [replace(as_mesh(mesh, name), name=name) for mesh, name in zip(meshes, names, strict=True)]
-    if len({mesh.name for mesh in given}) < len(given):
-        given = [replace(mesh, name=f"{mesh.name} {number}") for number, mesh in enumerate(given)]
-    return given
+    if names is not None:
+        return [replace(as_mesh(mesh, name), name=name) for mesh, name in zip(meshes, names, strict=True)]
+    named = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
+    if len({mesh.name for mesh in named}) < len(named):
+        named = [replace(mesh, name=f"{mesh.name} {number}") for number, mesh in enumerate(named)]
+    return named
 
 
 def _check_usable(
-    given: Sequence[Mesh], usable: Iterable[int], left_out: Mapping[str, str], template: int | None
+    meshes: Sequence[Mesh],
+    usable: Mapping[int, PreparedShape],
+    left_out: Mapping[str, str],
+    template: int | None,
 ) -> None:
-    """Check that at least two meshes and the template can be matched.
-
-    **Raises:** `InputError` if not.
-    """
-    if len(given) - len(left_out) < 2:
+    """Raise `InputError` if fewer than two meshes or not the template can be matched."""
+    if len(usable) < 2:
         raise InputError(
-            f"a collection needs at least two meshes, but only {len(given) - len(left_out)} of {len(given)} "
+            f"a collection needs at least two meshes, but only {len(usable)} of {len(meshes)} "
             "can be matched. " + " ".join(f"{name}: {reason}" for name, reason in left_out.items())
         )
     if template is not None and template not in usable:
-        raise InputError(f"the template {given[template].name} cannot be matched: choose another.")
+        raise InputError(f"the template {meshes[template].name} cannot be matched: choose another.")
 
 
 def _check_connected(maps: Mapping[Edge, EdgeMap], shapes: Sequence[PreparedShape]) -> None:
-    """Check that the matched edges connect all shapes.
-
-    **Raises:** `ArithmeticError` if not. The message names the shapes outside the largest connected
-    component.
-    """
+    """Raise `ArithmeticError` if the matched edges do not connect all shapes."""
     component = connected_components(np.array(list(maps)).reshape(-1, 2), len(shapes))[1]
     largest = np.bincount(component).argmax()
     if (apart := np.flatnonzero(component != largest)).size:
@@ -217,8 +213,6 @@ def _match_contradicted(
     consistent: ConsistentMaps, edges: Sequence[Edge], matcher: EdgeMatcher
 ) -> tuple[ConsistentMaps, set[Edge]]:
     """Repeat the match of each edge that contradicts the consistent maps, and synchronise all maps again.
-
-    The template is chosen again as well.
 
     **Returns:** The final consistent maps, and the edges whose maps were replaced.
     """
@@ -237,8 +231,5 @@ def _match_contradicted(
 
 
 def _reflected(points: SurfacePoints) -> SurfacePoints:
-    """Return points on a mesh, given the points on its mirror image.
-
-    The mirror image of a mesh has the same faces, with the corners in reverse order.
-    """
+    """Return points on a mesh, given the points on its mirror image, whose corners have the reverse order."""
     return SurfacePoints(points.faces, np.ascontiguousarray(points.weights[:, ::-1]))

@@ -34,48 +34,46 @@ def match_pairs(
     pairs: Iterable[tuple[int, int]],
     *,
     preset: PresetName | Preset = DEFAULT_PRESET,
-    alternatives: bool = True,
     batch_size: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[tuple[int, Correspondence]]:
     """Match any pairs of several full shapes.
 
     Spectra, descriptors and samples are computed once per shape. The descriptors of all shapes have the same
-    axes (`DescriptorAxes`), so a map can differ slightly from the map of `match`. On accelerators or on
-    several devices, pairs are refined in batches (`jaxsmw.refine_pairs`). On one CPU, pairs are refined one
-    after another. Maps are repaired as in `match`. Mirror images are not considered.
+    axes (`DescriptorAxes`), so a map can differ slightly from the map of `match`. On accelerators or several
+    devices, pairs are refined in batches. Mirror images are not considered.
 
     **Arguments:**
 
     - `meshes`: the meshes of the shapes, each a `Mesh` or a mesh that `make_mesh` accepts. The meshes may
       have different units of length, because each shape is scaled to area 1.
     - `pairs`: a tuple (source X, target Y) for each pair, as 0-based positions in `meshes`.
-    - `preset`: `"accurate"` (the default), `"fast"`, `"paper"` or a `Preset`; see `match`.
-    - `alternatives`: whether repair tries alternative maps.
+    - `preset`: `"accurate"` (the default), `"fast"`, `"paper"` or a `Preset`; see `match`. Without
+      alternative maps (`Preset.without_alternatives`), suspicious maps take less time.
     - `batch_size`: the number of pairs that each device refines at the same time; see `refine_pairs`.
     - `devices`: the JAX devices. The default is all devices of the default backend.
 
-    **Returns:** An iterator over tuples. Each tuple contains the 0-based position of a pair in `pairs`, and
-    the `Correspondence` of this pair.
+    **Returns:** An iterator over tuples of the 0-based position of a pair in `pairs`, and its
+    `Correspondence`.
 
-    **Raises:** `InputError` if a mesh or an argument cannot be used, or if a pair contains a number that
-    belongs to no shape. The iterator raises `ArithmeticError` if the refinement of a pair fails numerically.
+    **Raises:** `InputError` if an argument is not as described. The iterator raises `ArithmeticError` if the
+    refinement of a pair fails numerically.
     """
-    given = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
-    checked = check_pairs(pairs, len(given), "pair")
+    uncut = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
+    checked = check_pairs(pairs, len(uncut), "pair")
     check_devices(devices)
     if batch_size is not None:
         check_whole_number("batch_size", batch_size, 1)
-    chosen = choose_preset(preset)
-    shapes, _ = prepare_collection(given, chosen)
+    preset = choose_preset(preset)
+    shapes, _ = prepare_collection(uncut, preset)
 
     def results() -> Iterator[tuple[int, Correspondence]]:
-        tasks = (prepare_task(shapes[i], shapes[j], given=Pair(given[i], given[j])) for i, j in checked)
-        matched = match_many(tasks, chosen, alternatives, batch_size=batch_size, devices=devices)
-        for number, found in enumerate(matched):
-            if isinstance(found, ArithmeticError):
-                raise found
-            yield number, found
+        tasks = (prepare_task(shapes[i], shapes[j], given=Pair(uncut[i], uncut[j])) for i, j in checked)
+        matched = match_many(tasks, preset, batch_size=batch_size, devices=devices)
+        for number, result in enumerate(matched):
+            if isinstance(result, ArithmeticError):
+                raise result
+            yield number, result
 
     return results()
 
@@ -113,22 +111,14 @@ def prepare_task(
 def match_many(
     tasks: Iterable[Task],
     preset: Preset,
-    alternatives: bool,
     *,
     batch_size: int | None = None,
     devices: Sequence[jax.Device] | None = None,
 ) -> Iterator[Correspondence | ArithmeticError]:
-    """Match many prepared pairs. The stages run in batches, except on one CPU without a batch size.
+    """Match prepared pairs, and yield their results in order, or the error of a failed refinement.
 
-    **Arguments:**
-
-    - `tasks`: each prepared pair with its starts; see `match_prepared`.
-    - `preset`: the stages and the repair. For each pair, the preset is adapted to small meshes.
-    - `alternatives`: whether repair tries alternative maps.
-    - `batch_size`, `devices`: see `jaxsmw.refine_pairs`.
-
-    **Returns:** An iterator over the results in the order of the tasks. If the refinement of a pair fails
-    numerically, its result is the `ArithmeticError`.
+    The stages run in batches, except on one CPU without a batch size. For each pair, the preset is adapted to
+    small meshes. The other arguments are those of `match_pairs`.
     """
     devices = jax.devices() if devices is None else devices
     batched = batch_size is not None or len(devices) > 1 or devices[0].platform != "cpu"
@@ -142,7 +132,7 @@ def match_many(
     if not batched:
         for own, prepared, starts in fitted():
             release_programs()
-            yield _matched(prepared, starts, own, (), alternatives)
+            yield _matched(prepared, starts, own)
         return
     # All pairs of a batch run the same stages.
     for own, group in itertools.groupby(fitted(), key=lambda task: task[0]):
@@ -152,17 +142,16 @@ def match_many(
             outcomes = iter(run_batches(own.judged, flat, batch_size=batch_size, devices=devices))
             for _, prepared, starts in waiting:
                 of_pair = list(itertools.islice(outcomes, len(starts)))
-                yield _matched(prepared, starts, own, of_pair, alternatives)
+                yield _matched(prepared, starts, own, of_pair)
 
 
 def _matched(
     prepared: PreparedPair,
     starts: Sequence[Start],
     preset: Preset,
-    outcomes: Sequence[Outcome],
-    alternatives: bool,
+    outcomes: Sequence[Outcome] = (),
 ) -> Correspondence | ArithmeticError:
     try:
-        return match_prepared(prepared, starts, preset, outcomes=outcomes, alternatives=alternatives)
+        return match_prepared(prepared, starts, preset, outcomes=outcomes)
     except ArithmeticError as error:
         return error

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64, Int64
 
 from jaxsmw.collection.shape_models import ShapeModel, shape_model
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.preparation import DescriptorAxes
 from jaxsmw.transfer.registered_mesh import RegisteredMesh, register_mesh
 from jaxsmw.wording import count_of
@@ -73,8 +73,8 @@ class MatchedEdge:
 class Collection:
     """The result of `match_collection`: consistent maps between all shapes of a collection.
 
-    Vertex v of the template corresponds to the same point of the body on every shape. The number of a shape
-    is its 0-based position in `meshes`, which contains only the meshes that were matched.
+    The number of a shape is its 0-based position in `meshes`, which contains only the meshes that were
+    matched. The methods raise `InputError` if a number is not the number of a shape.
 
     **Attributes:**
 
@@ -85,15 +85,13 @@ class Collection:
       left teeth. All points and positions refer to the meshes, not to the mirror images.
     - `registered`: for each shape, the `RegisteredMesh` of the template on the shape.
     - `edges`: the matched pairs, each a `MatchedEdge`.
-    - `cycle_errors`: a pair of arrays (c,) and (d,) with the errors of all triangles of the graph. The first
-      array was computed from the first maps of the edges, the second from the final maps. Each error is the
-      mean over the three shapes of the triangle, in units of the square root of the area of each shape.
+    - `cycle_errors`: the errors of all triangles of the graph, of the first maps (c,) and of the final maps
+      (d,). Each error is the mean over the three shapes, in units of the square root of their areas.
     - `axes`: the `DescriptorAxes` of the descriptors; None if the preset uses no descriptors.
-    - `outliers`: the numbers (positions in `meshes`) of the shapes that differ much from all other shapes.
-      All maps of such a shape have large errors or distortions. The shape may be another kind of body.
-    - `left_out`: a dictionary of the meshes that could not be matched. The keys are the names of the meshes,
-      and the values are the reasons.
-    - `seconds`: a dictionary from the name of each step to its wall time in seconds.
+    - `outliers`: the numbers of the shapes whose maps all have large errors or distortions. Such a shape may
+      be another kind of body.
+    - `left_out`: the reasons why meshes could not be matched, by the names of the meshes.
+    - `seconds`: the wall time of each step in seconds, by the name of the step.
     """
 
     meshes: tuple[Mesh, ...]
@@ -129,29 +127,29 @@ class Collection:
     def decisions(self) -> tuple[str, ...]:
         """Return sentences about the template, the edges, the registered meshes and mirrored shapes."""
         decisions = Counter(edge.decision for edge in self.edges)
-        found = [
+        sentences = [
             f"{count_of(len(self.meshes), 'shape')}, {count_of(len(self.edges), 'matched pair')}; the "
             f"template is {self.names[self.template]}."
         ]
         if len(self.cycle_errors[0]):
-            found.append(
+            sentences.append(
                 f"Maps that agree with the other maps: {decisions['kept']}. Wrong maps that were replaced: "
                 f"{decisions['replaced']}. Maps that still contradict the others and hardly count: "
                 f"{decisions['contradicted']}."
             )
         else:
-            found.append("The graph has no cycles, so no map could be compared with other maps.")
-        distance = np.mean([one.distances.mean() / np.sqrt(one.mesh_y.area) for one in self.registered])
-        flipped = [float(one.flipped_faces.mean()) for one in self.registered]
-        found.append(
+            sentences.append("The graph has no cycles, so no map could be compared with other maps.")
+        distance = np.mean([mesh.distances.mean() / np.sqrt(mesh.mesh_y.area) for mesh in self.registered])
+        flipped = [float(mesh.flipped_faces.mean()) for mesh in self.registered]
+        sentences.append(
             f"Registered meshes: the mean distance to the meshes is {distance:.2%} of the square root of the "
             f"area. Flipped triangles: {np.mean(flipped):.2%} in the mean, at most {max(flipped):.2%} "
             f"({self.names[int(np.argmax(flipped))]})."
         )
         if self.mirrored.any():
             names = ", ".join(name for name, other in zip(self.names, self.mirrored, strict=True) if other)
-            found.append(f"Of the other hand, so that their mirror images were matched: {names}.")
-        return tuple(found)
+            sentences.append(f"Of the other hand, so that their mirror images were matched: {names}.")
+        return tuple(sentences)
 
     @property
     def warning(self) -> str:
@@ -191,10 +189,8 @@ class Collection:
     def pointwise_map(self, source: int, target: int) -> Int64[np.ndarray, " m"]:
         """Return the map from `source` (m vertices) to `target`, as 0-based vertices of `target` (m,).
 
-        The map goes through the template. A vertex that is carried around a cycle therefore returns to
-        itself, up to the rounding to vertices.
-
-        **Raises:** `InputError` if a number is not the number of a shape.
+        The map goes through the template, so a vertex that is carried around a cycle returns to itself, up
+        to the rounding to vertices.
         """
         self._check_number(source, target)
         return self._surface_points(source, target).nearest_corners(self.meshes[target])
@@ -207,8 +203,6 @@ class Collection:
 
         The positions are in the unit of `target`. With the registered mesh, `jaxsmw.transfer` transfers
         landmarks and attributes from `source` to `target`.
-
-        **Raises:** `InputError` if a number is not the number of a shape.
         """
         self._check_number(source, target)
         if source == self.template:
@@ -218,20 +212,15 @@ class Collection:
 
     @property
     def signs(self) -> Float64[np.ndarray, "N 3"]:
-        """The factors (N, 3) by which the shape model multiplies the coordinates of each shape.
-
-        All factors of a shape are 1 if the shape and the template have the same value in `mirrored`.
-        Otherwise the factor of the x coordinates is -1.
-        """
+        """The factors (N, 3) of the coordinates in the shape model; -1 for x if a shape is mirrored there."""
         other_hand = self.mirrored != self.mirrored[self.template]
         return np.where(other_hand[:, None], [-1.0, 1.0, 1.0], 1.0)
 
     def shape_model(self, *, scale: bool = False, number_of_modes: int | None = None) -> ShapeModel:
         """Compute the mean and the modes of the registered meshes; see `jaxsmw.collection.shape_model`.
 
-        The weight of each vertex is its vertex area on the template. If a shape and the template have
-        different values in `mirrored`, the mirror image of the shape enters the model. If the meshes have
-        different units, `scale` must be True.
+        The weight of each vertex is its vertex area on the template. Shapes of the other hand than the
+        template enter the model as mirror images. If the meshes have different units, `scale` must be True.
         """
         return shape_model(
             [one.vertices * sign for one, sign in zip(self.registered, self.signs, strict=True)],

@@ -72,10 +72,7 @@ def align(
     Each round moves every shape to the mean, in the least-squares sense, and then updates the mean (Gower,
     "Generalized Procrustes analysis", Psychometrika 1975; Goodall, "Procrustes methods in the statistical
     analysis of shape", JRSS B 1991). The first mean is the reference shape. The rounds end when the mean
-    changes by less than 1e-10 of its size, or after 1000 rounds.
-
-    The size of a shape is its centroid size: the square root of the weighted mean of the squared distances
-    from the vertices to their weighted centroid.
+    changes by less than 1e-10 of its centroid size, or after 1000 rounds.
 
     **Arguments:**
 
@@ -83,11 +80,11 @@ def align(
       arrays (n, 3). Without `scale`, all shapes need the same unit of length.
     - `scale`: whether to scale each shape to fit the mean in the least-squares sense. One common factor then
       gives the mean the average size of the given shapes.
-    - `weights`: non-negative weights of the vertices (n,), such as vertex areas, so that dense regions of the
-      triangulation do not dominate. By default, all weights are equal.
+    - `weights`: non-negative weights of the vertices (n,), such as vertex areas. By default, all weights are
+      equal.
     - `reference`: the 0-based index of the shape whose rotation and centroid do not change.
 
-    **Returns:** An `ProcrustesAlignment`, in the unit of length of the shapes.
+    **Returns:** A `ProcrustesAlignment`, in the unit of length of the shapes.
 
     **Raises:** `InputError` if an argument is not as described, or a shape is a single point.
     """
@@ -121,27 +118,31 @@ class DistanceCurve(NamedTuple):
     mean: Float64[np.ndarray, " numbers"]
     standard_error: Float64[np.ndarray, " numbers"]
 
+    @classmethod
+    def of(cls, numbers: tuple[int, ...], distances: Float64[np.ndarray, "numbers p"]) -> DistanceCurve:
+        """Average distances (numbers, p) over their second axis."""
+        error = distances.std(axis=1, ddof=1) / np.sqrt(distances.shape[1])
+        return cls(numbers, distances.mean(axis=1), error)
+
 
 @dataclass(frozen=True, eq=False)
 class ShapeModel:
     """The mean of aligned shapes and the modes in which the shapes differ from the mean.
 
     The modes are the principal components of the shapes (Cootes, Taylor, Cooper, Graham, "Active shape
-    models", CVIU 1995). The inner product of two fields u and v of displacements is sum_i w_i u_i · v_i, with
-    the weights w of the vertices. Therefore, if one score changes by s, the root mean square of the vertices'
-    displacements over the surface is s.
+    models", CVIU 1995), for the inner product sum_i w_i u_i · v_i of displacements u and v with the weights w
+    of the vertices. If one score changes by s, the root mean square displacement over the surface is s.
 
     **Attributes:**
 
     - `alignment`: the `ProcrustesAlignment` of the N shapes.
-    - `modes`: the displacements of each mode (k, n, 3), without unit. The modes are orthonormal in the inner
-      product above. For each mode, the score with the largest absolute value is positive.
+    - `modes`: the displacements of each mode (k, n, 3), without unit and orthonormal. The score of each mode
+      with the largest absolute value is positive.
     - `variances`: the variance of the scores of each mode (k,), decreasing, in squared units of length. Sums
       of squares are divided by N - 1.
     - `scores`: the inner products (N, k) of the displacements of each shape with the modes, in units of
       length.
-    - `total_variance`: the sum of the variances of all modes, including modes that the model leaves out, in
-      squared units of length.
+    - `total_variance`: the sum of the variances of all modes, including modes that the model leaves out.
     """
 
     alignment: ProcrustesAlignment
@@ -170,14 +171,9 @@ class ShapeModel:
         return self.alignment.weights
 
     def shape(self, scores: Real[np.ndarray, " j"]) -> Float64[np.ndarray, "n 3"]:
-        """Make the shape with the given scores, in the coordinates of the mean.
+        """Return the vertices (n, 3) of the shape whose first j modes have the given scores (j,).
 
-        **Arguments:**
-
-        - `scores`: the scores of the first j modes (j,), in units of length, where j is at most k. All other
-          scores are 0.
-
-        **Returns:** The positions of the vertices (n, 3), in the same unit.
+        All other scores are 0. Positions and scores are in the unit of length of the model.
 
         **Raises:** `InputError` if there are more scores than modes, or a score is not finite.
         """
@@ -190,15 +186,10 @@ class ShapeModel:
         return self.mean + np.tensordot(scores, self.modes[: len(scores)], axes=1)
 
     def project(self, shape: Real[np.ndarray, "_ 3"]) -> Float64[np.ndarray, " k"]:
-        """Return the scores of a shape, after its alignment to the mean.
+        """Return the scores (k,) of a shape (n, 3), after its alignment to the mean, in units of length.
 
-        **Arguments:**
-
-        - `shape`: positions of the n vertices (n, 3), in any coordinate system of the same unit of length. If
-          the model removes differences of size, the unit does not matter.
-
-        **Returns:** The scores (k,), in units of length. For a shape of the collection, the result equals the
-        row of this shape in the attribute `scores`.
+        The unit of the shape matters only if the model does not remove differences of size. For a shape of
+        the collection, the result equals its row in the attribute `scores`.
 
         **Raises:** `InputError` if the shape has another number of vertices or is a single point.
         """
@@ -245,8 +236,6 @@ class ShapeModel:
         - `numbers_of_modes`: numbers of modes, from 0 (the mean alone) to N - 2.
 
         **Returns:** A `DistanceCurve` of the errors of the N shapes.
-
-        **Raises:** `InputError` if there are fewer than two shapes, or another number of modes is given.
         """
         count = len(self.scores)
         if count < 2:
@@ -263,17 +252,16 @@ class ShapeModel:
                 for at, number in enumerate(numbers):
                     residuals[at, i] = left_out - mean - scores[:number] @ modes[:number]
         errors = np.array([self._mean_lengths(of_number, coordinates) for of_number in residuals])
-        return _curve(numbers, errors.reshape(len(numbers), count))
+        return DistanceCurve.of(numbers, errors.reshape(len(numbers), count))
 
     def specificity(
         self, numbers_of_modes: Sequence[int], *, samples: int = 1000, seed: int = 0
     ) -> DistanceCurve:
         """Measure how much random shapes of the model resemble shapes of the collection.
 
-        The scores of a random shape have a normal distribution with the variances of the modes (Davies 2002;
-        Styner et al. 2003). Each random shape is compared with one shape of the collection: the shape at the
-        smallest root-mean-square distance. The distance of the random shape is the mean distance over the
-        surface between both shapes.
+        The scores of a random shape have a normal distribution with the variances of the modes. Its distance
+        is the mean distance over the surface from the shape of the collection at the smallest
+        root-mean-square distance (Davies 2002; Styner et al. 2003).
 
         **Arguments:**
 
@@ -282,8 +270,6 @@ class ShapeModel:
         - `seed`: the random seed. The random numbers of a mode do not depend on `numbers_of_modes`.
 
         **Returns:** A `DistanceCurve` of the distances of the random shapes.
-
-        **Raises:** `InputError` if an argument is not as described.
         """
         samples = check_whole_number("samples", samples, 2)
         seed = check_whole_number("seed", seed, 0)
@@ -300,7 +286,7 @@ class ShapeModel:
             if coordinates.shape[1]:
                 random_shapes -= coordinates[cdist(random_shapes, coordinates).argmin(axis=1)]
             distances.append(self._mean_lengths(random_shapes, coordinates))
-        return _curve(numbers, np.array(distances).reshape(len(numbers), samples))
+        return DistanceCurve.of(numbers, np.array(distances).reshape(len(numbers), samples))
 
     def _mean_lengths(
         self, fields: Float64[np.ndarray, "p r"], coordinates: Float64[np.ndarray, "N r"]
@@ -332,7 +318,7 @@ def shape_model(
 
     **Returns:** A `ShapeModel`, in the unit of length of the shapes.
 
-    **Raises:** `InputError` if `align` raises it, or if the number of modes is below 1.
+    **Raises:** `InputError` if an argument is not as described.
     """
     if number_of_modes is not None:
         number_of_modes = check_whole_number("number_of_modes", number_of_modes, 1)
@@ -405,7 +391,7 @@ def _inner_products(
     centroids: Float64[np.ndarray, "N 3"],
     weights: Float64[np.ndarray, " n"],
 ) -> Float64[np.ndarray, "N 3 N 3"]:
-    """Return the weighted inner products of the centred coordinates, so that no round depends on n."""
+    """Return the weighted inner products of the centred coordinates."""
     count = len(points)
     products = np.zeros((3 * count, 3 * count))
     for block in _blocks(len(weights)):
@@ -422,7 +408,7 @@ def _rotations_and_scales(
     *,
     scale: bool,
 ) -> tuple[Float64[np.ndarray, "N 3 3"], Float64[np.ndarray, " N"]]:
-    """Return the rotations and scales of all shapes, from their `_inner_products`."""
+    """Return the rotations and scales of all shapes, in rounds whose time does not depend on n."""
     count = len(squared_sizes)
     flat = products.reshape(3 * count, 3 * count)
     size = np.sqrt(squared_sizes).mean()
@@ -493,8 +479,3 @@ def _directions(centered: Float64[np.ndarray, "N r"], smallest: float) -> Float6
         return np.zeros((0, centered.shape[1]))
     _, values, right = np.linalg.svd(centered, full_matrices=False)
     return right[values > smallest]
-
-
-def _curve(numbers: tuple[int, ...], distances: Float64[np.ndarray, "numbers p"]) -> DistanceCurve:
-    error = distances.std(axis=1, ddof=1) / np.sqrt(distances.shape[1])
-    return DistanceCurve(numbers, distances.mean(axis=1), error)

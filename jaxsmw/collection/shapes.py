@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxsmw.choices import Eigensolver, Laplacian
+from jaxsmw.choices import Eigensolver
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.mesh import Mesh
@@ -22,64 +22,44 @@ from jaxsmw.matching.pair import number_of_usable_vertices
 from jaxsmw.matching.preparation import DescriptorAxes, PreparedShape, PrincipalAxes, prepare_shapes
 from jaxsmw.matching.stages import Preset
 from jaxsmw.runtime.cache import Store
-from jaxsmw.runtime.progress import Progress, no_progress
+from jaxsmw.runtime.progress import Progress
 
 logger = logging.getLogger("jaxsmw")
 
 
 def warned_already() -> AbstractContextManager[object]:
-    """Return a context that ignores warnings, because `prepare_shape` has already issued the warnings."""
+    """Return a context that ignores the warnings that `prepare_shape` has already issued."""
     return warnings.catch_warnings(action="ignore", category=UserWarning)
 
 
-def prepare_shape(
-    mesh: Mesh,
-    preset: Preset,
-    *,
-    laplacian: Laplacian = "auto",
-    eigensolver: Eigensolver = "exact",
-) -> PreparedShape:
-    """Prepare one shape for a preset. The result has no descriptors.
+def prepare_shape(mesh: Mesh, preset: Preset, eigensolver: Eigensolver) -> PreparedShape:
+    """Prepare one shape for a preset, without descriptors.
 
-    **Arguments:**
-
-    - `mesh`: a `Mesh` (n vertices).
-    - `preset`: the preset, whose stages determine the numbers of eigenvectors and samples. If the mesh is
-      small, the preset is adapted to the mesh; see `Preset.fitted`.
-    - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`. All shapes of a collection need the same
-      eigensolver, because their spectra are compared.
+    All shapes of a collection need the same eigensolver, because their spectra are compared.
 
     **Raises:** `InputError` if the shape cannot be prepared, or SHOT is not defined on the mesh.
     """
     if preset.cuts_shortcuts:
         mesh = cut_shortcuts(mesh)
     sizes = fitted_preset(preset, mesh).sizes
-    (shape,) = prepare_shapes([mesh], sizes, laplacian=laplacian, eigensolver=eigensolver)
+    (shape,) = prepare_shapes([mesh], sizes, eigensolver=eigensolver)
     # `shot_descriptors` raises an error if the mesh is too coarse, and stores the descriptors in the cache.
     shot_descriptors(mesh, samples=shape.compared, required=True)
     return shape
 
 
 def prepare_usable_shapes(
-    meshes: Sequence[Mesh], preset: Preset, progress: Progress = no_progress
+    meshes: Sequence[Mesh], preset: Preset, eigensolver: Eigensolver, progress: Progress
 ) -> tuple[dict[int, PreparedShape], dict[str, str]]:
-    """Compute the spectra and samples of all shapes that can be matched. The results have no descriptors.
+    """Prepare all shapes that can be matched; see `prepare_shape`.
 
-    **Arguments:**
-
-    - `meshes`: the meshes, each a `Mesh`.
-    - `preset`: see `prepare_shape`.
-    - `progress`: a function that is called after each shape.
-
-    **Returns:** Two dictionaries. The first contains the `PreparedShape` of each usable mesh, and its keys
-    are positions in `meshes`. The second contains the reasons why the other meshes cannot be matched, and its
-    keys are the names of these meshes.
+    **Returns:** The `PreparedShape` of each usable mesh by its position in `meshes`, and the reasons why the
+    other meshes cannot be matched by their names.
     """
-    eigensolver = choose_eigensolver(*meshes) if meshes else "exact"
     shapes, left_out = {}, {}
     for number, mesh in enumerate(meshes):
         try:
-            shapes[number] = prepare_shape(mesh, preset, eigensolver=eigensolver)
+            shapes[number] = prepare_shape(mesh, preset, eigensolver)
         except (InputError, ArithmeticError) as error:
             left_out[mesh.name] = str(error)
             logger.warning("%s is left out: %s", mesh.name, error)
@@ -87,11 +67,11 @@ def prepare_usable_shapes(
     return shapes, left_out
 
 
-def shape_key(shape: PreparedShape, preset: Preset) -> tuple[Any, ...]:
+def shape_key(shape: PreparedShape, preset: Preset, eigensolver: Eigensolver) -> tuple[Any, ...]:
     """Return the part of a `Store` key that identifies a shape, apart from its descriptors."""
     sizes = preset.sizes
     numbers = sizes.number_of_eigenvectors, sizes.number_of_crease_eigenvectors
-    return shape.mesh.vertices, shape.mesh.faces, *numbers
+    return shape.mesh.vertices, shape.mesh.faces, eigensolver, *numbers
 
 
 def preset_key(preset: Preset) -> tuple[Any, ...]:
@@ -105,31 +85,17 @@ def describe_shapes(
     preset: Preset,
     store: Store = Store(),  # noqa: B008 (immutable)
 ) -> tuple[list[PreparedShape], DescriptorAxes | None]:
-    """Compute descriptors for all shapes of a collection, if the preset uses descriptors.
+    """Return shapes with descriptors in common axes, and the axes, if the preset uses descriptors.
 
-    The descriptors are expressed in common axes, so the descriptors of any two shapes are comparable.
-
-    **Arguments:**
-
-    - `shapes`: the shapes.
-    - `preset`: the preset, which determines the number of descriptors.
-    - `store`: the store in which the axes are kept. The axes do not change if shapes are added to the
-      collection later. The stored maps therefore remain valid.
-
-    **Returns:** The shapes with descriptors, and the axes. Without descriptors, the axes are None.
-
-    **Raises:** `InputError` if SHOT is not defined on a mesh.
+    The axes are kept in the store. They do not change if shapes are added to the collection later, so the
+    stored maps remain valid.
     """
     if not (shapes and preset.number_of_descriptors):
         return list(shapes), None
 
     def compute() -> dict[str, np.ndarray]:
         axes = DescriptorAxes.of(shapes, preset.number_of_descriptors)
-        return {
-            "radii": np.array(axes.radii),
-            "mean": axes.principal.mean,
-            "axes": axes.principal.axes,
-        }
+        return {"radii": np.array(axes.radii), **axes.principal._asdict()}
 
     with warned_already():
         arrays = store.get("descriptor-axes", preset_key(preset), compute)
@@ -140,18 +106,22 @@ def describe_shapes(
 def prepare_collection(
     meshes: Sequence[Mesh], preset: Preset
 ) -> tuple[list[PreparedShape], DescriptorAxes | None]:
-    """Prepare several shapes, and compute comparable descriptors; see `prepare_shape` and `describe_shapes`.
+    """Prepare several shapes for a preset, with comparable descriptors.
+
+    **Arguments:**
+
+    - `meshes`: the meshes, each a `Mesh`. Their spectra are computed with the same eigensolver.
+    - `preset`: the `Preset`, whose stages determine the numbers of eigenvectors, samples and descriptors.
+
+    **Returns:** The shapes, each a `PreparedShape`, and the `DescriptorAxes`; None without descriptors.
 
     **Raises:** `InputError` if a mesh cannot be used.
     """
     eigensolver = choose_eigensolver(*meshes) if meshes else "exact"
-    shapes = [prepare_shape(mesh, preset, eigensolver=eigensolver) for mesh in meshes]
+    shapes = [prepare_shape(mesh, preset, eigensolver) for mesh in meshes]
     return describe_shapes(shapes, preset)
 
 
 def fitted_preset(preset: Preset, *meshes: Mesh) -> Preset:
-    """Return the preset, adapted to the mesh with the fewest referenced vertices; see `Preset.fitted`.
-
-    **Raises:** `InputError` if a mesh has too few vertices.
-    """
+    """Return the preset, adapted to the mesh with the fewest referenced vertices; see `Preset.fitted`."""
     return preset.fitted(min(map(number_of_usable_vertices, meshes)))

@@ -13,11 +13,11 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from jaxsmw.collection.consistency import Edge
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.geometry.surface_points import SurfacePoints
+from jaxsmw.runtime.batches import pad_rows, padded_size
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
 
 # Lengths are in units of the square root of the area of each shape. Table R26 is in `docs/research_log.md`.
 # Each iteration averages the points on every shape. (Table R26)
@@ -66,25 +66,20 @@ def robust_mean(
 
 
 class Network:
-    """The shapes of a collection and the maps along the edges of its graph.
+    """The shapes of a collection and the maps along the edges of its graph, which are not checked.
 
-    The constructor checks nothing. The function `synchronize` computes consistent maps from a network. The
-    number of a shape is its 0-based position in `meshes`.
+    The function `synchronize` computes consistent maps from a network. The number of a shape is its 0-based
+    position in `meshes`.
 
     **Arguments:**
 
     - `meshes`: the meshes of the N shapes, each a `Mesh` in any unit of length.
-    - `maps`: a dictionary with the maps of each edge in both directions. The value of the key (i, j) is one
-      `SurfacePoints` on mesh j, with one entry for every vertex of mesh i.
-    - `errors`: a dictionary with the estimated error of each edge, a float, with the key (i, j) for i < j.
-      The error applies to the maps i -> j and j -> i. The error is a mean distance on the shape to which a
-      map leads. Its unit is the square root of this shape's area.
+    - `maps`: the maps of each edge in both directions, by keys (i, j). Each is one `SurfacePoints` on mesh j,
+      with one entry for every vertex of mesh i.
+    - `errors`: the estimated error of the maps i -> j and j -> i of each edge, by keys (i, j) with i < j. An
+      error is a mean distance in units of the square root of the area of the shape to which a map leads.
 
-    **Attributes:**
-
-    - `meshes`, `errors`: the arguments. The argument `maps` is not kept; the network stores the positions of
-      its points instead.
-    - `units`: a list with the square root of the area of each mesh, in the unit of the mesh.
+    **Attributes:** `meshes` and `errors`, and `units`: the square root of the area of each mesh.
     """
 
     def __init__(
@@ -104,10 +99,7 @@ class Network:
         return self.errors[min(i, j), max(i, j)]
 
     def lengths(self) -> csr_array:
-        """Return the errors of all edges as a symmetric sparse matrix (N, N).
-
-        Each entry is in units of the square root of the area.
-        """
+        """Return the errors of all edges as a symmetric sparse matrix (N, N)."""
         rows, columns = zip(*self._images, strict=True) if self._images else ((), ())
         # In the sparse matrix, an entry of zero would mean a missing edge.
         values = [max(self.error(i, j), 1e-6) for i, j in self._images]
@@ -118,9 +110,7 @@ class Network:
         return int(np.argmin(dijkstra(self.lengths(), directed=False).sum(axis=1)))
 
     def along_best_paths(self, template: int) -> list[SurfacePoints]:
-        """Map the vertices of the template to all shapes along the best paths.
-
-        The best path to a shape has the smallest sum of errors.
+        """Map the vertices of the template to all shapes along the paths with the smallest sums of errors.
 
         **Returns:** For each shape, one `SurfacePoints` with n entries, one for each vertex of the template.
 
@@ -137,18 +127,14 @@ class Network:
         return [points[shape] for shape in range(len(self.meshes))]
 
     def carried(self, points: SurfacePoints, source: int, target: int) -> Float64[np.ndarray, "p 3"]:
-        """Carry points on shape `source` along an edge. Return positions near to shape `target` (p, 3).
-
-        The positions are in the unit of mesh `target`.
-        """
+        """Carry points along an edge to positions near shape `target` (p, 3), in the unit of this shape."""
         limit = _DISCONTINUITY_DISTANCE * self.units[target]
         return carry(points, self.meshes[source], self._images[source, target], limit)
 
     def averaged(self, points: Sequence[SurfacePoints], template: int) -> list[SurfacePoints]:
-        """Move each point on a shape to the robust mean of the corresponding points of the neighbours.
+        """Move each point to the robust mean of the points that the edges carry from neighbouring shapes.
 
-        The points of the neighbours are first carried to the shape along the edges of the graph. The points
-        on the template do not move.
+        The points on the template do not move.
         """
 
         def moved(shape: int) -> SurfacePoints:
@@ -188,10 +174,9 @@ class Network:
 def synchronize(network: Network, template: int) -> list[SurfacePoints]:
     """Compute the maps from the template to all shapes, such that they agree with the maps of all edges.
 
-    The first maps follow the best paths from the template. The best path to a shape has the smallest sum of
-    errors. In each iteration, the points on the neighbours of a shape are carried to this shape, along the
-    edges of the graph. The points on this shape then move to the robust mean of the carried points. This is
-    the synchronisation of pointwise maps (Huang, Guibas 2013) by iterated averages on the surfaces.
+    The first maps follow the best paths from the template (`Network.along_best_paths`). Each iteration moves
+    the points on every shape to averages over its neighbours (`Network.averaged`). This is the
+    synchronisation of pointwise maps (Huang, Guibas 2013) by iterated averages on the surfaces.
 
     **Arguments:**
 

@@ -25,10 +25,7 @@ def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
 
 
 def all_finite(tree: PyTree) -> Bool[Array, ""]:
-    """Return whether all numbers in the floating-point arrays of a pytree are finite.
-
-    The pytree must contain at least one floating-point array.
-    """
+    """Return whether the floating-point arrays of a pytree, at least one, contain only finite numbers."""
     inexact = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in inexact]))
 
@@ -46,10 +43,7 @@ def check_option(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 
 def check_kind(name: str, value: object, *kinds: type) -> None:
-    """Raise `TypeError` if the value is not an instance of one of the types `kinds`.
-
-    If `kinds` contains several types, the error message names only the first type.
-    """
+    """Raise `TypeError` if the value has none of the types `kinds`. The message names the first type."""
     if isinstance(value, kinds):
         return
     shown = repr(value) if isinstance(value, str | int | float | type | None) else type(value).__name__
@@ -58,15 +52,27 @@ def check_kind(name: str, value: object, *kinds: type) -> None:
     raise TypeError(f"the {name} is {shown}, but {needed} is needed")
 
 
+def check_pointwise_map(name: str, pointwise_map: Array | np.ndarray, number_of_vertices: int) -> None:
+    """Check that a map has one integer per vertex of X.
+
+    **Raises:** `ValueError` if the map has another shape; `TypeError` if it is not an array of integers.
+    """
+    check_kind(name, pointwise_map, np.ndarray, jax.Array)
+    if pointwise_map.shape != (number_of_vertices,):
+        raise ValueError(
+            f"the {name} has shape {pointwise_map.shape}, but X has {number_of_vertices} vertices: give one "
+            "vertex of Y for each vertex of X"
+        )
+    if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
+        raise TypeError(f"the {name} has type {pointwise_map.dtype}, but integer vertex indices are needed")
+
+
 def check_between(
     owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
 ) -> None:
-    """Check that a numerical parameter of a module is within its limits.
+    """Raise `ValueError` unless a parameter has `ndim` dimensions and lies strictly between its limits.
 
-    If the parameter is traced, only its number of dimensions is checked.
-
-    **Raises:** `ValueError` if the parameter does not have `ndim` dimensions, or if one of its numbers is not
-    finite or does not lie strictly between `low` and `high`.
+    Of a traced parameter, only the number of dimensions is checked.
     """
     if value.ndim != ndim:
         wanted = "one number" if ndim == 0 else "a list of numbers"
@@ -83,10 +89,9 @@ def check_between(
 def counts_iterations(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
     """Decorate a compiled function so that its argument `iterations` may be an integer of any type.
 
-    Apply this decorator outside `equinox.filter_jit`, which would otherwise trace a NumPy integer.
-
-    **Raises:** The decorated function raises `TypeError` if `iterations` is not an integer or is traced, and
-    `ValueError` if `iterations` is below 1.
+    Apply this decorator outside `equinox.filter_jit`, which would otherwise trace a NumPy integer. The
+    decorated function raises `TypeError` if `iterations` is not an integer or is traced, and `ValueError` if
+    it is below 1.
     """
 
     @functools.wraps(function, updated=())
@@ -99,7 +104,6 @@ def counts_iterations(function: Callable[Parameters, Returned]) -> Callable[Para
 
 
 def _whole_number(caller: str, iterations: object) -> int:
-    """Return the number of iterations as a Python integer."""
     try:
         number = operator.index(iterations)  # type: ignore[arg-type]
     except TypeError:

@@ -1,19 +1,16 @@
-r"""The functional map of a pointwise map, and the wavelet-preservation energy.
+"""The functional map of a pointwise map, and the wavelet-preservation energy.
 
 The pointwise map T: X -> Y has a matrix P (m, n), whose row x has a one in column T(x) and zeros elsewhere.
-Phi_X and Phi_Y contain the eigenvectors as columns. C_0 is the functional map of T before any filtering.
-There are two conventions for the direction of a functional map C:
+Phi_X and Phi_Y contain the eigenvectors as columns. C_0 is the functional map of T before any filtering. A
+functional map C has one of two conventions:
 
-- **pullback** (default): `C` (k_X, k_Y) maps functions on Y to functions on X, and `C_0 = Phi_X^+ P Phi_Y`.
-  The MWP authors' program uses this convention.
-- **pushforward**: `C` (k_Y, k_X) maps functions on X to functions on Y, and `C_0 = Phi_Y^+ P^T Phi_X`. The
-  equations of the MWP paper use this convention.
+- **pullback** (default, as in the MWP authors' program): `C` (k_X, k_Y) maps functions on Y to functions on
+  X, and `C_0 = Phi_X^+ P Phi_Y`.
+- **pushforward** (as in the equations of the MWP paper): `C` (k_Y, k_X) maps functions on X to functions on
+  Y, and `C_0 = Phi_Y^+ P^T Phi_X`.
 
-In this module, "in" denotes the shape that C maps from, and "out" denotes the shape that C maps to. In both
-conventions, every vertex x of X has a weight w_x, an input vector a_x and an output vector b_x. Ideally, C
-maps a_x to b_x. In the area norm, the weight of a vertex is its area. In the Frobenius norm, which equation
-(5) of the MWP paper uses, all vertices have the same weight. The following table defines the weights and the
-vectors:
+C maps from the shape "in" to the shape "out". Every vertex x of X has a weight w_x, an input vector a_x and
+an output vector b_x, and ideally, C maps a_x to b_x:
 
 | convention  | norm      | weight w_x | input a_x          | output b_x                           |
 |-------------|-----------|------------|--------------------|--------------------------------------|
@@ -22,27 +19,21 @@ vectors:
 | pushforward | area      | area_X(x)  | Phi_X(x)           | area_Y(T(x)) Phi_Y(T(x)) / area_X(x) |
 | pushforward | frobenius | 1          | area_X(x) Phi_X(x) | area_Y(T(x)) Phi_Y(T(x))             |
 
-In the last row of the table, the inputs and outputs are the columns of `Phi_X^+` and `Phi_Y^+ P^T`, as in the
-MWP paper. For a bank with filters g_l, equation (5) of the MWP paper defines the energy
+For a bank with filters g_l, equation (5) of the MWP paper defines the energy
 
     E(C) = sum_l sum_x w_x || C g_l(Lambda_in) a_x - g_l(Lambda_out) b_x ||².
 
-The diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of the two shapes. The matrices G_out
-and G_in contain the responses of the filters at these eigenvalues, one row per filter. For every matrix M,
-the sum over filters equals an elementwise product (`*`):
-`sum_l g_l(Lambda_out) M g_l(Lambda_in) = M * (G_out^T G_in)`. So the energy depends only on a matrix `gram`,
-a matrix `cross` and a constant. Computing `gram` and `cross` needs no loop over filters and no array of size
-m x n:
+The diagonal matrices Lambda contain the eigenvalues, and the matrices G contain the responses of the filters,
+one row per filter. For every matrix M, `sum_l g_l(Lambda_out) M g_l(Lambda_in)` is the elementwise product `M
+* (G_out^T G_in)`, so the energy needs no loop over filters and no array of size m x n:
 
     E(C) = <C, C gram> - 2 <C, cross> + constant
     gram = (sum_x w a a^T) * (G_in^T G_in)        cross = (sum_x w b a^T) * (G_out^T G_in)
 
-The minimiser solves the linear system `C gram = cross` with the (k_in, k_in) matrix `gram`. The inputs are
-called orthonormal if `sum_x w a a^T` is the identity. Then `gram` is a diagonal matrix that contains the
-values of the frame function. The minimiser is `cross` with each column divided by the corresponding value.
-For a Parseval frame, this minimiser is the filtered map of equation (8) of the MWP paper. In the pushforward
-convention with the area norm, the inputs are always orthonormal. In the pullback convention with the area
-norm, the inputs are orthonormal if T preserves area. `docs/frames.md` derives these results.
+The minimiser solves `C gram = cross`. If `sum_x w a a^T` is the identity, `gram` is diagonal and contains the
+values of the frame function. For a Parseval frame, the minimiser is then the filtered map of equation (8) of
+the MWP paper. In the area norm, this holds for pushforwards, and for pullbacks if T preserves area
+(`docs/frames.md`).
 """
 
 from __future__ import annotations
@@ -72,12 +63,12 @@ Norm = Literal["area", "frobenius"]
 
 Side = TypeVar("Side")
 
+FunctionalMap = Float[Array, "k_out k_in"]
+"""A functional map C, which takes functions on the shape "in" to functions on the shape "out"."""
+
 
 def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-    """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y).
-
-    **Raises:** `ValueError` for an unknown convention.
-    """
+    """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y)."""
     check_option("convention", convention, get_args(Convention))
     return (of_x, of_y) if convention == "pullback" else (of_y, of_x)
 
@@ -85,19 +76,12 @@ def out_and_in(convention: Convention, of_x: Side, of_y: Side) -> tuple[Side, Si
 def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Float[Array, "n k"]:
     """Return the transposed pseudo-inverse of the eigenvectors: `Phi^+` (k, n) as an array (n, k).
 
-    **Arguments:**
-
-    - `spectrum`: the `Spectrum` of a shape with n vertices and k eigenvectors.
-    - `pseudo_inverse`: `"area"` computes `Phi^+ = Phi^T A`, where the diagonal matrix A contains the vertex
-      areas. The MWP paper uses this matrix, which is the projection in the inner product of the surface.
-      `"least_squares"` computes `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight. The MWP
-      authors' program uses `"least_squares"`. The two forms are nearly equal if the vertices are spread
-      evenly. The spectrum of samples (`Spectrum.sample`) needs `"least_squares"`, because its eigenvectors
-      are not orthonormal.
-
-    **Returns:** The array (n, k), in units of length, where the eigenvectors are in units of 1 / length.
-
-    **Raises:** `ValueError` for an unknown pseudo-inverse.
+    `"area"` computes `Phi^+ = Phi^T A`, where the diagonal matrix A contains the vertex areas, as in the MWP
+    paper: the projection in the inner product of the surface. `"least_squares"` computes `(Phi^T Phi)^-1
+    Phi^T`, in which all vertices have the same weight, as in the MWP authors' program. The two forms are
+    nearly equal if the vertices are spread evenly. The eigenvectors of samples (`Spectrum.sample`) are not
+    orthonormal and need `"least_squares"`. The result has the unit of length, where the eigenvectors have 1 /
+    length.
     """
     check_option("pseudo_inverse", pseudo_inverse, get_args(PseudoInverse))
     if pseudo_inverse == "area":
@@ -117,44 +101,36 @@ def encode(
     *,
     convention: Convention = "pullback",
     pseudo_inverse: PseudoInverse = "area",
-) -> Float[Array, "k_out k_in"]:
-    """Return the functional map C_0 of a pointwise map T: X -> Y, without any filtering.
-
-    Phi_X and Phi_Y contain the eigenvectors as columns, and `Phi^+` is a pseudo-inverse of Phi. P (m, n) is
-    the matrix of T: row x has a one in column T(x) and zeros elsewhere.
+) -> FunctionalMap:
+    """Return the functional map C_0 of a pointwise map T: X -> Y, without any filtering and without unit.
 
     **Arguments:**
 
-    - `pointwise_map`: the map T, as an integer array (m,) with one 0-based vertex of Y per vertex of X. T can
-      also be a `SoftMap` or a `SparseSoftMap` from X to Y.
+    - `pointwise_map`: the map T, as an integer array (m,) with one 0-based vertex of Y per vertex of X, or as
+      a `SoftMap` or a `SparseSoftMap` from X to Y.
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
-      vertices, k_Y eigenvectors). Both need the same scale, because a change of one shape's scale multiplies
-      C_0 by a constant. Two full shapes need equal areas, such as the area 1 from `compute_spectrum`. The
-      shapes of a partial pair need the same unit of length.
+      vertices, k_Y eigenvectors). Two full shapes need equal areas, such as the area 1 from
+      `compute_spectrum`. The shapes of a partial pair need the same unit of length.
     - `convention`: the direction of C_0. `"pullback"` (the default) gives `Phi_X^+ P Phi_Y` (k_X, k_Y), which
       maps functions on Y to functions on X. `"pushforward"` gives `Phi_Y^+ P^T Phi_X` (k_Y, k_X), which maps
-      functions on X to functions on Y.
+      functions on X to functions on Y. P (m, n) is the matrix of T.
     - `pseudo_inverse`: `"area"` (the default) uses `Phi^+ = Phi^T A`, where the diagonal matrix A contains
-      the vertex areas. `"least_squares"` uses `Phi^+ = (Phi^T Phi)^-1 Phi^T`, in which all vertices have the
-      same weight.
-
-    **Returns:** C_0, a float array without unit. Its shape is (k_X, k_Y) in the pullback convention and
-    (k_Y, k_X) in the pushforward convention.
+      the vertex areas. `"least_squares"` uses `Phi^+ = (Phi^T Phi)^-1 Phi^T`, which samples need.
 
     **Raises:** `ValueError` for an unknown convention or pseudo-inverse.
     """
     spectrum_out, spectrum_in = out_and_in(convention, spectrum_x, spectrum_y)
     dual_out = dual_eigenvectors(spectrum_out, pseudo_inverse)
-    return _encode(pointwise_map, dual_out, spectrum_in.eigenvectors, convention)
+    return encode_by(dual_out, pointwise_map, spectrum_in.eigenvectors, convention)
 
 
-def _encode(
-    pointwise_map: PointwiseMap,
+def encode_by(
     dual_out: Float[Array, "n_out k_out"],
+    pointwise_map: PointwiseMap,
     eigenvectors_in: Float[Array, "n_in k_in"],
     convention: Convention,
-) -> Float[Array, "k_out k_in"]:
-    """Compute the result of `encode` from dual eigenvectors."""
+) -> FunctionalMap:
+    """Return the result of `encode` from the `dual_eigenvectors` of the shape that it maps to."""
     of_x, of_y = out_and_in(convention, dual_out, eigenvectors_in)
     dual_out, eigenvectors_in = out_and_in(convention, of_x, pull_back(pointwise_map, of_y))
     return product(dual_out.T, eigenvectors_in)
@@ -165,18 +141,9 @@ def multiscale_kernel(
 ) -> Float[Array, "k_out k_in"]:
     """Return the multiscale kernel K (k_out, k_in), which turns filtering into an elementwise product.
 
-    For a bank with filters g_l and any functional map C (k_out, k_in), the filtered map
-    `sum_l g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The diagonal matrix
-    Lambda_out contains the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains
-    the eigenvalues of the shape that C maps from.
-
-    The responses and the kernel are numbers without unit.
-
-    **Arguments:**
-
-    - `responses_out`: (filters, k_out), the responses g_l of the bank at the eigenvalues of the shape that C
-      maps to.
-    - `responses_in`: (filters, k_in), the responses at the eigenvalues of the shape that C maps from.
+    For a bank with filters g_l and any functional map C (k_out, k_in), the filtered map `sum_l
+    g_l(Lambda_out) C g_l(Lambda_in)` equals the elementwise product `C * K`. The responses g_l (filters, k)
+    at the eigenvalues of the shapes "out" and "in", and the kernel, are numbers without unit.
     """
     return product(responses_out.T, responses_in)
 
@@ -184,19 +151,15 @@ def multiscale_kernel(
 class QuadraticEnergy(eqx.Module):
     """A quadratic function of the functional map C: `E(C) = <C, C gram> - 2 <C, cross> + constant`.
 
-    Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares
-    `sum_i ||C a_i - b_i||²` has this form, for any number of vectors a_i and b_i. `energy(C)` returns the
-    energy of C (k_out, k_in) as an array of shape (), in the unit of `constant`. `energy.minimizer()` returns
-    the C of least energy, (k_out, k_in). If `gram` is singular, the returned matrix is NaN or meaningless,
-    and `energy.is_regular()` is False. `energy + other` adds two energies, and `weight * energy` multiplies
-    an energy by an array of shape ().
+    Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares `sum_i
+    ||C a_i - b_i||²` has this form. `energy(C)` returns the energy of C, `energy + other` adds two energies,
+    and `weight * energy` multiplies an energy by an array of shape ().
 
     **Attributes:**
 
     - `gram`: (k_in, k_in), `sum_i a_i a_i^T`, positive semi-definite.
     - `cross`: (k_out, k_in), `sum_i b_i a_i^T`.
-    - `constant`: (), `sum_i ||b_i||²`, which is the energy of C = 0. The unit depends on the vectors; the
-      energies of `WaveletProblem.energy` in the area norm have no unit.
+    - `constant`: (), `sum_i ||b_i||²`, which is the energy of C = 0. Its unit is that of the energy.
     """
 
     gram: Float[Array, "k_in k_in"]
@@ -208,11 +171,8 @@ class QuadraticEnergy(eqx.Module):
         """Return the energy that is zero for every C."""
         return cls(jnp.zeros((k_in, k_in), dtype), jnp.zeros((k_out, k_in), dtype), jnp.zeros((), dtype))
 
-    def __call__(self, functional_map: Float[Array, "k_out k_in"]) -> Float[Array, ""]:
-        """Return the energy of a functional map.
-
-        The energy is a difference of large sums, so rounding errors can make it slightly negative.
-        """
+    def __call__(self, functional_map: FunctionalMap) -> Float[Array, ""]:
+        """Return the energy of a functional map. Rounding errors can make it slightly negative."""
         return jnp.sum(functional_map * (product(functional_map, self.gram) - 2 * self.cross)) + self.constant
 
     def __add__(self, other: QuadraticEnergy) -> QuadraticEnergy:
@@ -223,10 +183,10 @@ class QuadraticEnergy(eqx.Module):
     def __rmul__(self, weight: Float[Array, ""]) -> QuadraticEnergy:
         return QuadraticEnergy(weight * self.gram, weight * self.cross, weight * self.constant)
 
-    def minimizer(self) -> Float[Array, "k_out k_in"]:
+    def minimizer(self) -> FunctionalMap:
         """Return the functional map of least energy, (k_out, k_in), by one Cholesky factorisation.
 
-        If the gram matrix is singular, the returned map is NaN or meaningless; `is_regular` detects this.
+        If the gram matrix is singular, the map is NaN or meaningless; `is_regular` detects this.
         """
         return solve_positive_definite(self.gram, self.cross.T).T
 
@@ -235,10 +195,7 @@ class QuadraticEnergy(eqx.Module):
         return is_regular(self.gram)
 
     def condition_number(self) -> Float[Array, ""]:
-        """Return the ratio of the largest to the smallest eigenvalue of the gram matrix.
-
-        The ratio is infinite if the matrix is singular.
-        """
+        """Return the ratio of the extreme eigenvalues of the gram matrix, infinite if it is singular."""
         eigenvalues = symmetric_eigenvalues(self.gram)
         return eigenvalues[-1] / jnp.maximum(eigenvalues[0], 0)
 
@@ -251,14 +208,13 @@ class WaveletProblem(eqx.Module):
 
     **Attributes:**
 
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices). Both
-      have the same scale; see `encode`.
+    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices), of the
+      same scale; see `encode`.
     - `responses_x`, `responses_y`: the responses of the filter bank, without unit, at the eigenvalues of X,
       (filters, k_x), and of Y, (filters, k_y).
-    - `convention`: `"pullback"` (the default) if C maps functions on Y to functions on X; `"pushforward"` if
-      C maps functions on X to functions on Y.
-    - `sampled`: whether the spectra contain only samples of the vertices, by default False. On samples, the
-      eigenvectors are not orthonormal.
+    - `convention`: the direction of C; see `encode`.
+    - `sampled`: whether the spectra contain only samples of the vertices. Their eigenvectors are not
+      orthonormal.
     """
 
     spectrum_x: Spectrum
@@ -269,10 +225,7 @@ class WaveletProblem(eqx.Module):
     sampled: bool = eqx.field(static=True, default=False)
 
     def out_and_in(self, of_x: Side, of_y: Side) -> tuple[Side, Side]:
-        """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y).
-
-        **Raises:** `ValueError` for an unknown convention.
-        """
+        """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y)."""
         return out_and_in(self.convention, of_x, of_y)
 
     @property
@@ -285,40 +238,18 @@ class WaveletProblem(eqx.Module):
         """The responses on the two shapes in the order (out, in)."""
         return self.out_and_in(self.responses_x, self.responses_y)
 
-    def encode(
-        self, pointwise_map: PointwiseMap, dual_out: Float[Array, "n_out k_out"]
-    ) -> Float[Array, "k_out k_in"]:
-        """Return the functional map C_0 (k_out, k_in) of a pointwise map, without any filtering.
-
-        **Arguments:**
-
-        - `pointwise_map`: the map T, as in the function `encode`.
-        - `dual_out`: the `dual_eigenvectors` (n_out, k_out) of the shape that C maps to.
-        """
-        _, spectrum_in = self.spectra
-        return _encode(pointwise_map, dual_out, spectrum_in.eigenvectors, self.convention)
-
     def energy(self, pointwise_map: PointwiseMap, *, norm: Norm = "area") -> QuadraticEnergy:
         """Return the wavelet-preservation energy (equation (5) of the MWP paper) as a function of C.
 
-        For each functional map C, the energy is a weighted sum of squared distances over all filters and all
-        vertices x of X. In the pullback convention, C maps the wavelet at the match of x to a function on X.
-        Each summand is the squared distance between this function and the wavelet at x. The docstring of the
-        module `jaxsmw.core.functional_map` states the formula, which holds for every filter bank.
-
-        `problem.energy(T)(C)` is the energy of C. `problem.energy(T).minimizer()` is the C of least energy,
-        even if the frame is not tight. `problem.energy(T).constant` is the energy of C = 0. In the pullback
-        convention with the area norm, this constant is `sum_i G_X(lambda_i)`, where G_X is the frame function
-        on X, and lambda_i are the eigenvalues of X. For a Parseval frame this sum is k_X.
+        The module `jaxsmw.core.functional_map` states the formula, which holds for every filter bank. In the
+        pullback convention with the area norm, the energy of C = 0 is `sum_i G_X(lambda_i)`, where G_X is the
+        frame function on X. For a Parseval frame this sum is k_X.
 
         **Arguments:**
 
         - `pointwise_map`: the map T, as in the function `encode`.
-        - `norm`: `"area"` (the default) weights each vertex of X by its area. `"frobenius"` gives all
-          vertices the same weight, as in equation (5) of the MWP paper.
-
-        **Returns:** A `QuadraticEnergy` with the attributes `gram` (k_in, k_in), `cross` (k_out, k_in) and
-        `constant` (). In the area norm, the energy has no unit.
+        - `norm`: `"area"` (the default) weights each vertex of X by its area; the energy then has no unit.
+          `"frobenius"` gives all vertices the same weight, as in equation (5) of the MWP paper.
         """
         weights, inputs, outputs = self._weights_inputs_outputs(pointwise_map, norm)
         responses_out, responses_in = self.responses

@@ -6,7 +6,7 @@ import jax
 from jaxtyping import Array, Float, Int, Int32
 
 from jaxsmw.choices import Search
-from jaxsmw.core.functional_map import Convention, out_and_in
+from jaxsmw.core.functional_map import Convention, FunctionalMap, out_and_in
 from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.search import Patches, make_patches, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
@@ -14,40 +14,29 @@ from jaxsmw.core.triangles import nearest_point_on_triangles
 
 
 def spectral_embeddings(
-    functional_map: Float[Array, "k_out k_in"],
+    functional_map: FunctionalMap,
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     *,
     convention: Convention = "pullback",
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Return spectral embeddings of X and Y: point sets in which matched vertices are close to each other.
+    """Return the points of X (m, d) and of Y (n, d) in which `decode` searches, of unit 1 / length.
 
-    The matrices Phi_X and Phi_Y contain the eigenvectors as columns. In the pullback convention, the points
-    of X are the rows of `Phi_X`, and the points of Y are the rows of `Phi_Y C^T`. In the pushforward
-    convention, the points of X are the rows of `Phi_X C^T`, and the points of Y are the rows of `Phi_Y`.
+    In the pullback convention, the points are the rows of `Phi_X` and of `Phi_Y C^T`. In the pushforward
+    convention, they are the rows of `Phi_X C^T` and of `Phi_Y`.
 
-    The convention matters because a filtered functional map shortens the vectors that it maps. The search
-    finds the nearest point of Y (the database) for each point of X (a query). In the pushforward convention,
-    C shrinks the queries. A few points of the database with small norms are then nearest to most queries. In
-    the pullback convention, C shrinks the database, which hardly changes the order of the distances from a
-    query. On real shapes, refinement with filtering therefore succeeds only in the pullback convention.
-
-    **Arguments:**
-
-    - `functional_map`, `spectrum_x`, `spectrum_y`, `convention`: as in `decode`.
-
-    **Returns:** Two point sets: the queries (m, d) with one point per vertex of X, and the database (n, d)
-    with one point per vertex of Y. The dimension d is the number of rows of C. The coordinates have the unit
-    of the eigenvectors, which is 1 / length.
-
-    **Raises:** `ValueError` for an unknown convention.
+    The convention matters because a filtered functional map shortens the vectors that it maps. In the
+    pushforward convention, C shrinks the points of X (the queries), and a few points of Y with small norms
+    are then nearest to most queries. In the pullback convention, C shrinks the points of Y, which hardly
+    changes the order of the distances from a query. On real shapes, refinement with filtering therefore
+    succeeds only in the pullback convention.
     """
     rows_out, rows_in = out_and_in(convention, spectrum_x.eigenvectors, spectrum_y.eigenvectors)
     return out_and_in(convention, rows_out, product(rows_in, functional_map.T))
 
 
 def decode(
-    functional_map: Float[Array, "k_out k_in"],
+    functional_map: FunctionalMap,
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     *,
@@ -56,25 +45,17 @@ def decode(
 ) -> Int32[Array, " m"]:
     """Recover the pointwise map T: X -> Y from a functional map C by nearest-neighbour search.
 
-    This computation is step 3 of Algorithm 1 of the MWP paper. T maps each vertex of X to the unmasked vertex
-    of Y that is nearest in the `spectral_embeddings`. The search is exact up to rounding errors, with and
-    without patches.
+    This is step 3 of Algorithm 1 of the MWP paper. T maps each vertex of X to the unmasked vertex of Y that
+    is nearest in the `spectral_embeddings`. The search is exact up to rounding errors.
 
     **Arguments:**
 
-    - `functional_map`: C, without unit, of shape (k_X, k_Y) in the pullback convention and of shape
-      (k_Y, k_X) in the pushforward convention.
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices, k_X eigenvectors) and of target Y (n
-      vertices, k_Y eigenvectors). Both need the same scale, as in the computation of C. Two full shapes need
-      equal areas, such as the area 1 from `compute_spectrum`. The shapes of a partial pair need the same unit
-      of length.
-    - `convention`: the direction of C. With `"pullback"` (the default), C maps functions on Y to functions on
-      X. With `"pushforward"`, C maps functions on X to functions on Y.
+    - `functional_map`: C, without unit, in the given `convention`.
+    - `spectrum_x`, `spectrum_y`, `convention`: as in `encode`.
     - `patches`: the result of `search_patches(spectrum_x, spectrum_y)`, which makes the search faster on
       large shapes. With None (the default), the search compares all vertices of X with all vertices of Y.
 
-    **Returns:** The map T, an int32 array (m,). Entry i is the match of vertex i of X, as a 0-based vertex of
-    Y.
+    **Returns:** The map T, an int32 array (m,) of 0-based vertices of Y.
 
     **Raises:** `ValueError` for an unknown convention.
     """
@@ -83,7 +64,7 @@ def decode(
 
 
 def decode_to_triangles(
-    functional_map: Float[Array, "k_out k_in"],
+    functional_map: FunctionalMap,
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     faces_y: Int[Array, "f 3"],
@@ -94,22 +75,15 @@ def decode_to_triangles(
 
     The method is that of Ezuz and Ben-Chen, "Deblurring and denoising of maps between shapes", 2017. The
     triangles of Y span a surface in the space of the `spectral_embeddings`. Each vertex of X is mapped to the
-    nearest point of this surface.
+    nearest point of this surface. Unlike with `decode`, functions on Y therefore stay smooth when they are
+    transferred to a finer X. For shapes of 5000 vertices, the function takes about one second, ten times as
+    long as `decode`. The time grows with the product of the numbers of vertices.
 
-    If X is finer than Y, `decode` maps several neighbouring vertices of X to the same vertex of Y.
-    `decode_to_triangles` can map neighbouring vertices to different points. Textures and other functions on Y
-    therefore stay smooth when they are transferred to X. For shapes of 5000 vertices, `decode_to_triangles`
-    takes about one second, ten times as long as `decode` without patches. The time grows with the number of
-    vertices of X times the number of vertices of Y.
+    The arguments are those of `decode`, and the triangles `faces_y` (f, 3), as vertex indices from 0 to n -
+    1.
 
-    **Arguments:**
-
-    - `functional_map`, `spectrum_x`, `spectrum_y`, `convention`: as in `decode`.
-    - `faces_y`: (f, 3), the triangles of Y, as vertex indices from 0 to n - 1.
-
-    **Returns:** Two arrays with one row per vertex of X. The first array (m,), int32, contains triangles of Y
-    as 0-based rows of `faces_y`. The second array (m, 3) contains barycentric weights of the three corners.
-    The weights are non-negative and sum to 1.
+    **Returns:** The triangle of Y for each vertex of X, as a 0-based row of `faces_y` (m,), and the
+    barycentric weights of its corners (m, 3), which are non-negative and sum to 1.
 
     **Raises:** `ValueError` for an unknown convention.
     """
@@ -118,20 +92,11 @@ def decode_to_triangles(
 
 
 def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches]:
-    """Return patches of both shapes, for the argument `patches` of `decode`.
+    """Return patches of X (the queries) and of Y (the database), for the argument `patches` of `decode`.
 
-    A patch is a group of neighbouring vertices, which a nearest-neighbour search can skip as a whole. Patches
-    make `decode` faster on large shapes. The same patches can be used for all functional maps between X and
-    Y.
-
-    A patch of Y contains more vertices if Y is finer: the patch size grows with the cube root of Y's number
-    of vertices.
-
-    **Arguments:**
-
-    - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X and of target Y, in any unit of length.
-
-    **Returns:** A pair of `Patches`: the patches of X (the queries) and the patches of Y (the database).
+    A patch is a group of neighbouring vertices, which a nearest-neighbour search can skip as a whole. The
+    same patches can be used for all functional maps between X and Y. Their size on Y grows with the cube root
+    of Y's number of vertices.
     """
     n = spectrum_y.mask.shape[0]
     size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** (1 / 3))
@@ -146,8 +111,8 @@ def chosen_patches(
 ) -> tuple[Patches, Patches] | None:
     """Return the result of `search_patches` if the setting `search` needs patches, and None otherwise.
 
-    `"patches"` always uses patches, and `"exhaustive"` never uses patches. `"auto"` uses patches if the
-    default backend is a CPU and the geometric mean of the two numbers of vertices is at least 15 000.
+    `"auto"` uses patches if the default backend is a CPU and the geometric mean of the two numbers of
+    vertices is at least 15 000.
     """
     sizes = spectrum_x.mask.shape[0] * spectrum_y.mask.shape[0]
     pays = jax.default_backend() == "cpu" and sizes >= _PATCHES_FROM**2

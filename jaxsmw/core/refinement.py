@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict
 
 import equinox as eqx
 import jax
@@ -14,41 +15,37 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.choices import ITERATIONS
-from jaxsmw.core.checks import all_finite, check_kind, counts_iterations
+from jaxsmw.core.checks import all_finite, check_kind, check_pointwise_map, counts_iterations
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, Samples, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
 
 
 class History(eqx.Module):
     """A record of the iterations of `refine`, stored in `Refinement.history` if `history=True`.
 
-    If the refinement stopped early, `changed`, `energy` and `objective` contain NaN for the skipped
-    iterations.
+    If the refinement stopped early, `changed`, `energy` and `objective` are NaN for the skipped iterations.
 
     **Attributes:**
 
     - `changed`: (iterations,), the share of X's vertices whose match changed in each iteration, from 0 to 1.
-      If the refinement uses samples, `changed` is computed from the samples of X only. The first entry is
-      then NaN unless `starts_on_samples` is True, and the last entry is NaN unless `ends_on_samples` is True.
-    - `energy`: (iterations,), the result of `Refiner.energy` in each iteration, computed from the state and
-      from the pointwise map that produced this state. For `WaveletPreservation`, this is the energy of
-      equation (5) of the MWP paper, which has no unit.
-    - `objective`: (iterations,), the result of `Refiner.objective` in each iteration, computed from the state
-      and from the pointwise map that was recovered from this state. The objective is the mean squared
-      distance between matched points of the embeddings, in the squared unit of the embeddings; lower is
-      better.
-    - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration. Each row
-      contains a 0-based vertex of Y for each of the m vertices of X. The rows of skipped iterations repeat
-      the final map. After a failure, all entries of `pointwise_maps` are -1. `pointwise_maps` is None if the
-      refinement uses samples, because the iterations then map only the samples.
+      With samples, only the samples of X count. The first entry is then NaN unless `starts_on_samples` is
+      True, and the last entry is NaN unless `ends_on_samples` is True.
+    - `energy`: (iterations,), the result of `Refiner.energy` for each state and the map that produced it. For
+      `WaveletPreservation`, this is the energy of equation (5) of the MWP paper, which has no unit.
+    - `objective`: (iterations,), the result of `Refiner.objective` for each state and the map that was
+      recovered from it: the mean squared distance between matched points of the embeddings.
+    - `pointwise_maps`: (iterations, m), the map X -> Y that was recovered in each iteration, 0-based. The
+      rows of skipped iterations repeat the final map. After a failure, all entries are -1. With samples,
+      `pointwise_maps` is None, because the iterations then map only the samples.
     """
 
-    changed: Float[Array, " iterations"]
-    energy: Float[Array, " iterations"]
-    objective: Float[Array, " iterations"]
-    pointwise_maps: Int32[Array, "iterations m"] | None
+    changed: Float[Array, "*iterations"]
+    energy: Float[Array, "*iterations"]
+    objective: Float[Array, "*iterations"]
+    pointwise_maps: Int32[Array, "*iterations m"] | None
 
 
 class Refinement(eqx.Module):
@@ -59,14 +56,12 @@ class Refinement(eqx.Module):
     - `pointwise_map`: the refined map T: X -> Y (m,), one 0-based vertex of Y per vertex of X; all entries
       are -1 after a failure.
     - `functional_map`: the functional map C (k_out, k_in), without unit, from which the pointwise map was
-      recovered. This property returns `state.functional_map`. By default, C is a pullback (k_X, k_Y), which
-      takes functions on Y to functions on X. If the refiner's `convention` is `"pushforward"`, C (k_Y, k_X)
-      takes functions on X to functions on Y. After a failure, C contains NaN or meaningless numbers.
+      recovered, in the refiner's `convention`. By default, C is a pullback (k_X, k_Y), which takes functions
+      on Y to functions on X. After a failure, C contains NaN or meaningless numbers.
     - `state`: the final `State` of the refiner, which contains the functional map.
-    - `result`: the status code, a member of `RESULTS`. Compare `result` with `RESULTS.successful`.
-      `RESULTS[result]` is a sentence that explains the status.
-    - `iterations`: the number of iterations that were run. If the refinement stopped early, this number is
-      smaller than the requested number.
+    - `result`: the status code, a member of `RESULTS`. `RESULTS[result]` is a sentence that explains it.
+    - `iterations`: the number of iterations that were run, fewer than requested if the refinement stopped
+      early.
     - `history`: a `History`, or None if `refine` was called with `history=False`.
     """
 
@@ -82,11 +77,9 @@ class Refinement(eqx.Module):
         return self.state.functional_map
 
     def unpadded(self, number_of_vertices: int) -> Refinement:
-        """Return the same refinement without the vertices that `Spectrum.pad` added to X.
+        """Return the refinement without the vertices that `Spectrum.pad` added to X.
 
-        **Arguments:**
-
-        - `number_of_vertices`: the number of vertices of X before padding.
+        `number_of_vertices` is the number of vertices of X before padding.
         """
         history = self.history
         if history is not None and history.pointwise_maps is not None:
@@ -94,6 +87,18 @@ class Refinement(eqx.Module):
             history = dataclasses.replace(history, pointwise_maps=maps)
         kept = self.pointwise_map[:number_of_vertices]
         return dataclasses.replace(self, pointwise_map=kept, history=history)
+
+
+class RefineSettings(TypedDict, total=False):
+    """The arguments of `refine` that are the same for all pairs of a batch."""
+
+    refiner: Refiner
+    iterations: int
+    starts_on_samples: bool
+    ends_on_samples: bool
+    partial: bool
+    stop_when_unchanged: bool
+    history: bool
 
 
 @counts_iterations
@@ -115,42 +120,36 @@ def refine(
     """Refine a pointwise map T: X -> Y by alternating between functional maps and pointwise maps.
 
     The loop is Algorithm 1 of the MWP paper, generalised to any refiner. The function is pure and
-    jit-compiled. JAX compiles the function again only when sizes or static settings change. For many pairs of
-    equal size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For pairs of different sizes, use
-    `jaxsmw.refine_pairs`.
+    jit-compiled. For many pairs of equal size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For
+    pairs of different sizes, use `jaxsmw.refine_pairs`.
 
-    If samples are given, only the first and the last step use all vertices. The first step computes a
-    functional map from the initial map of all vertices. The last step recovers the refined map of all
-    vertices. All steps in between use only the samples. The fast variant of the MWP authors' program also
-    iterates on samples. `starts_on_samples` restricts the first step to the samples, and `ends_on_samples`
-    restricts the last step to the samples. If one call ends on samples and the next call starts on the same
+    If samples are given, only the first functional map and the last pointwise map are computed from all
+    vertices, as in the fast variant of the MWP authors' program. `starts_on_samples` and `ends_on_samples`
+    restrict these two steps to the samples. If one call ends on samples and the next call starts on the same
     samples, the two calls save one search of all vertices.
 
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices). Unless
       `partial` is True, each shape should have area 1, as from `compute_spectrum`.
-    - `pointwise_map`: the initial map T, an integer array (m,). Entry i is the match of vertex i of X, as the
-      index of a vertex of Y, from 0 to n - 1.
+    - `pointwise_map`: the initial map T, an integer array (m,) of 0-based vertices of Y.
     - `refiner`: the method, a `Refiner`. The default is `WaveletPreservation()`, the method of the MWP paper.
     - `iterations`: the number of iterations, an integer of at least 1. Each iteration computes a functional
       map and then a pointwise map.
     - `samples`: a tuple of two integer arrays: the 0-based vertices of X (s_x,) and of Y (s_y,) on which the
       refinement iterates. The samples should be evenly spread and outnumber the eigenvectors. With None, all
       iterations use all vertices.
-    - `starts_on_samples`: whether the first functional map is computed from the samples only. If True, the
-      initial map of all other vertices of X is ignored.
-    - `ends_on_samples`: whether the last step matches only the samples. If True, the refined map contains -1
-      for each vertex of X that is not a sample.
-    - `partial`: whether one shape is a part of the other. If True, both shapes must have the same unit of
-      length.
+    - `starts_on_samples`: whether the first functional map is computed from the samples only. The initial map
+      of all other vertices of X is then ignored.
+    - `ends_on_samples`: whether the last step matches only the samples. The refined map then contains -1 for
+      each vertex of X that is not a sample.
+    - `partial`: whether one shape is a part of the other. Both shapes then need the same unit of length.
     - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. Under `jax.vmap`,
-      every pair takes as long as the slowest pair, but the results are the same as without `jax.vmap`.
-    - `history`: whether to record a `History`. Recording increases the run time by about 10 %.
+      every pair takes as long as the slowest pair, with the same results.
+    - `history`: whether to record a `History`, which increases the run time by about 10 %.
 
-    **Returns:** A `Refinement`, whose attributes include `pointwise_map` (m,) with 0-based vertices of Y,
-    `functional_map` (k_out, k_in) without unit, and `result`. Numerical failures raise no error, so compare
-    `result` with `RESULTS.successful`. After a failure, all entries of `pointwise_map` are -1.
+    **Returns:** A `Refinement`. Numerical failures raise no error, so compare its `result` with
+    `RESULTS.successful`. After a failure, all entries of its `pointwise_map` are -1.
 
     **Raises:** `ValueError` if `iterations` is below 1, the initial map does not have shape (m,), `samples`
     is not a pair, or the two spectra have different float types. `ValueError` is also raised if
@@ -171,9 +170,9 @@ def refine(
     if samples is not None and starts_on_samples:
         used = used & jnp.zeros_like(used).at[samples[0]].set(True)
         first_map = pointwise_map[samples[0]]
-        progress = loop.init(prepared, first_map, first_map)
+        progress = loop.start(prepared, first_map, first_map)
     else:
-        progress = loop.init(in_full, pointwise_map, first_map)
+        progress = loop.start(in_full, pointwise_map, first_map)
     if samples is None or ends_on_samples:
         # The last search is a part of the loop. Outside the loop, the search would have to be compiled a
         # second time, and a search takes longer to compile than any other part of the program.
@@ -185,18 +184,20 @@ def refine(
     else:
         progress, records = lax.scan(loop.step, progress, jnp.zeros(iterations - 1, bool))
         refined = refiner.recover(in_full, progress.state)
-        records = records.completed(progress.energy, loop.objective(in_full, progress.state, refined))
+        objective = loop.recorded(refiner.objective, in_full, progress.state, refined)
+        last = History(loop.undefined, progress.energy, objective, None)  # no map to compare `refined` with
+        records = jax.tree.map(jnp.append, records, last)
     if samples is not None and not starts_on_samples:
-        records = records.without_first_change()
+        # The first map of the samples has no predecessor either.
+        records = dataclasses.replace(records, changed=records.changed.at[:1].set(jnp.nan))
     result = diagnose(spectrum_x, spectrum_y, pointwise_map, progress.result, used)
     successful = result == RESULTS.successful
-    return Refinement(
-        jnp.where(successful, refined, -1),
-        progress.state,
-        result,
-        progress.iterations,
-        records.history(successful) if history else None,
-    )
+    refined = jnp.where(successful, refined, -1)
+    if records.pointwise_maps is not None:
+        maps = jnp.where(successful, records.pointwise_maps, -1)
+        records = dataclasses.replace(records, pointwise_maps=maps)
+    recorded = records if history else None
+    return Refinement(refined, progress.state, result, progress.iterations, recorded)
 
 
 class _Progress(NamedTuple):
@@ -211,52 +212,12 @@ class _Progress(NamedTuple):
     finished: Bool[Array, ""]
 
 
-class _Record(NamedTuple):
-    """The values that `History` contains for one iteration.
-
-    A stacked record contains the values for all iterations.
-    """
-
-    changed: Float[Array, "*iterations"]
-    energy: Float[Array, "*iterations"]
-    objective: Float[Array, "*iterations"]
-    pointwise_map: Int32[Array, "*iterations m"] | None
-
-    def completed(self, energy: Float[Array, ""], objective: Float[Array, ""]) -> _Record:
-        """Append a last entry, for the search that matches all vertices after the iterations on samples.
-
-        The last map cannot be compared with an earlier map of the same vertices, so its entry in `changed` is
-        NaN.
-        """
-        return _Record(
-            jnp.append(self.changed, jnp.asarray(jnp.nan, self.changed.dtype)),
-            jnp.append(self.energy, energy),
-            jnp.append(self.objective, objective),
-            None,
-        )
-
-    def without_first_change(self) -> _Record:
-        """Return the record with NaN as the first entry of `changed`.
-
-        The first map of the samples cannot be compared with an earlier map.
-        """
-        return self._replace(changed=self.changed.at[:1].set(jnp.nan))
-
-    def history(self, successful: Bool[Array, ""]) -> History:
-        """Return the `History`. If the refinement failed, all entries of its pointwise maps are -1."""
-        maps = self.pointwise_map
-        if maps is not None:
-            maps = jnp.where(successful, maps, -1)
-        return History(self.changed, self.energy, self.objective, maps)
-
-
 @dataclass(frozen=True, eq=False)
 class _Loop:
     """Algorithm 1 of the MWP paper for one prepared problem.
 
-    `init` computes the first state. Then each call of `step` runs one iteration, until `terminate` returns
-    True. Each step recovers a pointwise map from the current state. Every step except the last step then
-    computes the next state from this map.
+    Each step recovers a pointwise map from the current state. Every step except the last step then computes
+    the next state from this map.
     """
 
     refiner: Refiner
@@ -265,61 +226,53 @@ class _Loop:
     history: bool
     keeps_maps: bool
 
-    def init(
-        self, in_full: Prepared, pointwise_map: Int32[Array, " m"], first_map: Int32[Array, " s"]
+    def start(
+        self, prepared: Prepared, pointwise_map: Int32[Array, " m"], first_map: Int32[Array, " s"]
     ) -> _Progress:
-        """Compute the first state from the initial map.
-
-        `pointwise_map` is the initial map of all vertices or, with `starts_on_samples`, of the samples.
-
-        The first iteration compares its map with `first_map` to count the changed matches. Usually
-        `first_map` is the same as `pointwise_map`. If samples are given without `starts_on_samples`, all
-        entries of `first_map` are -1.
-        """
-        state, result = self.refiner.update(in_full, pointwise_map, None)
+        """Compute the first state from the initial map. The first step compares its map with `first_map`."""
+        state, result = self.refiner.update(prepared, pointwise_map, None)
         return _Progress(
             first_map,
             state,
             checked(state, result),
-            self._energy(in_full, state, pointwise_map),
+            self.recorded(self.refiner.energy, prepared, state, pointwise_map),
             iterations=jnp.asarray(1, jnp.int32),
             unchanged=jnp.asarray(False),
             finished=jnp.asarray(False),
         )
 
-    def step(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, _Record]:
-        """Run one iteration, or do nothing if the loop has terminated."""
+    def step(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, History]:
+        """Run one iteration, or do nothing if the loop has finished."""
         if not self.stop_when_unchanged:
             return self._iterate(progress, is_last)
-        return lax.cond(
-            self.terminate(progress), self._stay, self._iterate, progress, is_last | progress.unchanged
-        )
+        return lax.cond(progress.finished, self._stay, self._iterate, progress, is_last | progress.unchanged)
 
-    def terminate(self, progress: _Progress) -> Bool[Array, ""]:
-        """Return whether the loop has finished its last iteration."""
-        return progress.finished
-
-    def objective(
-        self, prepared: Prepared, state: State, pointwise_map: Int32[Array, " s"]
+    def recorded(
+        self, measure: Callable[..., Float[Array, ""]], *arguments: Prepared | State | Int32[Array, " s"]
     ) -> Float[Array, ""]:
-        """Return the objective of the map that was recovered from a state; NaN without a history."""
-        return self.refiner.objective(prepared, state, pointwise_map) if self.history else self._undefined
+        """Return the measure, or NaN without a history."""
+        return measure(*arguments) if self.history else self.undefined
 
-    def _iterate(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, _Record]:
+    @property
+    def undefined(self) -> Float[Array, ""]:
+        return jnp.asarray(jnp.nan, self.prepared.spectrum_x.eigenvectors.dtype)
+
+    def _iterate(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, History]:
         after, previous = self.refiner.recover_both(self.prepared, progress.state)
         mask = self.prepared.spectrum_x.mask
         changed = jnp.sum((after != progress.pointwise_map) & mask) / jnp.sum(mask)
-        record = _Record(
-            changed.astype(self._undefined.dtype),
+        record = History(
+            changed.astype(self.undefined.dtype),
             progress.energy,
-            self.objective(self.prepared, progress.state, after),
+            self.recorded(self.refiner.objective, self.prepared, progress.state, after),
             after if self.keeps_maps else None,
         )
 
         def update() -> tuple[State, RESULTS, Array, Array]:
             state, result = self.refiner.update(self.prepared, after, previous)
             result = where(progress.result == RESULTS.successful, checked(state, result), progress.result)
-            return state, result, self._energy(self.prepared, state, after), progress.iterations + 1
+            energy = self.recorded(self.refiner.energy, self.prepared, state, after)
+            return state, result, energy, progress.iterations + 1
 
         def keep() -> tuple[State, RESULTS, Array, Array]:
             return progress.state, progress.result, progress.energy, progress.iterations
@@ -328,17 +281,9 @@ class _Loop:
         unchanged = (changed == 0) & self.refiner.is_settled(progress.state)
         return _Progress(after, state, result, energy, iterations, unchanged, is_last), record
 
-    def _stay(self, progress: _Progress, _: Bool[Array, ""]) -> tuple[_Progress, _Record]:
-        undefined = self._undefined
+    def _stay(self, progress: _Progress, _: Bool[Array, ""]) -> tuple[_Progress, History]:
         maps = progress.pointwise_map if self.keeps_maps else None
-        return progress, _Record(undefined, undefined, undefined, maps)
-
-    def _energy(self, prepared: Prepared, state: State, pointwise_map: Int[Array, " _"]) -> Float[Array, ""]:
-        return self.refiner.energy(prepared, state, pointwise_map) if self.history else self._undefined
-
-    @property
-    def _undefined(self) -> Float[Array, ""]:
-        return jnp.asarray(jnp.nan, self.prepared.spectrum_x.eigenvectors.dtype)
+        return progress, History(self.undefined, self.undefined, self.undefined, maps)
 
 
 def _check_arguments(
@@ -350,7 +295,7 @@ def _check_arguments(
 ) -> None:
     check_kind("refiner", refiner, Refiner)
     check_spectra(spectrum_x, spectrum_y)
-    check_kind("initial map", pointwise_map, np.ndarray, jax.Array)
+    check_pointwise_map("initial map", pointwise_map, len(spectrum_x.mask))
     if samples is not None:
         if not isinstance(samples, tuple) or len(samples) != 2:
             raise ValueError(
@@ -359,42 +304,25 @@ def _check_arguments(
             )
         check_kind("samples of X", samples[0], np.ndarray, jax.Array)
         check_kind("samples of Y", samples[1], np.ndarray, jax.Array)
-    if pointwise_map.shape != spectrum_x.mask.shape:
-        raise ValueError(
-            f"the initial map has shape {pointwise_map.shape}, but X has {len(spectrum_x.mask)} vertices: "
-            "give one vertex of Y for each vertex of X"
-        )
-    if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
-        raise TypeError(
-            f"the initial map has type {pointwise_map.dtype}, but its entries must be integer vertex indices"
-        )
 
 
 def check_samples_use(refiner: Refiner, sampled: bool, starts: bool, ends: bool) -> None:
-    """Check the arguments `starts_on_samples` and `ends_on_samples` of `refine`.
-
-    **Raises:** `ValueError` if one of the two arguments is True, but there are no samples, or
-    `refiner.matches_samples_with_all` is False.
-    """
+    """Raise `InputError` if refinement cannot start or end on samples; see `refine`."""
     if not (starts or ends):
         return
     if not sampled:
-        raise ValueError(
-            "refinement cannot start or end on samples, because there are no samples: give samples"
+        raise InputError(
+            "refinement cannot start or end on samples, because there are no samples: give samples."
         )
     if not refiner.matches_samples_with_all:
-        raise ValueError(
+        raise InputError(
             f"{type(refiner).__name__} matches samples of X with samples of Y, so refinement cannot start or "
-            "end on samples: use FeatureRegression or Registration"
+            "end on samples: use FeatureRegression or Registration."
         )
 
 
 def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """Check that both arguments are spectra and have the same float type.
-
-    **Raises:** `TypeError` if an argument is not a `Spectrum`; `ValueError` if the spectra have different
-    float types.
-    """
+    """Raise `TypeError` or `ValueError` unless both arguments are spectra of the same float type."""
     check_kind("spectrum of X", spectrum_x, Spectrum)
     check_kind("spectrum of Y", spectrum_y, Spectrum)
     dtype_x, dtype_y = spectrum_x.eigenvectors.dtype, spectrum_y.eigenvectors.dtype
@@ -406,10 +334,9 @@ def check_spectra(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
 
 
 def checked(state: State, result: RESULTS) -> RESULTS:
-    """Check the state that an update computed, and return the status code of the update.
+    """Return the status code of an update, or of a failure of its state.
 
-    If `result` is a failure, this failure is returned unchanged. A state also counts as a failure if it
-    contains NaN or infinity, or if all entries of its functional map are zero.
+    A state is a failure if it contains NaN or infinity, or if its functional map is zero.
     """
     went_well = result == RESULTS.successful
     finite, zero = all_finite(state), jnp.all(state.functional_map == 0)
@@ -424,18 +351,11 @@ def diagnose(
     result: RESULTS,
     used: Bool[Array, " m"] | None = None,
 ) -> RESULTS:
-    """Check the inputs of a refinement, and return the status code of the refinement.
+    """Return the status code `result` of a refinement, or the code of a fault of its inputs.
 
-    If a spectrum contains NaN or infinity, or the initial map is invalid, the status code names this fault.
-    If the inputs are valid, `result` is returned unchanged.
-
-    **Arguments:**
-
-    - `spectrum_x`, `spectrum_y`: source X (m vertices) and target Y (n vertices).
-    - `matches`: the initial map (m, ...), as one or several vertices of Y per vertex of X; None for a dense
-      soft map, which contains no vertex indices.
-    - `result`: the status code of the refinement loop.
-    - `used`: a mask of the vertices of X whose matches must be valid (m,). The default is the mask of X.
+    A spectrum is faulty if it contains NaN or infinity. `matches` are one or several vertices of Y per vertex
+    of X, which must be valid where `used` is True; by default, on the mask of X. A dense soft map has no
+    matches.
     """
     if matches is not None:
         vertices_y = spectrum_y.mask.shape[0]

@@ -9,11 +9,8 @@ from jaxtyping import Array, Bool
 class RESULTS(eqx.Enumeration):
     """The status code of a refinement.
 
-    `Refinement.result` and `SoftRefinement.result` are status codes. Under `jax.vmap`, `result` contains one
-    status code per pair. Compare a status code `result` with a member: `result == RESULTS.successful`.
-    `RESULTS[result]` is a text that explains the status and suggests remedies. The members are `successful`,
-    `nonfinite_spectrum`, `invalid_initial_map`, `nonfinite_functional_map`, `undetermined_functional_map`,
-    `singular_system`, `fixed_point_not_reached` and `solver_not_converged`.
+    Under `jax.vmap`, `result` contains one status code per pair. Compare a status code with a member: `result
+    == RESULTS.successful`. `RESULTS[result]` is a text that explains the status and suggests remedies.
     """
 
     successful = "The refinement succeeded: all numbers are finite."
@@ -56,7 +53,7 @@ class RESULTS(eqx.Enumeration):
 
 
 def where(condition: Bool[Array, ""] | bool, if_true: RESULTS | str, if_false: RESULTS | str) -> RESULTS:
-    """Return the status code `if_true` if the condition is True, and `if_false` otherwise.
+    """Return one of two status codes.
 
     The annotations include `str` because type checkers treat the members of an Enumeration as strings.
     """

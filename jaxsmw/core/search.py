@@ -47,21 +47,19 @@ def nearest_neighbor(
 ) -> Int32[Array, " m"]:
     """Return, for each query, the index of the database row that is nearest in Euclidean distance.
 
-    The search compares every query with every row, and it is exact up to rounding errors. If several database
-    rows are identical, the search returns the lowest of their indices. The queries are processed in blocks,
-    so no array of size m x n is stored.
+    The search compares every query with every row, and it is exact up to rounding errors. Of several
+    identical database rows, the first is returned. The queries are processed in blocks, so no array of size m
+    x n is stored.
 
     The score of a database row b for a query q is `q·b - |b|²/2`, which is largest for the nearest row. The
-    search finds the two chunks of database rows with the best scores, and the best row in each of these
-    chunks. The search then compares the distances from the query to these two rows, because scores have large
-    rounding errors if `|b|` is large compared to the distance. The search takes little longer than the matrix
-    product that computes the scores.
+    search compares the distances to the best rows of the two chunks of rows with the best scores, because
+    scores have large rounding errors if `|b|` is large compared to the distance.
 
     **Arguments:**
 
-    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
-    - `database_mask`: a Boolean array (n,), False for rows that are never chosen. With None (the default),
-      all rows can be chosen. If all entries are False, the result is meaningless.
+    - `queries`, `database`: query points (m, d) and database points (n, d), in the same unit.
+    - `database_mask`: a Boolean array (n,), False for rows that are never chosen; at least one must be True.
+      With None (the default), all rows can be chosen.
 
     **Returns:** One index from 0 to n - 1 per query, an int32 array (m,).
 
@@ -95,8 +93,7 @@ def nearest_neighbor(
 def queries_per_block(m: int, n: int) -> int:
     """Return how many of m queries an exhaustive search compares with n database rows at once.
 
-    On CPUs, the scores of a block must fit into the cache. On accelerators, small blocks leave most of a GPU
-    idle.
+    On accelerators, small blocks leave most of a GPU idle.
     """
     if jax.default_backend() == "cpu":
         return BLOCK
@@ -104,36 +101,46 @@ def queries_per_block(m: int, n: int) -> int:
 
 
 class SearchProblem(NamedTuple):
-    """The arguments of one `nearest_neighbor` search."""
+    """The arguments of one search by `nearest_vertices`."""
 
     queries: Float[Array, "m d"]
     database: Float[Array, "n d"]
     database_mask: Bool[Array, " n"]
+    patches: tuple[Patches, Patches] | None = None
+
+
+def nearest_vertices(
+    queries: Float[Array, "m d"],
+    database: Float[Array, "n d"],
+    database_mask: Bool[Array, " n"],
+    patches: tuple[Patches, Patches] | None = None,
+) -> Int32[Array, " m"]:
+    """Return the nearest database row of each query, (m,). Patches replace `database_mask`."""
+    if patches is None:
+        return nearest_neighbor(queries, database, database_mask=database_mask)
+    return nearest_neighbor_in_patches(queries, database, *patches)
 
 
 def nearest_in_both(
     first: SearchProblem, second: SearchProblem
 ) -> tuple[Int32[Array, " m_1"], Int32[Array, " m_2"]]:
-    """Return the results of two exhaustive searches, (m_1,) and (m_2,), of which the sizes may differ.
+    """Return the results of two searches, (m_1,) and (m_2,), of which the sizes may differ.
 
-    JAX compiles the search only once, because both searches are iterations of one loop.
+    Without patches, both searches are iterations of one loop, so JAX compiles the search only once.
     """
-    searches = (first, second)
-    m, n = (max(len(one[field]) for one in searches) for field in (0, 1))
-    d = max(one.queries.shape[1] for one in searches)
+    if first.patches is not None or second.patches is not None:
+        return nearest_vertices(*first), nearest_vertices(*second)
+    d = max(first.queries.shape[1], second.queries.shape[1])
 
-    def padded(rows: Array, number: int) -> Array:
-        columns = ((0, d - rows.shape[1]),) if rows.ndim == 2 else ()
-        return jnp.pad(rows, ((0, number - len(rows)), *columns))
-
-    stacked = SearchProblem(
-        *(
-            jnp.stack([padded(one[field], number) for one in searches])
-            for field, number in enumerate((m, n, n))
+    def stacked(*arrays: Array) -> Array:
+        most = max(map(len, arrays))
+        return jnp.stack(
+            [jnp.pad(a, ((0, most - len(a)), *((0, d - a.shape[-1]),) * (a.ndim - 1))) for a in arrays]
         )
-    )
-    found = lax.map(lambda one: nearest_neighbor(one[0], one[1], database_mask=one[2]), stacked)
-    return found[0, : len(first.queries)], found[1, : len(second.queries)]
+
+    arguments = tuple(stacked(*pair) for pair in zip(first[:3], second[:3], strict=True))
+    nearest = lax.map(lambda one: nearest_vertices(*one), arguments)
+    return nearest[0, : len(first.queries)], nearest[1, : len(second.queries)]
 
 
 def in_blocks(
@@ -191,10 +198,9 @@ class Patches(eqx.Module):
     - `rows`: (g, c, s), int32, the 0-based indices of the s points of each of the c patches of g regions. The
       indices of a patch are in ascending order, with padding at the end.
     - `mask`: (g, c, s), False for padding and for masked points, True for all other points.
-    - `variations`: (g, c, r, s), the coefficients of r linear combinations of the s points of each patch,
-      without unit. These combinations are the r directions along which the points of the patch differ most.
-    - `region_variations`: (g, q, c), the coefficients of q linear combinations of the centres of the c
-      patches of each region. These combinations are the q directions along which the centres differ most.
+    - `variations`: (g, c, r, s), the coefficients of r linear combinations of the s points of each patch: the
+      directions along which the points of the patch differ most.
+    - `region_variations`: (g, q, c), the same for the centres of the c patches of each region.
     """
 
     rows: Int32[Array, "g c s"]
@@ -204,21 +210,18 @@ class Patches(eqx.Module):
 
 
 def make_patches(points: Float[Array, "n d"], mask: Bool[Array, " n"], *, size: int, rank: int) -> Patches:
-    """Divide points into patches of equal size by repeated halving.
+    """Divide points into patches of equal size by repeated halving. Their number is a power of two.
 
-    The function halves each group of points along the coordinate with the largest variance. Only the first 6
-    coordinates are considered. The patches of a region come from one group of an earlier halving.
+    The function halves each group of points along the coordinate with the largest variance, among the first 6
+    coordinates. The first eigenvectors of a surface vary slowly, so neighbouring vertices have similar
+    coordinates.
 
     **Arguments:**
 
-    - `points`: the points (n, d). The points of a surface are the rows of the matrix of eigenvectors. The
-      first eigenvectors vary slowly over the surface, so neighbouring vertices have similar coordinates.
+    - `points`: the points (n, d), such as the rows of the matrix of eigenvectors.
     - `mask`: a Boolean array (n,), False for points that are ignored.
-    - `size`: the desired number of points per patch. The actual number is 0.7 to 1.4 times the desired
-      number.
+    - `size`: the desired number of points per patch. The actual number is 0.7 to 1.4 times this number.
     - `rank`: the number r of `variations` per patch; 0 for patches of queries, which need no variations.
-
-    **Returns:** The `Patches`. The number of patches is a power of two.
     """
     n = points.shape[0]
     levels = max(0, round(math.log2(n / size)))
@@ -310,39 +313,27 @@ def nearest_neighbor_in_patches(
 ) -> Int32[Array, " m"]:
     """Return the same indices as `nearest_neighbor`, but skip patches that are too far away.
 
-    Each patch of the database has a bounding box with r axes through the centre of the patch. The box also
-    has a radius: the largest distance from a point of the patch to the space that the axes span. The box
-    gives a lower bound on the distances from a query to the points of the patch. Computing this bound takes
-    only r + 1 scalar products. Each region has such a box as well.
+    Each patch of the database has a bounding box with r axes through its centre, and a radius: the largest
+    distance from a point of the patch to the space that the axes span. The box gives a lower bound on the
+    distances from a query to the points of the patch, by only r + 1 scalar products. Each region has such a
+    box as well.
 
     For each query, a point in the region with the nearest box is the first candidate. A region is too far
     away if its lower bound exceeds the distance to this candidate. In the other regions, a point of the patch
     with the nearest box is the second candidate. A patch is too far away if its lower bound exceeds the
-    distance to the nearer candidate. The queries are divided into patches, too. For each patch of queries,
-    the search skips the regions and the patches that are too far away from every query. The bounds allow for
-    rounding errors, so no nearest point is skipped. If the points are spread evenly in all dimensions, the
-    search skips no patch, and `nearest_neighbor` is faster.
+    distance to the nearer candidate. For each patch of queries, the search skips what is too far away from
+    every query. The bounds allow for rounding errors, so no nearest point is skipped. If the points are
+    spread evenly in all dimensions, nothing is skipped, and `nearest_neighbor` is faster.
 
-    **Arguments:**
-
-    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
-    - `query_patches`, `database_patches`: the results of `make_patches` for the queries and for the database.
-      Patches remain valid if a linear map is applied to their points. Masked points of the database are never
-      chosen. The results for masked queries are meaningless.
-
-    **Returns:** One index from 0 to n - 1 per query, (m,).
+    The patches are the results of `make_patches`. They remain valid if a linear map is applied to their
+    points. Masked points of the database are never chosen. The results for masked queries are meaningless.
     """
     found, _ = search_in_patches(queries, database, query_patches, database_patches)
     return found
 
 
 class SearchedNumbers(NamedTuple):
-    """The numbers of regions and patches of the database that a search in patches did not skip.
-
-    **Attributes:**
-
-    - `regions`, `patches`: one number for each of the p patches of queries, (p,).
-    """
+    """The numbers of regions and patches that a search did not skip, for each patch of queries (p,)."""
 
     regions: Int32[Array, " p"]
     patches: Int32[Array, " p"]
@@ -380,18 +371,6 @@ def search_in_patches(
     everywhere = jnp.zeros(queries.shape[0], jnp.int32)
     kept = jnp.where(query_patches.mask, query_patches.rows, queries.shape[0])
     return everywhere.at[kept.reshape(-1)].set(found.reshape(-1), mode="drop"), numbers
-
-
-def nearest_vertices(
-    queries: Float[Array, "m d"],
-    database: Float[Array, "n d"],
-    database_mask: Bool[Array, " n"],
-    patches: tuple[Patches, Patches] | None,
-) -> Int32[Array, " m"]:
-    """Return the nearest database row of each query, (m,). Patches replace `database_mask`."""
-    if patches is None:
-        return nearest_neighbor(queries, database, database_mask=database_mask)
-    return nearest_neighbor_in_patches(queries, database, *patches)
 
 
 class _Boxes(NamedTuple):
@@ -528,47 +507,29 @@ def _distance_to_candidate(
     return jnp.sqrt(jnp.sum((block - candidates) ** 2, axis=1)) * (1 + _precision(block))
 
 
-class _InRegions(NamedTuple):
-    """What is known about p patches after some regions: the nearest box of each query, and `_bounds`."""
-
-    step: Int32[Array, ""]
-    squared: Float[Array, " block"]
-    nearest: Int32[Array, " block"]
-    bounds: Float[Array, "p block"]
-
-
 def _bounds_in_regions(
     patches: _PatchBoxes, block: Float[Array, "block d"], near: Bool[Array, " g"]
 ) -> tuple[Int32[Array, " block"], Float[Array, "p block"]]:
     """Return the patch with the nearest box, and the `_bounds` of all patches, infinite in far regions."""
-    number = jnp.sum(near, dtype=jnp.int32)
     listed = jnp.nonzero(near, size=len(near), fill_value=0)[0].astype(jnp.int32)
     each = patches.points.shape[1]
 
-    def look(known: _InRegions) -> _InRegions:
-        region = listed[known.step]
-        squared, bounds = _bounds(jax.tree.map(lambda field: field[region], patches.boxes), block)
+    def look(step: Int32[Array, ""], nearer: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        least, nearest, bounds = nearer
+        region = listed[step]
+        squared, in_region = _bounds(jax.tree.map(lambda field: field[region], patches.boxes), block)
         smallest = jnp.min(squared, axis=0)
         position = region * each + _position_of_minimum(squared).astype(jnp.int32)
-        return _InRegions(
-            known.step + 1,
-            jnp.minimum(known.squared, smallest),
-            jnp.where(smallest < known.squared, position, known.nearest),
-            lax.dynamic_update_slice_in_dim(known.bounds, bounds, region * each, axis=0),
+        return (
+            jnp.minimum(least, smallest),
+            jnp.where(smallest < least, position, nearest),
+            lax.dynamic_update_slice_in_dim(bounds, in_region, region * each, axis=0),
         )
 
     infinite = jnp.full((len(near) * each, len(block)), jnp.inf, block.dtype)
-    start = _InRegions(jnp.asarray(0, jnp.int32), infinite[0], jnp.zeros(len(block), jnp.int32), infinite)
-    found = lax.while_loop(lambda known: known.step < number, look, start)
-    return found.nearest, found.bounds
-
-
-class _Found(NamedTuple):
-    """The two best candidates of each query so far, as rows of all points, in different patches."""
-
-    step: Int32[Array, ""]
-    scores: Float[Array, "2 block"]
-    rows: Int32[Array, "2 block"]
+    start = infinite[0], jnp.zeros(len(block), jnp.int32), infinite
+    _, nearest, bounds = lax.fori_loop(0, jnp.sum(near, dtype=jnp.int32), look, start)
+    return nearest, bounds
 
 
 def _two_best_rows(
@@ -581,20 +542,21 @@ def _two_best_rows(
     steps = -(-len(needed) // _GROUP)
     listed = jnp.nonzero(needed, size=steps * _GROUP, fill_value=len(needed))[0].astype(jnp.int32)
 
-    def look(state: _Found) -> _Found:
-        group = lax.dynamic_slice(listed, (state.step * _GROUP,), (_GROUP,))
+    def look(step: Int32[Array, ""], best_so_far: tuple[Array, Array]) -> tuple[Array, Array]:
+        best_scores, best_rows = best_so_far
+        group = lax.dynamic_slice(listed, (step * _GROUP,), (_GROUP,))
         points = all_points.at[group].get(mode="fill", fill_value=0).reshape(_GROUP * size, d)
         half_norms = all_half_norms.at[group].get(mode="fill", fill_value=jnp.inf)
         scores = product(points, block.T).reshape(_GROUP, size, -1) - half_norms[..., None]
-        merged = jnp.concatenate([state.scores, jnp.max(scores, axis=1)])
+        merged = jnp.concatenate([best_scores, jnp.max(scores, axis=1)])
         best = _two_best(merged)
         fresh = jnp.maximum(best - 2, 0)
         rows = group[fresh] * size + jnp.argmax(scores[fresh, :, each[None, :]], axis=2).astype(jnp.int32)
-        rows = jnp.where(best < 2, jnp.take_along_axis(state.rows, jnp.minimum(best, 1), axis=0), rows)
-        return _Found(state.step + 1, jnp.take_along_axis(merged, best, axis=0), rows)
+        rows = jnp.where(best < 2, jnp.take_along_axis(best_rows, jnp.minimum(best, 1), axis=0), rows)
+        return jnp.take_along_axis(merged, best, axis=0), rows
 
     nothing = jnp.full((2, block.shape[0]), -jnp.inf, block.dtype)
-    start = _Found(jnp.asarray(0, jnp.int32), nothing, jnp.full(nothing.shape, 0, jnp.int32))
-    number = jnp.sum(needed, dtype=jnp.int32)
-    found = lax.while_loop(lambda state: state.step * _GROUP < number, look, start)
-    return found.rows, jnp.isinf(found.scores)
+    start = nothing, jnp.zeros(nothing.shape, jnp.int32)
+    groups = -(-jnp.sum(needed, dtype=jnp.int32) // _GROUP)
+    scores, rows = lax.fori_loop(0, groups, look, start)
+    return rows, jnp.isinf(scores)

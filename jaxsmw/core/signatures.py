@@ -1,9 +1,11 @@
 """Spectral signatures: the heat kernel signature, the wave kernel signature and a wavelet signature.
 
 All three signatures have the form `f_t(x) = sum_i w_t(lambda_i) phi_i(x)² / sum_i w_t(lambda_i)`. Dimension t
-of a signature has its own weight function w_t of the eigenvalue. On a surface of area 1, the area-weighted
-mean of each dimension is 1. The signatures do not depend on the signs of the eigenvectors, and they do not
-distinguish left from right.
+has its own weight function w_t of the eigenvalue. The arrays (n, dimensions) are in units of 1 / area: on a
+surface of area 1, the area-weighted mean of each dimension is 1. The signatures do not depend on the signs of
+the eigenvectors, and they do not distinguish left from right. All entries are NaN if no eigenvalue is
+positive. In the docstrings, lambda_max is the largest eigenvalue, and lambda_min is the smallest positive
+eigenvalue.
 """
 
 from __future__ import annotations
@@ -20,16 +22,10 @@ from jaxsmw.core.spectrum import Spectrum
 def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
     """Return the heat kernel signature at log-spaced diffusion times (Sun, Ovsjanikov, Guibas 2009).
 
-    The times run from `4 ln 10 / lambda_max` to `4 ln 10 / lambda_min`. Here lambda_max is the largest
-    eigenvalue of the spectrum, and lambda_min is the smallest positive eigenvalue.
+    The times run from `4 ln 10 / lambda_max` to `4 ln 10 / lambda_min`.
 
-    **Arguments:**
-
-    - `spectrum`: the `Spectrum` of a shape with n vertices.
-    - `dimensions`: the number of diffusion times, at least 1, by default 100.
-
-    **Returns:** The signature of each vertex (n, dimensions), in units of 1 / area. On a surface of area 1,
-    the area-weighted mean of each column is 1. All entries are NaN if no eigenvalue is positive.
+    **Returns:** The signature (n, dimensions), in units of 1 / area. On a surface of area 1, the
+    area-weighted mean of each column is 1. All entries are NaN if no eigenvalue is positive.
     """
     smallest, largest = _positive_range(spectrum)
     times = 4 * jnp.log(10.0) / jnp.geomspace(largest, smallest, dimensions)
@@ -40,17 +36,9 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
     """Return the wave kernel signature at evenly spaced logarithmic energies.
 
     Aubry, Schlickewei, Cremers 2011 define this signature. The weights are Gaussians in the logarithm of the
-    eigenvalue. The centres of the Gaussians run in even steps from `log lambda_min + 2 width` to
-    `log lambda_max - 2 width`. The `width` (standard deviation) of each Gaussian is 7 steps. Here lambda_max
-    is the largest eigenvalue of the spectrum, and lambda_min is the smallest positive eigenvalue.
-
-    **Arguments:**
-
-    - `spectrum`: the `Spectrum` of a shape with n vertices.
-    - `dimensions`: the number of energies, at least 1, by default 100.
-
-    **Returns:** The signature of each vertex (n, dimensions), in units of 1 / area. On a surface of area 1,
-    the area-weighted mean of each column is 1. All entries are NaN if no eigenvalue is positive.
+    eigenvalue. The centres of the Gaussians run in even steps from `log lambda_min + 2 width` to `log
+    lambda_max - 2 width`. The `width` (standard deviation) of each Gaussian is 7 steps. The result is as in
+    `heat_kernel_signature`.
     """
     smallest, largest = _positive_range(spectrum)
     low, high = jnp.log(smallest), jnp.log(largest)
@@ -70,16 +58,8 @@ def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Arr
     This signature is a spectral wavelet signature in the sense of Li and Ben Hamza 2013, but with the
     band-pass filter of the Meyer frame from the MWP paper. The filter of each scale is largest at an
     eigenvalue `peak` and passes the eigenvalues from `peak / 2` to `2 peak`. The peaks are log-spaced from
-    lambda_min, the smallest positive eigenvalue, to `lambda_max / 2`, half the largest eigenvalue.
-
-    **Arguments:**
-
-    - `spectrum`: the `Spectrum` of a shape with n vertices.
-    - `dimensions`: the number of scales, at least 1, by default 100.
-
-    **Returns:** The signature of each vertex (n, dimensions), in units of 1 / area. On a surface of area 1,
-    the area-weighted mean of each column is 1. A column is NaN if its filter passes no eigenvalue. All
-    entries are NaN if no eigenvalue is positive.
+    lambda_min to `lambda_max / 2`. The result is as in `heat_kernel_signature`, and a column is NaN if its
+    filter passes no eigenvalue.
     """
     smallest, largest = _positive_range(spectrum)
     peaks = jnp.geomspace(smallest, largest / 2, dimensions)

@@ -33,10 +33,7 @@ class SoftMap(eqx.Module):
     plan is `P_ij = a_i w_ij / sum_k w_ik` with `w_ij = b_j exp(g_j - |q_i - y_j|² / temperature)`. The share
     that query i gives to row j is `w_ij / sum_k w_ik`. The matrix P is never stored as a whole. Row i of P
     sums to the area a_i. If `sinkhorn` computed the map, column j of P sums to the area b_j up to the
-    `residual`.
-
-    `sinkhorn`, `Softmax` and `Sinkhorn` return soft maps, and the attribute `SoftRefinement.soft_map`
-    contains one. For maps between shapes, the queries are the vertices of X, and the database rows are the
+    `residual`. For maps between shapes, the queries are the vertices of X, and the database rows are the
     vertices of Y.
 
     **Attributes:**
@@ -46,15 +43,12 @@ class SoftMap(eqx.Module):
     - `query_areas`, `database_areas`: the areas a (m,) and b (n,), without unit, each with sum 1. Ignored
       points have area zero. The shares of a query of area zero are still computed from its position.
     - `potentials`: g (n,), dimensionless. A database row with a higher potential receives larger shares from
-      all queries. The potential is zero for rows of zero area, and for all rows of a map that `Softmax`
-      computed.
+      all queries. The potential is zero for rows of zero area, and for all rows of a map of `Softmax`.
     - `temperature`: the temperature, a scalar array in squared units of the points.
-    - `residual`: the misplaced area divided by the total area, a number from 0 to 1 without unit. Misplaced
-      area is the area that database rows receive in excess of their own areas. The residual is NaN if
-      `Softmax` computed the map, because `Softmax` computes no residual.
-    - `converged`: whether the residual is at most the argument `tolerance` of `sinkhorn`; False if the
-      residual is NaN.
-    - `iterations`: the number of iterations that `sinkhorn` ran; 0 if `Softmax` computed the map.
+    - `residual`: the area that database rows receive in excess of their own areas, divided by the total area;
+      NaN for a map of `Softmax`.
+    - `converged`: whether the residual is at most the argument `tolerance` of `sinkhorn`.
+    - `iterations`: the number of iterations that `sinkhorn` ran; 0 for a map of `Softmax`.
     """
 
     queries: Float[Array, "m d"]
@@ -69,16 +63,9 @@ class SoftMap(eqx.Module):
 
     @eqx.filter_jit
     def pull_back(self, functions_on_y: Float[Array | np.ndarray, "n p"]) -> Float[Array, "m p"]:
-        """Pull functions on Y, such as colours, back to the queries.
+        """Pull functions on Y (n, p), such as colours, back to the queries (m, p).
 
-        A query receives a weighted mean of the values at the database rows. The weights are the shares of the
-        query.
-
-        **Arguments:**
-
-        - `functions_on_y`: the values of p functions at the database rows (n, p), in any unit.
-
-        **Returns:** The values of the p functions at the queries (m, p), in the same unit.
+        A query receives the mean of the values at the database rows, weighted with the shares of the query.
 
         **Raises:** `ValueError` if the values do not have shape (n, p).
         """
@@ -100,7 +87,7 @@ class SoftMap(eqx.Module):
     def pointwise_map(self) -> Int32[Array, " m"]:
         """Return, for each query, the index of the database row with the largest share per area, (m,).
 
-        The shares are divided by the areas of the rows, because shares alone would favour rows of large area.
+        Shares alone would favour rows of large area.
         """
         everywhere = jnp.where(self.database_areas > 0, self.potentials, -jnp.inf)
 
@@ -114,13 +101,10 @@ class SoftMap(eqx.Module):
 class SparseSoftMap(eqx.Module):
     """A soft map from m query points to n database points, in which each query has at most t nonzero shares.
 
-    `NearestFew` returns maps of this type.
-
     **Attributes:**
 
     - `rows`: (m, t), the 0-based indices of the t database rows of each query, int32, nearest first.
-    - `shares`: (m, t), the share of each database row in `rows`, a number from 0 to 1. The shares of each
-      query sum to 1.
+    - `shares`: (m, t), the share of each database row in `rows`. The shares of each query sum to 1.
     """
 
     rows: Int32[Array, "m t"]
@@ -148,19 +132,11 @@ PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
 
 
 def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """Pull functions on Y back to X, along a pointwise map or a soft map from X to Y.
+    """Pull functions on Y (n, p) back to X (m, p), along a pointwise map or a soft map from X to Y.
 
     With a pointwise map, each vertex of X receives the value at its match. With a soft map, each vertex of X
     receives the mean of the values on Y, weighted with the shares of the vertex. No array of size m x n is
     stored.
-
-    **Arguments:**
-
-    - `pointwise_map`: an integer array (m,) with one 0-based vertex of Y per vertex of X, or a `SoftMap`, or
-      a `SparseSoftMap`.
-    - `functions_on_y`: the values of p functions at the vertices of Y (n, p), in any unit.
-
-    **Returns:** The values of the p functions at the vertices of X (m, p), in the same unit.
 
     Entries of a pointwise map are not checked: JAX replaces an index above n - 1 by n - 1, and counts a
     negative index from the end. If a refinement failed, all entries of its map are -1, so check
@@ -176,13 +152,17 @@ def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) 
 class Recovery(eqx.Module):
     """A method that computes a soft map from the distances between two point sets.
 
-    This class is the abstract base class of recoveries. Pass a recovery to the argument `recovery` of
-    `refine_softly` or `WaveletPreservationLayer`. `refine_softly` passes the spectral embeddings of X and Y
-    to the recovery. The m points of X are then the queries, and the n points of Y are the database rows.
-    Ready subclasses are `Softmax`, `NearestFew` and `Sinkhorn`.
+    This class is the abstract base class of recoveries, for the argument `recovery` of `refine_softly` and
+    `WaveletPreservationLayer`. There, the m queries are embedded vertices of X, and the n database rows are
+    embedded vertices of Y. Ready subclasses are `Softmax`, `NearestFew` and `Sinkhorn`. A subclass is an
+    equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
 
-    A subclass is an equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
-    Padded vertices have area zero and must receive share zero.
+    The ready subclasses have a `temperature`, a positive, finite number, by default 0.1. Its unit is the
+    area-weighted mean squared distance from queries to their nearest database rows (`sinkhorn` explains the
+    unit). Lower temperatures give sharper maps.
+
+    **Raises:** The constructors raise `TypeError` if a number is not an integer, and `ValueError` if an
+    argument is not a single positive, finite number.
     """
 
     @abc.abstractmethod
@@ -197,29 +177,19 @@ class Recovery(eqx.Module):
 
         **Arguments:**
 
-        - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same
-          unit.
-        - `query_areas`, `database_areas`: the areas of the points, (m,) and (n,), in any unit.
+        - `queries`, `database`: query points (m, d) and database points (n, d), in the same unit.
+        - `query_areas`, `database_areas`: the areas of the points, (m,) and (n,), in any unit. Padded
+          vertices have area zero.
         """
 
 
-class Softmax(Recovery):
-    """A recovery in which each query gives shares to all database rows, and larger shares to nearer rows.
+class _Tempered(Recovery):
+    """A recovery with a temperature."""
 
-    The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
-    `distance` is the distance between the query and the row. The result is a `SoftMap`, whose `pull_back`
-    transfers functions (n, p) on Y to X (m, p).
-
-    **Arguments:**
-
-    - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
-      0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
-      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper maps.
-
-    **Raises:** `ValueError` if the temperature is not a single positive, finite number.
-    """
-
-    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
+    @property
+    @abc.abstractmethod
+    def temperature(self) -> Float[Array, ""]:
+        """The temperature, in the unit that `Recovery` describes."""
 
     def __check_init__(self) -> None:
         check_between(self, "temperature", self.temperature)
@@ -230,53 +200,52 @@ class Softmax(Recovery):
         database: Float[Array, "n d"],
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
-    ) -> SoftMap:
-        """Return the soft map from the queries to the database; see `Recovery`."""
-        transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
+    ) -> SoftMap | SparseSoftMap:
+        return self.map_from(_normalized(queries, database, query_areas, database_areas, self.temperature))
+
+    @abc.abstractmethod
+    def map_from(self, transport: _Transport) -> SoftMap | SparseSoftMap:
+        """Return the soft map of scaled inputs."""
+
+
+class Softmax(_Tempered):
+    """A recovery in which each query gives shares to all database rows, and larger shares to nearer rows.
+
+    The share of a database row is proportional to its area times `exp(-distance² / temperature)`, where
+    `distance` is the distance between the query and the row; see `Recovery`. The result is a `SoftMap`.
+    """
+
+    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
+
+    def map_from(self, transport: _Transport) -> SoftMap:
         b = transport.database_areas
         unknown, no_iterations = jnp.asarray(jnp.nan, b.dtype), jnp.asarray(0, jnp.int32)
         return transport.soft_map(jnp.zeros_like(b), unknown, jnp.asarray(False), no_iterations)
 
 
-class NearestFew(Recovery):
+class NearestFew(_Tempered):
     """A recovery in which each query gives shares only to its nearest database rows.
 
-    The share of each of the nearest rows is proportional to its area times `exp(-distance² / temperature)`,
-    where `distance` is the distance between the query and the row. The shares are differentiable, but
-    derivatives treat the choice of the rows as constant. The result is a `SparseSoftMap`. Its attributes
-    `rows` and `shares` have shape (m, t), where t is the smaller of `number` and n. On CPUs, `NearestFew` is
-    slow in float64, because sorting then takes most of the time.
+    The shares of these rows are those of `Softmax`. They are differentiable, but derivatives treat the choice
+    of the rows as constant. The result is a `SparseSoftMap`. On CPUs, `NearestFew` is slow in float64,
+    because sorting then takes most of the time.
 
     **Arguments:**
 
     - `number`: the number of database rows per query, an integer of at least 1. If fewer than `number` rows
       have positive area, the remaining shares are zero.
-    - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
-      0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
-      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper maps.
-
-    **Raises:** `TypeError` if `number` is not an integer; `ValueError` if `number` is below 1, or if the
-    temperature is not a single positive, finite number.
+    - `temperature`: see `Recovery`.
     """
 
     number: int = eqx.field(static=True, default=10)
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
 
     def __check_init__(self) -> None:
-        check_between(self, "temperature", self.temperature)
         check_kind("number", self.number, int, np.integer)
         if self.number < 1:
             raise ValueError(f"NearestFew needs at least 1 row, not {self.number}")
 
-    def __call__(
-        self,
-        queries: Float[Array, "m d"],
-        database: Float[Array, "n d"],
-        query_areas: Float[Array, " m"],
-        database_areas: Float[Array, " n"],
-    ) -> SparseSoftMap:
-        """Return the soft map from the queries to the database; see `Recovery`."""
-        transport = _normalized(queries, database, query_areas, database_areas, self.temperature)
+    def map_from(self, transport: _Transport) -> SparseSoftMap:
         queries, database, _, b, temperature = transport
         settled_queries, settled = lax.stop_gradient((queries, database))
         unit = jnp.asarray(1, queries.dtype)
@@ -292,26 +261,16 @@ class NearestFew(Recovery):
         return SparseSoftMap(rows, jax.nn.softmax(exponents + _log(b)[rows], axis=1))
 
 
-class Sinkhorn(Recovery):
+class Sinkhorn(_Tempered):
     """A recovery by entropy-regularised optimal transport, which preserves the areas of database rows.
 
-    The function `sinkhorn` computes the shares. The area that all queries together send to a database row
-    equals the area of the row, up to the tolerance. The result is a `SoftMap`, whose `pull_back` transfers
-    functions (n, p) on Y to X (m, p). If the iterations end before they reach the tolerance, no error is
-    raised. The result is then the map of the last iteration, and its attribute `converged` is False.
+    The function `sinkhorn` computes the `SoftMap`. If the iterations end before they reach the tolerance, no
+    error is raised, and the attribute `converged` of the map is False.
 
     **Arguments:**
 
-    - `temperature`: a positive, finite number. An array is accepted only if it has shape (). The default is
-      0.1. The unit of the temperature is the area-weighted mean squared distance from queries to their
-      nearest database rows (`sinkhorn` explains the unit). Lower temperatures give sharper maps and need more
-      iterations.
-    - `iterations`: the maximum number of iterations of `sinkhorn`, an integer of at least 1.
-    - `tolerance`: a positive number, a share of the total area and therefore without unit. The iterations
-      stop when `SoftMap.residual`, the share of misplaced area, is at most the tolerance.
-
-    **Raises:** `TypeError` if `iterations` is not an integer; `ValueError` if the temperature is not a single
-    positive, finite number, `iterations` is below 1, or `tolerance` is not positive.
+    - `temperature`: see `Recovery`. Lower temperatures need more iterations.
+    - `iterations`, `tolerance`: as in `sinkhorn`.
     """
 
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
@@ -319,7 +278,6 @@ class Sinkhorn(Recovery):
     tolerance: float = eqx.field(static=True, default=0.01)
 
     def __check_init__(self) -> None:
-        check_between(self, "temperature", self.temperature)
         check_kind("iterations", self.iterations, int, np.integer)
         if self.iterations < 1 or not self.tolerance > 0:
             raise ValueError(
@@ -327,23 +285,8 @@ class Sinkhorn(Recovery):
                 f"{self.tolerance}"
             )
 
-    def __call__(
-        self,
-        queries: Float[Array, "m d"],
-        database: Float[Array, "n d"],
-        query_areas: Float[Array, " m"],
-        database_areas: Float[Array, " n"],
-    ) -> SoftMap:
-        """Return the soft map from the queries to the database; see `Recovery`."""
-        return sinkhorn(
-            queries,
-            database,
-            query_areas=query_areas,
-            database_areas=database_areas,
-            temperature=self.temperature,
-            iterations=self.iterations,
-            tolerance=self.tolerance,
-        )
+    def map_from(self, transport: _Transport) -> SoftMap:
+        return _sinkhorn_map(transport, self.iterations, self.tolerance)
 
 
 def sinkhorn(
@@ -361,31 +304,29 @@ def sinkhorn(
     The method is that of Cuturi 2013, "Sinkhorn distances: lightspeed computation of optimal transport". A
     transport plan distributes the areas of the queries over the areas of the database rows. The returned plan
     minimises the mean squared distance minus `temperature` times the entropy of the plan. A nearest-neighbour
-    map can send many queries to one row and no query to another row. In the returned plan, the area that
-    each row receives from all queries equals the row's own area, up to the tolerance.
+    map can send many queries to one row and no query to another row. In the returned plan, the area that each
+    row receives from all queries equals the row's own area, up to the tolerance.
 
     The iterations update the logarithms of Sinkhorn's scaling factors. Each iteration recomputes the
-    distances in blocks of queries, so no array of size m x n is stored. Derivatives through all iterations
-    are also computed without an array of size m x n.
+    distances in blocks of queries, so no array of size m x n is stored, not even for derivatives through all
+    iterations.
 
     **Arguments:**
 
-    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit,
-      which is otherwise arbitrary.
+    - `queries`, `database`: query points (m, d) and database points (n, d) in d dimensions, in the same unit.
     - `query_areas`, `database_areas`: the areas of the points, (m,) and (n,), in any unit. The areas of each
       point set are divided by their sum. Points of zero area send no area, receive no area, and do not affect
       other points.
-    - `temperature`: a positive number, or a positive array of shape (). Its unit is the area-weighted mean
-      squared distance from queries to their nearest database rows. The unit is at least `sqrt(eps)` times the
-      area-weighted variance of the queries, where eps is the machine epsilon of the float type. Lower
-      temperatures give sharper maps and need more iterations. The rounding error of squared distances is eps
-      times the area-weighted variance of the queries. If the temperature is below this error, the error is
-      used as the temperature. In this case, derivatives with respect to the temperature are zero. If the
-      temperature is not positive, the result is NaN.
+    - `temperature`: a positive number. Its unit is the area-weighted mean squared distance from queries to
+      their nearest database rows. The unit is at least `sqrt(eps)` times the area-weighted variance of the
+      queries, where eps is the machine epsilon of the float type. Lower temperatures give sharper maps and
+      need more iterations. If the temperature is below eps times the variance, which is the rounding error of
+      squared distances, this error is the temperature, and derivatives with respect to the temperature are
+      zero. If the temperature is not positive, the result is NaN.
     - `iterations`: the maximum number of iterations, an integer of at least 1. Iterations after convergence
-      are skipped. Under `jax.vmap`, iterations after convergence run but change nothing.
-    - `tolerance`: a positive number, a share of the total area and therefore without unit. The iterations
-      stop when `SoftMap.residual`, the share of misplaced area, is at most the tolerance.
+      are skipped. Under `jax.vmap`, they run but change nothing.
+    - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, the share of misplaced
+      area, is at most the tolerance.
 
     **Returns:** A `SoftMap` from the m queries to the n database rows. If the iterations do not converge, or
     if the result is not finite, no error is raised, but the attribute `converged` of the map is False.
@@ -395,9 +336,7 @@ def sinkhorn(
     if iterations < 1:
         raise ValueError(f"sinkhorn needs at least 1 iteration, not {iterations}")
     arrays = map(jnp.asarray, (queries, database, query_areas, database_areas, temperature))
-    transport = _normalized(*arrays)
-    potentials, residual, done = _sinkhorn_potentials(transport, iterations, tolerance)
-    return transport.soft_map(potentials, residual, residual <= tolerance, done)
+    return _sinkhorn_map(_normalized(*arrays), iterations, tolerance)
 
 
 class _SinkhornState(NamedTuple):
@@ -409,10 +348,7 @@ class _SinkhornState(NamedTuple):
     iterations: Int32[Array, ""]
 
 
-def _sinkhorn_potentials(
-    transport: _Transport, iterations: int, tolerance: float | Float[Array, ""]
-) -> tuple[Float[Array, " n"], Float[Array, ""], Int32[Array, ""]]:
-    """Return the potentials of `sinkhorn`, their residual, and the number of iterations."""
+def _sinkhorn_map(transport: _Transport, iterations: int, tolerance: float | Float[Array, ""]) -> SoftMap:
     queries, database, a, b, temperature = transport
     dtype, (m, d) = queries.dtype, queries.shape
     log_b, rest = _log(b), -m % _BLOCK
@@ -445,7 +381,7 @@ def _sinkhorn_potentials(
     zeros = jnp.zeros_like(b)
     initial = _SinkhornState(zeros, zeros, jnp.asarray(jnp.inf, dtype), jnp.asarray(0, jnp.int32))
     last, _ = lax.scan(step, initial, None, length=iterations)
-    return last.potentials, last.residual, last.iterations
+    return transport.soft_map(last.potentials, last.residual, last.residual <= tolerance, last.iterations)
 
 
 def _log(areas: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -478,7 +414,6 @@ class _Transport(NamedTuple):
         converged: Bool[Array, ""],
         iterations: Int32[Array, ""],
     ) -> SoftMap:
-        """Return the soft map with the given potentials."""
         points, areas = (self.queries, self.database), (self.query_areas, self.database_areas)
         return SoftMap(*points, *areas, potentials, self.temperature, residual, converged, iterations)
 

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.core.checks import check_kind, check_option, counts_iterations
+from jaxsmw.core.functional_map import FunctionalMap
 from jaxsmw.core.refinement import check_spectra, checked, diagnose
 from jaxsmw.core.refiner import Problem, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -21,7 +22,7 @@ from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, Spar
 from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
-Step = Callable[[Float[Array, "k_out k_in"]], tuple[Float[Array, "k_out k_in"], RESULTS]]
+Step = Callable[[FunctionalMap], tuple[FunctionalMap, RESULTS]]
 """A function that takes a functional map, and returns the next functional map and a status code."""
 
 
@@ -30,22 +31,18 @@ class SoftRefinement(eqx.Module):
 
     **Attributes:**
 
-    - `functional_map`: the final functional map C (k_out, k_in), without unit. By default, C is a pullback
-      (k_X, k_Y), which takes functions on Y to functions on X. If the refiner's `convention` is
-      `"pushforward"`, C (k_Y, k_X) takes functions on X to functions on Y. After a failure, C contains NaN or
-      meaningless numbers.
-    - `soft_map`: the soft map from X (m vertices) to Y (n vertices), a `SoftMap` or a `SparseSoftMap`. The
-      recovery computes the soft map from C. The method `pull_back` of the soft map transfers functions (n, p)
-      on Y to X (m, p). The method `pointwise_map` returns an integer array (m,), one 0-based vertex of Y per
-      vertex of X.
-    - `result`: the status code, a member of `RESULTS`. Compare `result` with `RESULTS.successful`.
-      `RESULTS[result]` is a sentence that explains the status.
+    - `functional_map`: the final functional map C (k_out, k_in), without unit, in the refiner's `convention`.
+      By default, C is a pullback (k_X, k_Y), which takes functions on Y to functions on X. After a failure, C
+      contains NaN or meaningless numbers.
+    - `soft_map`: the `SoftMap` or `SparseSoftMap` from X (m vertices) to Y (n vertices) that the recovery
+      computes from C.
+    - `result`: the status code, a member of `RESULTS`. `RESULTS[result]` is a sentence that explains it.
     - `iterations`: the number of functional maps that were computed after the first functional map.
     - `change`: the Frobenius norm of the change of C in the last iteration, divided by the Frobenius norm of
-      C. The change has no unit, and is 0 at a fixed point.
+      C. The change is 0 at a fixed point.
     """
 
-    functional_map: Float[Array, "k_out k_in"]
+    functional_map: FunctionalMap
     soft_map: SoftMap | SparseSoftMap
     result: RESULTS
     iterations: Int32[Array, ""]
@@ -68,9 +65,8 @@ def refine_softly(
     """Refine a map by Algorithm 1 of the MWP paper with soft maps instead of nearest neighbours.
 
     The outcome is differentiable with respect to the spectra, the parameters of the filter bank, the weights
-    and descriptors of the solution, and the temperature of the recovery. If the initial map is a soft map,
-    the outcome is also differentiable with respect to this map. No array of size m x n is stored, not even
-    for derivatives.
+    and descriptors of the solution, the temperature of the recovery, and the initial map if it is a soft map.
+    No array of size m x n is stored, not even for derivatives.
 
     **Arguments:**
 
@@ -79,29 +75,24 @@ def refine_softly(
       same unit of length.
     - `pointwise_map`: the initial map X -> Y: an integer array (m,) with one 0-based vertex of Y per vertex
       of X, or a `SoftMap`, or a `SparseSoftMap`.
-    - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps. The attribute
-      `search` of the refiner has no effect.
-    - `recovery`: the `Recovery` that computes soft maps from functional maps: `Softmax()`, `NearestFew()` or
-      `Sinkhorn()`. At lower temperatures, the results are closer to the results of `jaxsmw.refine`, but the
-      derivatives are larger and less informative.
+    - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps. Its attribute
+      `search` has no effect.
+    - `recovery`: the `Recovery` that computes soft maps from functional maps. At lower temperatures, the
+      results are closer to those of `jaxsmw.refine`, but the derivatives are larger and less informative.
     - `iterations`: the number of functional maps after the first functional map, an integer of at least 1.
       With `"implicit"`, `iterations` is an upper limit.
-    - `differentiation`: how derivatives are computed.
-        - `"unrolled"`: automatic differentiation through all iterations.
-        - `"checkpointed"` (the default): the same derivatives as `"unrolled"`, with less memory. The backward
-          pass computes the intermediate values of each iteration again instead of storing them.
-        - `"implicit"`: the iterations run up to a fixed point C = F(C, θ), where F is one iteration and θ are
-          its parameters. The derivatives follow from the implicit function theorem:
-          `dC = (I - dF/dC)^-1 dF/dθ dθ`. `optimistix.fixed_point` runs the iterations. GMRES solves the
-          linear system in this formula. The system contains only derivatives of one iteration, so the memory
-          does not grow with the number of iterations. The outcome has no derivative with respect to the
-          initial map.
+    - `differentiation`: how derivatives are computed. `"unrolled"` differentiates through all iterations.
+      `"checkpointed"` (the default) gives the same derivatives with less memory: the backward pass computes
+      the intermediate values of each iteration again. `"implicit"` iterates up to a fixed point C = F(C, θ),
+      where F is one iteration and θ are its parameters, by `optimistix.fixed_point`. The derivatives follow
+      from the implicit function theorem, `dC = (I - dF/dC)^-1 dF/dθ dθ`, and GMRES solves this linear system.
+      The memory then does not grow with the number of iterations, and the outcome has no derivative with
+      respect to the initial map.
     - `tolerance`: a positive number, which only `"implicit"` uses. The tolerance limits the error of the
       fixed point, relative to the largest entry of the first functional map. GMRES uses the same tolerance.
 
-    **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in) without unit,
-    `soft_map` (a `SoftMap` or `SparseSoftMap` from X to Y) and `result`. Numerical failures raise no error,
-    so compare `result` with `RESULTS.successful`. If `"implicit"` has too few `iterations`, `result` is
+    **Returns:** A `SoftRefinement`. Numerical failures raise no error, so compare its `result` with
+    `RESULTS.successful`. If `"implicit"` has too few `iterations`, `result` is
     `RESULTS.fixed_point_not_reached`.
 
     **Raises:** `ValueError` if `iterations` is below 1, `tolerance` is not positive, `differentiation` is
@@ -121,11 +112,11 @@ def refine_softly(
     first, result = refiner.update(prepared, pointwise_map, None)
     first_result = checked(first, result)
 
-    def recover(functional_map: Float[Array, "k_out k_in"]) -> SoftMap | SparseSoftMap:
+    def recover(functional_map: FunctionalMap) -> SoftMap | SparseSoftMap:
         points = refiner.embeddings(prepared, State(functional_map))
         return recovery(*points, *_areas(spectrum_x, spectrum_y))
 
-    def step(functional_map: Float[Array, "k_out k_in"]) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+    def step(functional_map: FunctionalMap) -> tuple[FunctionalMap, RESULTS]:
         following, how = refiner.update(prepared, recover(functional_map), State(functional_map))
         return following.functional_map, checked(following, how)
 
@@ -144,11 +135,7 @@ def refine_softly(
 
 
 def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."] | None:
-    """Return the vertices of Y that an initial map contains, or None for a dense soft map.
-
-    **Raises:** `ValueError` if the map has the wrong size; `TypeError` if the argument is neither an array
-    nor a soft map.
-    """
+    """Return the vertices of Y that an initial map contains, or None for a dense soft map."""
     if isinstance(pointwise_map, SoftMap):
         sizes = pointwise_map.queries.shape[0], pointwise_map.database.shape[0]
         if sizes != (m, n):
@@ -171,37 +158,19 @@ def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."]
 class WaveletPreservationLayer(eqx.Module):
     """A neural-network layer that matches two shapes by features of their vertices.
 
-    `layer(features_x, features_y, spectrum_x, spectrum_y)` computes a soft map from the distances between the
-    features of X (m, d) and the features of Y (n, d), in the same unit. The spectra are those of X and Y,
-    each a `Spectrum`, usually of area 1. The layer refines this soft map by `refine_softly` and returns a
-    `SoftRefinement`. The attribute `soft_map` of the result is a `SoftMap` or `SparseSoftMap` from X to Y. By
-    default, the attribute `functional_map` is a pullback (k_X, k_Y), which takes functions on Y to functions
-    on X. If the refiner's `convention` is `"pushforward"`, the functional map (k_Y, k_X) takes functions on X
-    to functions on Y.
-
-    The layer is an equinox module. Its trainable parameters are its array leaves, such as the parameters of
-    the filter bank and the temperatures of both recoveries. Train all parameters, or freeze some of them with
-    `equinox.partition`. The layer is a pure function of arrays, so flax and haiku models can also call it.
+    The layer computes a soft map from the distances between the features of X and Y, and refines it by
+    `refine_softly`. It is an equinox module, whose trainable parameters are its array leaves, such as the
+    parameters of the filter bank and the temperatures of both recoveries. `equinox.partition` can freeze some
+    of them. The layer is a pure function of arrays, so flax and haiku models can also call it.
 
     **Arguments:**
 
-    - `refiner`: a `WaveletPreservation`, which computes functional maps from soft maps.
-    - `recovery_of_features`: the `Recovery` that computes the initial soft map from the features:
-      `Softmax()`, `NearestFew()` or `Sinkhorn()`. The default is `Softmax()`, with temperature 0.1.
-    - `recovery`: the `Recovery` that computes soft maps from functional maps: `Softmax()`, `NearestFew()` or
-      `Sinkhorn()`. The default is `Softmax()`, with temperature 0.1.
-    - `iterations`: the number of functional maps after the first functional map, an integer of at least 1.
-      With `"implicit"`, `iterations` is an upper limit.
-    - `differentiation`: how derivatives are computed. `"unrolled"` differentiates through all iterations.
-      `"checkpointed"` (the default) gives the same derivatives as `"unrolled"` with less memory. `"implicit"`
-      iterates up to a fixed point and uses the implicit function theorem.
-    - `tolerance`: a positive number, the tolerance of the fixed point and of GMRES. Only `"implicit"` uses
-      it.
+    - `recovery_of_features`: the `Recovery` that computes the initial soft map from the features. The default
+      is `Softmax()`.
+    - `refiner`, `recovery`, `iterations`, `differentiation`, `tolerance`: as in `refine_softly`.
 
-    **Raises:** The constructor raises `TypeError` if `recovery_of_features` is not a `Recovery`. A call
-    raises `ValueError` if the features have wrong shapes, `iterations` is below 1, `tolerance` is not
-    positive or `differentiation` is unknown. A call raises `TypeError` if `refiner` is not a
-    `WaveletPreservation` or `recovery` is not a `Recovery`.
+    **Raises:** `TypeError` if `recovery_of_features` is not a `Recovery`. A call raises the errors of
+    `refine_softly`.
     """
 
     refiner: WaveletPreservation = WaveletPreservation()
@@ -221,7 +190,7 @@ class WaveletPreservationLayer(eqx.Module):
         spectrum_x: Spectrum,
         spectrum_y: Spectrum,
     ) -> SoftRefinement:
-        """Match two shapes by the features of their vertices.
+        """Match two shapes by the features of their vertices. Return a `SoftRefinement`.
 
         **Arguments:**
 
@@ -229,11 +198,8 @@ class WaveletPreservationLayer(eqx.Module):
           Corresponding vertices should be close to each other in feature space.
         - `spectrum_x`, `spectrum_y`: the spectra of the source X (m vertices) and the target Y (n vertices).
 
-        **Returns:** A `SoftRefinement`, whose attributes include `functional_map` (k_out, k_in), `soft_map`
-        (a soft map from X to Y) and `result`.
-
         **Raises:** `ValueError` if the features do not have one row per vertex, or if X and Y have different
-        numbers of features. The layer also raises the errors of `refine_softly`.
+        numbers of features, besides the errors of `refine_softly`.
         """
         needed = [(s.mask.shape[0], features_x.shape[-1]) for s in (spectrum_x, spectrum_y)]
         found = [features_x.shape, features_y.shape]
@@ -258,56 +224,42 @@ def _areas(*spectra: Spectrum) -> Iterator[Float[Array, " n"]]:
     return (jnp.where(spectrum.mask, spectrum.vertex_areas, 0) for spectrum in spectra)
 
 
-class _Loop(NamedTuple):
+class _Iterated(NamedTuple):
     """The final functional map, its last change, the status code, and the number of iterations."""
 
-    functional_map: Float[Array, "k_out k_in"]
-    last_change: Float[Array, "k_out k_in"]
+    functional_map: FunctionalMap
+    last_change: FunctionalMap
     result: RESULTS
     iterations: Int32[Array, ""]
 
 
 def _through_iterations(
-    step: Step, first: Float[Array, "k_out k_in"], first_result: RESULTS, iterations: int
-) -> _Loop:
+    step: Step, first: FunctionalMap, first_result: RESULTS, iterations: int
+) -> _Iterated:
     """Run a fixed number of iterations. Derivatives are computed through all iterations."""
 
-    def follow(state: _State, _: None) -> tuple[_State, None]:
-        following, how = step(state.functional_map)
-        result = where(state.result == RESULTS.successful, how, state.result)
-        return _State(state.functional_map, following, result), None
+    def follow(state: tuple[Array, Array, RESULTS], _: None) -> tuple[tuple[Array, Array, RESULTS], None]:
+        current, result = state[1:]
+        following, how = step(current)
+        return (current, following, where(result == RESULTS.successful, how, result)), None
 
-    last, _ = lax.scan(follow, _State(first, first, first_result), None, length=iterations)
-    done = jnp.asarray(iterations, jnp.int32)
-    return _Loop(last.functional_map, last.functional_map - last.previous, last.result, done)
-
-
-class _State(NamedTuple):
-    """The previous and the current functional map, and the status code of the first failure, if any."""
-
-    previous: Float[Array, "k_out k_in"]
-    functional_map: Float[Array, "k_out k_in"]
-    result: RESULTS
+    (previous, last, result), _ = lax.scan(follow, (first, first, first_result), None, length=iterations)
+    return _Iterated(last, last - previous, result, jnp.asarray(iterations, jnp.int32))
 
 
-def _to_the_fixed_point(
-    step: Step, first: Float[Array, "k_out k_in"], iterations: int, tolerance: float
-) -> _Loop:
+def _to_the_fixed_point(step: Step, first: FunctionalMap, iterations: int, tolerance: float) -> _Iterated:
     """Iterate up to the fixed point. Derivatives are computed by the implicit function theorem."""
     last, done, converged = _fixed_point(lambda c: step(c)[0], first, iterations, tolerance)
     # The fixed-point solver returns neither the status code of an update nor the last change of the
     # functional map. One more iteration computes both.
     after, result = step(lax.stop_gradient(last))
     unsettled = (result == RESULTS.successful) & ~converged
-    return _Loop(last, after - last, where(unsettled, RESULTS.fixed_point_not_reached, result), done)
+    return _Iterated(last, after - last, where(unsettled, RESULTS.fixed_point_not_reached, result), done)
 
 
 def _fixed_point(
-    step: Callable[[Float[Array, "k_out k_in"]], Float[Array, "k_out k_in"]],
-    first: Float[Array, "k_out k_in"],
-    iterations: int,
-    tolerance: float,
-) -> tuple[Float[Array, "k_out k_in"], Int32[Array, ""], Bool[Array, ""]]:
+    step: Callable[[FunctionalMap], FunctionalMap], first: FunctionalMap, iterations: int, tolerance: float
+) -> tuple[FunctionalMap, Int32[Array, ""], Bool[Array, ""]]:
     """Return the fixed point of a step, the number of iterations, and whether the iterations converged."""
     # These imports are local because they take as long as the computation of an eigenbasis.
     import lineax as lx
@@ -318,7 +270,7 @@ def _fixed_point(
     # set.
     unit = lax.stop_gradient(jnp.max(jnp.abs(first)))
 
-    def scaled_step(scaled: Float[Array, "k_out k_in"], _: None) -> Float[Array, "k_out k_in"]:
+    def scaled_step(scaled: FunctionalMap, _: None) -> FunctionalMap:
         return (step(scaled.astype(first.dtype) * unit) / unit).astype(float)
 
     solution: optx.Solution = optx.fixed_point(
@@ -335,13 +287,8 @@ def _fixed_point(
 
 
 @jax.custom_jvp
-def _differentiable_if(
-    converged: Bool[Array, ""], functional_map: Float[Array, "k_out k_in"]
-) -> Float[Array, "k_out k_in"]:
-    """Return the functional map, with NaN derivatives if the iterations have not converged.
-
-    The implicit function theorem holds only at fixed points.
-    """
+def _differentiable_if(converged: Bool[Array, ""], functional_map: FunctionalMap) -> FunctionalMap:
+    """Return the functional map, with NaN derivatives unless it is a fixed point."""
     return functional_map
 
 

@@ -18,9 +18,9 @@ class Spectrum(eqx.Module):
     diagonal matrix A contains the vertex areas. The eigenvectors Phi are orthonormal with respect to A:
     `Phi^T A Phi = I`.
 
-    A `Spectrum` describes one shape. For `jax.vmap`, `jaxsmw.stack` stacks the arrays of several shapes along
-    a new leading axis. `stack` pads smaller shapes with masked vertices, which have zero area and zero
-    eigenvectors. Unreferenced vertices (vertices that no face references) are also masked.
+    For `jax.vmap`, `jaxsmw.stack` stacks the arrays of several shapes along a new leading axis, and pads
+    smaller shapes with masked vertices. Unreferenced vertices (vertices that no face references) are also
+    masked. All vertex arrays are zero at masked vertices.
 
     The unit of length is the same in all attributes and otherwise arbitrary. `compute_spectrum` chooses the
     unit in which the area is 1.
@@ -29,18 +29,14 @@ class Spectrum(eqx.Module):
 
     - `eigenvalues`: (k,), ascending, in units of 1 / length².
     - `eigenvectors`: (n, k), in units of 1 / length.
-    - `vertex_areas`: (n,), in units of length², zero for masked vertices.
+    - `vertex_areas`: (n,), in units of length².
     - `mask`: (n,), True for vertices of the surface, False for masked vertices.
-    - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, without unit, zero for
-      masked vertices; or None (the default). Only the refiners `FeatureRegression` and `Registration` use
-      descriptors.
-    - `crease_eigenvectors`: (n, c), without unit, zero for masked vertices; or None (the default). Unlike
-      `eigenvectors`, they depend on how the surface bends; see `jaxsmw.geometry.crease_eigenvectors`. Only
-      the refiner `FeatureRegression` uses crease eigenvectors.
-    - `positions`: (n, 3), vertex positions in units of length, zero for masked vertices; or None (the
-      default). Only the refiner `Registration` uses positions.
-    - `normals`: (n, 3), outward unit normals, zero for masked vertices; or None (the default). Only the
-      refiner `Registration` uses normals.
+    - `descriptors`: (n, d), vertex descriptors that are comparable between shapes, without unit; or None.
+      Only the refiners `FeatureRegression` and `Registration` use descriptors.
+    - `crease_eigenvectors`: (n, c), without unit; or None. Unlike `eigenvectors`, they depend on how the
+      surface bends; see `jaxsmw.geometry.crease_eigenvectors`. Only `FeatureRegression` uses them.
+    - `positions`, `normals`: (n, 3), the vertex positions in units of length, and the outward unit normals;
+      or None. Only `Registration` uses them.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -61,14 +57,7 @@ class Spectrum(eqx.Module):
         )
 
     def scale(self, factor: float) -> Spectrum:
-        """Return the spectrum of the scaled shape.
-
-        Areas are multiplied by `factor`, and lengths are multiplied by the square root of `factor`.
-
-        **Arguments:**
-
-        - `factor`: a positive number.
-        """
+        """Return the spectrum of the shape whose areas are multiplied by a positive `factor`."""
         return dataclasses.replace(
             self,
             eigenvalues=self.eigenvalues / factor,
@@ -78,11 +67,7 @@ class Spectrum(eqx.Module):
         )
 
     def reflect(self) -> Spectrum:
-        """Return the spectrum of the mirror image.
-
-        The first coordinate of each position and of each normal changes its sign. The other attributes are
-        not changed.
-        """
+        """Return the spectrum of the mirror image, which negates the first coordinate of vectors."""
         flip = jnp.array([[-1, 1, 1]])
         return dataclasses.replace(
             self,
@@ -91,7 +76,7 @@ class Spectrum(eqx.Module):
         )
 
     def with_descriptors(self, descriptors: Float[Array, "n d"] | None) -> Spectrum:
-        """Return the spectrum with the given descriptors (n, d), or without descriptors if they are None.
+        """Return the spectrum with the given descriptors (n, d) or None.
 
         **Raises:** `ValueError` if the descriptors do not have one row per vertex.
         """
@@ -99,7 +84,7 @@ class Spectrum(eqx.Module):
         return dataclasses.replace(self, descriptors=descriptors)
 
     def with_crease_eigenvectors(self, crease_eigenvectors: Float[Array, "n c"] | None) -> Spectrum:
-        """Return the spectrum with the given crease eigenvectors (n, c), or without them if they are None.
+        """Return the spectrum with the given crease eigenvectors (n, c) or None.
 
         **Raises:** `ValueError` if the crease eigenvectors do not have one row per vertex.
         """
@@ -107,7 +92,7 @@ class Spectrum(eqx.Module):
         return dataclasses.replace(self, crease_eigenvectors=crease_eigenvectors)
 
     def with_positions(self, positions: Float[Array, "n 3"], normals: Float[Array, "n 3"]) -> Spectrum:
-        """Return the spectrum with the given vertex positions (n, 3) and unit normals (n, 3).
+        """Return the spectrum with the given vertex positions and unit normals.
 
         The positions must have the same unit of length as the vertex areas.
 
@@ -120,7 +105,7 @@ class Spectrum(eqx.Module):
     def pad(self, number_of_vertices: int) -> Spectrum:
         """Return the spectrum with masked vertices appended, so that it has `number_of_vertices` vertices.
 
-        **Raises:** `ValueError` if the shape already has more than `number_of_vertices` vertices.
+        **Raises:** `ValueError` if the shape already has more vertices.
         """
         rows = number_of_vertices - self.mask.shape[0]
         if rows < 0:
@@ -135,25 +120,17 @@ class Spectrum(eqx.Module):
         )
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
-        """Return the spectrum at the given vertices only (the samples). All samples receive the same area.
+        """Return the spectrum at the given vertices only (the samples), which should be evenly spread.
 
-        The areas of the samples sum to the area of the shape. The eigenvectors are not orthonormal on
-        samples, so the pseudo-inverse of the eigenvectors must be computed by least squares.
-
-        **Arguments:**
-
-        - `vertices`: (s,), the indices of the samples, which should be evenly spread over the surface.
+        All samples receive the same area, and their areas sum to the area of the shape. The eigenvectors are
+        not orthonormal on samples, so their pseudo-inverse must be computed by least squares.
         """
         share = jnp.sum(self.vertex_areas) / vertices.shape[0]
         sampled = self._map_vertex_arrays(lambda field: field[vertices])
         return dataclasses.replace(sampled, vertex_areas=jnp.full(vertices.shape, share))
 
     def excluding(self, vertices: Bool[Array, " n"]) -> Spectrum:
-        """Return the spectrum with area zero at the vertices for which the mask (n,) is True.
-
-        The areas of the other vertices are multiplied by a common factor, so that the total area stays the
-        same.
-        """
+        """Return the spectrum with area zero where the mask `vertices` is True, and the same total area."""
         areas = jnp.where(vertices, 0, self.vertex_areas)
         return dataclasses.replace(self, vertex_areas=areas * (jnp.sum(self.vertex_areas) / jnp.sum(areas)))
 

@@ -35,12 +35,10 @@ def nearest_point_on_triangles(
     - `queries`: (m, d), points in d dimensions, in any unit.
     - `points`: (n, d), the corners of the triangles, in the same unit.
     - `faces`: (f, 3), for each triangle the 0-based indices of its corners in `points`.
-    - `face_mask`: (f,), False for triangles that the search ignores. With None (the default), the search uses
-      all triangles. If the search ignores all triangles, the result is meaningless.
+    - `face_mask`: (f,), False for triangles that the search ignores; at least one must be True.
 
-    **Returns:** Two arrays with one row per query. The first array (m,), int32, contains the 0-based row of
-    `faces` with the nearest point. The second array (m, 3) contains the barycentric weights of the triangle's
-    corners, which are not negative and sum to 1.
+    **Returns:** The 0-based row of `faces` with the nearest point (m,), int32, and the barycentric weights of
+    the triangle's corners (m, 3), which are not negative and sum to 1.
     """
     corners = points[faces]
     edges = corners[:, 1:] - corners[:, :1]
@@ -82,13 +80,11 @@ def nearest_point_on_candidates(
 
     **Arguments:**
 
-    - `queries`, `points`, `faces`: (m, d), (n, d) and (f, 3), as in `nearest_point_on_triangles`.
-    - `rows`: (p,), for each candidate the index of its query. Every query needs at least one candidate.
-    - `candidates`: (p,), for each candidate the index of its triangle in `faces`.
+    - `queries`, `points`, `faces`: as in `nearest_point_on_triangles`.
+    - `rows`, `candidates`: (p,), pairs of a query and a triangle in `faces` that is a candidate for it. Every
+      query needs at least one candidate.
 
-    **Returns:** Two arrays with one row per query. The first array (m,), int32, contains the index of the
-    triangle with the nearest point. The second array (m, 3) contains the barycentric weights of this point,
-    which are not negative and sum to 1.
+    **Returns:** As in `nearest_point_on_triangles`.
     """
 
     def compare(pair: tuple[Int[Array, ""], Int[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, " 2"]]:

@@ -18,8 +18,8 @@ from scipy.spatial import KDTree
 
 from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.io.maps import Table
 from jaxsmw.runtime.files import atomic_write
 
@@ -32,15 +32,11 @@ _WEIGHT_TOLERANCE = 1e-4
 class GroundTruth:
     """The ground truth of a pair: the true points on Y of some or all vertices of X.
 
-    `read_ground_truth` reads a ground truth from files. `GroundTruth.of_all_vertices(targets)` creates a
-    ground truth from the true points of all vertices of X.
-
     **Attributes:**
 
     - `source_vertices`: 0-based vertices of X (p,), as int64. A vertex may occur several times or not at all.
-    - `targets`: the true point on Y of each source vertex. The true points are either an int64 array (p,) of
-      0-based vertices of Y, or `SurfacePoints` on Y with p entries. A surface point consists of a triangle
-      and three barycentric weights.
+    - `targets`: the true point on Y of each source vertex, as 0-based vertices of Y (p,) or as
+      `SurfacePoints` on Y with p entries.
 
     **Raises:** `InputError` if the number of source vertices differs from the number of targets.
     """
@@ -57,17 +53,13 @@ class GroundTruth:
 
     @classmethod
     def of_all_vertices(cls, targets: Int64[np.ndarray, " m"] | SurfacePoints) -> GroundTruth:
-        """Return the ground truth in which entry i of `targets` (m,) is the true point of vertex i of X.
-
-        The targets are 0-based vertices of Y or `SurfacePoints` on Y.
-        """
+        """Return the ground truth in which entry i of `targets` (m,) is the true point of vertex i of X."""
         return cls(np.arange(len(targets)), targets)
 
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
         """Extend the ground truth to all vertices of X. Return a map X -> Y (m,), as 0-based vertices of Y.
 
-        A vertex without ground truth receives the target of the nearest vertex that has ground truth.
-        Distances are Euclidean.
+        A vertex without ground truth receives the target of the nearest vertex (Euclidean) that has one.
 
         **Raises:** `InputError` if the targets are `SurfacePoints` and not vertices.
         """
@@ -88,33 +80,28 @@ def read_ground_truth(
 
     The number of files, their suffix and their number of columns determine the format:
 
-    - Two `.vts` files: the first file belongs to the source, and the second file belongs to the target. Each
-      line contains one vertex, counted from 1. The vertices in line i of the two files correspond to each
-      other.
-    - Three `.vts` files: the first two files belong to the source and the target. Line i of the third file
-      contains the line of the second file, counted from 1, that corresponds to line i of the first file.
-    - Two files with other suffixes: the lines have the same meaning as in `.vts` files. Vertices are counted
-      from 1 in `.mat` files, and from 0 in all other files.
+    - Two `.vts` files, of the source and of the target: each line contains one vertex, counted from 1. The
+      vertices in line i of the two files correspond to each other.
+    - Three `.vts` files: line i of the third file contains the line of the second file, counted from 1, that
+      corresponds to line i of the first file.
+    - Two files with other suffixes: the lines have the same meaning. Vertices are counted from 1 in `.mat`
+      files, and from 0 in all other files.
     - One `.baryc_gt` or `.baryc_gt_sym` file: line i contains the true point of the i-th vertex of the
-      source, as a face of the target and three barycentric weights. Faces are counted from 1.
+      source, as a face of the target, counted from 1, and three barycentric weights.
     - One file with two columns: each line contains a vertex of the source and its target vertex, both counted
       from 1.
-    - One file with one column: line i contains the target vertex of the i-th vertex of the source. Target
-      vertices are counted from 0 (from 1 in `.mat` files). `write_pointwise_map` writes this format.
-
-    Files of mirrored ground truth (`.sym.vts`, `.baryc_gt_sym`) have the same formats as files of direct
-    ground truth.
+    - One file with one column: line i contains the target vertex of the i-th vertex of the source, counted
+      from 0 (from 1 in `.mat` files). `write_pointwise_map` writes this format.
 
     **Arguments:**
 
     - `paths`: the path of one file, or a sequence of one to three paths.
     - `mesh_x`, `mesh_y`: the source X and the target Y, each a `Mesh`.
-    - `index_base`: the index of the first vertex and of the first face in the files, 0 or 1. If None (the
-      default), the index base of the format is used, as listed above.
+    - `index_base`: the index of the first vertex and of the first face in the files, 0 or 1; None (the
+      default) for that of the format, as listed above.
 
-    **Returns:** A `GroundTruth`, with the attributes `source_vertices` (p,) and `targets`. The targets are
-    vertices of Y (p,), or `SurfacePoints` with p entries if the file has the format `.baryc_gt`. Vertices of
-    X that no face references are left out, and a `UserWarning` states their number.
+    **Returns:** A `GroundTruth`. Vertices of X that no face references are left out, and a `UserWarning`
+    states their number.
 
     **Raises:** `InputError` if a file cannot be read, has an unknown format or does not fit the meshes. The
     message names the file, the line and the fault.
@@ -192,11 +179,9 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 
     **Arguments:**
 
-    - `path`: the file to create or to replace. The suffix should be `.baryc_gt`, because `read_ground_truth`
-      recognises the format by this suffix.
+    - `path`: the file to create or to replace, with the suffix `.baryc_gt`.
     - `ground_truth`: the ground truth of vertices 0, 1, … of X, with `SurfacePoints` as targets.
-    - `mesh_y`: the target Y, a `Mesh`. Faces are written as their 1-based positions in the mesh file of Y.
-      These positions count all faces of the file, including faces that were dropped when the mesh was read.
+    - `mesh_y`: the target Y, a `Mesh`. Faces are counted as in its file, with faces that were dropped.
 
     **Raises:** `InputError` if the targets are not `SurfacePoints`, if the source vertices are not 0, 1, … in
     this order, or if the file cannot be written.

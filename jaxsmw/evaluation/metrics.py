@@ -11,14 +11,9 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import GroundTruth
-from jaxsmw.geometry.geodesics import (
-    GeodesicMethod,
-    SurfacePoints,
-    check_indices,
-    check_points,
-    geodesic_distances_between,
-)
+from jaxsmw.geometry.geodesics import GeodesicMethod, geodesic_distances_between
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints, check_indices, check_points
 
 # Reports contain, for each of `THRESHOLDS`, the share of points with at most this error. Reported
 # correspondence quality curves end at `LARGEST_THRESHOLD`. Thresholds are in units of the square root of the
@@ -31,12 +26,7 @@ LARGEST_THRESHOLD = 0.25
 class GeodesicError:
     """The geodesic errors of a pointwise map X -> Y, as `geodesic_error` returns them.
 
-    All errors and thresholds are in units of the square root of the area of Y. The property `mean` is the
-    mean of all finite errors, and `median` is the median of all errors. The property `unreachable` is the
-    share of infinite errors. The property `within` is a dictionary from each threshold (0.02, 0.05 and 0.1)
-    to the share of points with at most this error. The methods `correspondence_quality_curve` and
-    `area_under_curve` compute further statistics. The method `as_dictionary` returns the main statistics and
-    the correspondence quality curve as a dictionary for JSON.
+    All errors and thresholds are in units of the square root of the area of Y.
 
     **Attributes:**
 
@@ -57,11 +47,7 @@ class GeodesicError:
 
     @property
     def mean(self) -> float:
-        """The mean of all finite errors; inf if no error is finite.
-
-        An error is infinite if the match and the true point are on different connected components of Y. The
-        mean leaves out infinite errors, whose share is `unreachable`.
-        """
+        """The mean of all finite errors; inf if no error is finite. The others are `unreachable`."""
         reachable = self.errors[np.isfinite(self.errors)]
         return float(reachable.mean()) if len(reachable) else np.inf
 
@@ -88,11 +74,8 @@ class GeodesicError:
     def as_dictionary(self) -> dict[str, Any]:
         """Return the main statistics and the correspondence quality curve as a dictionary for JSON.
 
-        The keys are `mean`, `median`, `within`, `area_under_curve`, `unreachable`, `points` (the number of
-        errors), `method` and `curve`. An infinite mean or median becomes None. `within` is a dictionary from
-        thresholds, as text, to shares of points. `curve` is a dictionary with two lists: `thresholds`
-        contains 251 equally spaced numbers from 0 to 0.25, and `shares` contains the shares of points with at
-        most these errors.
+        An infinite mean or median becomes None. `points` is the number of errors. `curve` contains the lists
+        `thresholds` (251 numbers from 0 to 0.25) and `shares`.
         """
         thresholds = np.linspace(0, LARGEST_THRESHOLD, 251)
         return {
@@ -110,28 +93,15 @@ class GeodesicError:
         }
 
     def correspondence_quality_curve(self, thresholds: ArrayLike) -> Float64[np.ndarray, " t"]:
-        """Return, for each threshold, the share of points with at most this error (Kim et al. 2011).
-
-        **Arguments:**
-
-        - `thresholds`: an array of thresholds (t,) in any order, in units of the square root of the area of
-          Y.
-
-        **Returns:** The shares (t,), in [0, 1].
-        """
+        """Return the share of points with at most this error for each threshold (t,) (Kim et al. 2011)."""
         counts = np.searchsorted(np.sort(self.errors), np.asarray(thresholds), side="right")
         return counts / len(self.errors)
 
     def area_under_curve(self, largest: float = LARGEST_THRESHOLD) -> float:
         """Return the mean height of the correspondence quality curve between the thresholds 0 and `largest`.
 
-        The curve has a step at each error e, so its mean height is exactly the mean of
-        `max(0, 1 - e/largest)` over all errors. The mean height is in [0, 1], and is 1 if all errors are
-        zero.
-
-        **Arguments:**
-
-        - `largest`: the largest threshold, a positive number in units of the square root of the area of Y.
+        The curve has a step at each error e, so its mean height is the mean of `max(0, 1 - e/largest)`. It is
+        in [0, 1], and is 1 if all errors are zero.
 
         **Raises:** `InputError` if `largest` is not positive.
         """
@@ -151,8 +121,7 @@ def geodesic_error(
 ) -> GeodesicError:
     """Compute the geodesic error of each match: the geodesic distance on Y from the match to the true point.
 
-    Distances are divided by the square root of the area of Y (Kim, Lipman and Funkhouser 2011). Errors
-    therefore do not depend on the unit of length or on the size of a shape.
+    Distances are divided by the square root of the area of Y (Kim, Lipman and Funkhouser 2011).
 
     **Arguments:**
 
@@ -168,8 +137,7 @@ def geodesic_error(
       rows are evaluated.
     - `seed`: the seed of the random draw.
 
-    **Returns:** A `GeodesicError` with one error for each evaluated row of the ground truth. Its array
-    `errors` (p,) contains the errors, and its properties `mean` and `median` summarise them.
+    **Returns:** A `GeodesicError` with one error for each evaluated row of the ground truth.
 
     **Raises:** `InputError` if the map or the ground truth contains a vertex or face that Y does not have; if
     the map has no entry for a vertex of X in the ground truth; if the ground truth is empty; if
@@ -199,15 +167,10 @@ def geodesic_error(
 def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
     """Return the coverage of a pointwise map: the share of the area of Y that belongs to matched vertices.
 
-    Each matched vertex of Y contributes its vertex area, which is a third of the area of the triangles around
-    the vertex. The coverage is in [0, 1], and needs no ground truth.
-
     **Arguments:**
 
     - `mesh_y`: the target Y, a `Mesh`.
     - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-
-    **Returns:** The coverage, a float without unit.
 
     **Raises:** `InputError` if an entry of the map is not a vertex of Y.
     """

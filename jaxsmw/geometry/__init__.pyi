@@ -1,7 +1,7 @@
 from .assignment import one_to_one_map
 from .creases import crease_eigenvectors
 from .eigenbasis import compute_spectrum
-from .geodesics import SurfacePoints, geodesic_distances
+from .geodesics import geodesic_distances
 from .mesh import Mesh, diagnose, make_mesh
 from .point_cloud import triangulate_points
 from .sampling import farthest_point_samples
@@ -9,6 +9,7 @@ from .scale import ScaleEstimate, estimate_scale
 from .shortcuts import cut_shortcuts
 from .shot import shot_descriptors
 from .surface_distance import distances_to_surface, nearest_surface_points
+from .surface_points import SurfacePoints
 
 __all__ = [
     "Mesh",

@@ -25,13 +25,7 @@ _NEWTON_STEPS, _AMBIGUOUS = 16, 1e-3
 
 
 class Alignment(NamedTuple):
-    """A rigid motion: a point p moves to `rotation @ p + offset`.
-
-    **Attributes:**
-
-    - `rotation`: a rotation (3, 3) without reflection.
-    - `offset`: a translation (3,), in the unit of the points.
-    """
+    """A rigid motion: a point p moves to `rotation @ p + offset`, without a reflection."""
 
     rotation: Float64[np.ndarray, "3 3"]
     offset: Float64[np.ndarray, " 3"]
@@ -50,21 +44,18 @@ def align_rigidly(
 
     The method of iterative closest points (Besl, McKay, "A method for registration of 3-D shapes", PAMI 1992)
     runs from the identity, from the 24 rotations between the principal axes of both sets, and from the 60
-    rotations of an icosahedron. Each resulting motion is rated by the sum of two mean distances: from x to
-    the nearest points of y, and from y to the nearest points of x. The motion with the smallest sum is
-    chosen.
+    rotations of an icosahedron. The motion with the smallest sum of two mean distances is chosen: from x to
+    the nearest points of y, and from y to the nearest points of x.
 
     The method of iterative closest points hardly slides one nearly round surface along another. If normals
     are given, further iterations therefore minimise the distances to tangent planes (Chen, Medioni, "Object
-    modelling by registration of multiple range images", 1992). The result of these iterations is used only if
-    the shapes fit each other.
+    modelling by registration of multiple range images", 1992). Their result is used only if the shapes fit
+    each other.
 
     **Arguments:**
 
     - `x`, `y`: points (p, 3) and (q, 3), evenly spread over the surfaces, in the same unit.
     - `normals`: unit normals of the surface at y (q, 3), or None.
-
-    **Returns:** The motion from x to y.
     """
     middle_x, middle_y = x.mean(axis=0), y.mean(axis=0)
     tree = KDTree(y)
@@ -133,10 +124,7 @@ def rigid_fit(
     targets: Float64[np.ndarray, "p 3"],
     weights: Float64[np.ndarray, " p"] | None = None,
 ) -> Alignment:
-    """Return the rigid motion of x that minimises the weighted sum of squared distances to the targets.
-
-    With `weights` None (the default), all points have the same weight.
-    """
+    """Return the rigid motion of x that minimises the weighted sum of squared distances to the targets."""
     middle, middle_of_targets = (np.average(points, axis=0, weights=weights) for points in (x, targets))
     pulls = targets - middle_of_targets
     if weights is not None:
@@ -155,8 +143,8 @@ def nearest_rotations(
 
     The maximal trace is the largest root of a polynomial of degree four, which Newton's method finds. The
     rotation then has a closed form (Markley, "Attitude determination using vector observations: a fast
-    optimal matrix algorithm", 1993). This takes a tenth of the time of a singular value decomposition.
-    The decomposition is computed only where the rotation is nearly ambiguous.
+    optimal matrix algorithm", 1993). This takes a tenth of the time of a singular value decomposition, which
+    is computed only where the rotation is nearly ambiguous.
 
     **Returns:** The rotations (n, 3, 3), with determinants 1, and the maximal traces (n,).
     """

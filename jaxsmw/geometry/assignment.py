@@ -21,29 +21,28 @@ def one_to_one_map(
 ) -> Int64[np.ndarray, " m"]:
     """Compute the one-to-one map X -> Y with the least sum of squared distances between matched points.
 
-    Each vertex of X is matched to a different vertex of Y. SciPy computes the exact optimum by shortest
-    augmenting paths (Crouse 2016, "On implementing 2D rectangular assignment algorithms"). The function
-    stores an (m, n) matrix in float64. For two real bodies of 5000 vertices each, the computation takes 15
-    seconds and 0.7 GiB of memory. The computation time grows with the third power of the number of vertices.
+    SciPy computes the exact optimum by shortest augmenting paths (Crouse 2016, "On implementing 2D
+    rectangular assignment algorithms"). The function stores an (m, n) matrix in float64. For two real bodies
+    of 5000 vertices each, the computation takes 15 seconds and 0.7 GiB of memory. The time grows with the
+    third power of the number of vertices.
 
     One-to-one maps suit shapes whose vertices correspond one by one, such as shapes with the same
-    triangulation. On other shapes, several vertices of X often have the same best match, which a one-to-one
-    map can assign to only one of these vertices. On pairs of the remeshed FAUST data set, the restriction to
-    one-to-one maps increases the mean geodesic error from 0.022 to 0.062.
+    triangulation. On pairs of the remeshed FAUST data set, the restriction to one-to-one maps increases the
+    mean geodesic error from 0.022 to 0.062, because several vertices of X often have the same best match.
 
     **Arguments:**
 
-    - `embedding_x`, `embedding_y`: points (m, d) and (n, d) in d dimensions, one per vertex of X and of Y, in
-      the same unit. The map matches vertices whose points are close together.
-    - `mask_x`, `mask_y`: Boolean arrays (m,) and (n,), False for vertices that are not matched. If a mask is
-      None (the default), all vertices are matched.
+    - `embedding_x`, `embedding_y`: points (m, d) and (n, d), one per vertex of X and of Y, in the same unit.
+      The map matches vertices whose points are close together.
+    - `mask_x`, `mask_y`: Boolean arrays (m,) and (n,), False for vertices that are not matched. By default,
+      all vertices are matched.
 
     **Returns:** An integer array (m,): the 0-based vertex of Y for each vertex of X, and -1 for each masked
     vertex of X.
 
-    **Raises:** `InputError` if Y has fewer unmasked vertices than X, or if the product of these two numbers
-    of vertices is above 20 000². `InputError` is also raised if a point of an unmasked vertex is not finite,
-    or if array shapes do not match.
+    **Raises:** `InputError` if Y has fewer unmasked vertices than X, if the product of these two numbers of
+    vertices is above 20 000², if a point of an unmasked vertex is not finite, or if array shapes do not
+    match.
     """
     for points, mask, side in ((embedding_x, mask_x, "x"), (embedding_y, mask_y, "y")):
         if points.ndim != 2:
@@ -79,11 +78,7 @@ def one_to_one_map(
 
 
 def check_one_to_one(vertices_x: int, vertices_y: int) -> None:
-    """Check that `one_to_one_map` can match meshes with these numbers of vertices.
-
-    **Raises:** `InputError` if Y has fewer vertices than X, or if the product of the two numbers is above
-    20 000².
-    """
+    """Raise `InputError` if `one_to_one_map` cannot match meshes with these numbers of vertices."""
     if vertices_x > vertices_y:
         raise InputError(
             f"the {vertices_x} vertices of the source cannot be matched one to one to the {vertices_y} of "

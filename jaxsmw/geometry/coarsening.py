@@ -36,9 +36,8 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
 
     **Arguments:**
 
-    - `stiffness`: the symmetric stiffness matrix (n, n) of one connected component, with an entry for each
-      edge.
-    - `mass`: the mass matrix (n, n).
+    - `stiffness`, `mass`: the symmetric matrices (n, n) of one connected component. The stiffness matrix has
+      an entry for each edge.
     - `dimensions`: the approximate dimension of the subspace, at most about n / 4.
 
     **Raises:** `RuntimeError` if the diagonal of the stiffness matrix is not positive, a vertex has 100 or

@@ -25,23 +25,22 @@ def crease_eigenvectors(mesh: Mesh, number: int) -> Float64[np.ndarray, "n c"]:
     Crease eigenvectors are the eigenvectors of the Laplace–Beltrami operator of another metric. In this
     metric, the squared length of an edge is the sum of its squared length in space and the squared difference
     of the unit normals at its ends, multiplied by 0.07². Lengths are in units of the square root of the area.
-    Distances across creases and strongly curved regions are therefore longer than on the surface. Unlike the
-    usual eigenvectors, crease eigenvectors depend on how the surface bends. They therefore contain further
+    Unlike the usual eigenvectors, crease eigenvectors depend on how the surface bends, and contain further
     information on the place of a vertex on the body. (Hybrid functional maps use a basis of a thin-shell
     energy for this purpose; Bastian, Xie, Navab, Lähner 2024.)
 
-    Crease eigenvectors do not depend on the scale, position and rotation of the mesh. The mirror image of a
-    mesh has the same crease eigenvectors. The sign of each eigenvector is chosen so that its entry of largest
-    absolute value is positive. Results are cached on disk (`jaxsmw.runtime.cache`).
+    Crease eigenvectors do not depend on the scale, position and rotation of the mesh, nor on a reflection.
+    The entry of largest absolute value of each eigenvector is positive. Results are cached on disk
+    (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices, a `Mesh`.
-    - `number`: the number c of eigenvectors, at least 1 and less than the number of referenced vertices. The
-      constant eigenvector counts.
+    - `number`: the number c of eigenvectors, the constant one included, at least 1 and less than the number
+      of referenced vertices.
 
-    **Returns:** The eigenvectors (n, c), without unit, each with mean square 1 in the other metric. The
-    eigenvectors are zero at unreferenced vertices.
+    **Returns:** The eigenvectors (n, c), without unit, each with mean square 1 in the other metric, and zero
+    at unreferenced vertices.
 
     **Raises:** `InputError` if `number` is out of its range, or if the eigenproblem cannot be solved
     accurately.
@@ -66,5 +65,4 @@ def _assemble(mesh: Mesh) -> tuple[sp.csc_matrix, Float64[np.ndarray, " n"]]:
     stiffness = -igl.cotmatrix_intrinsic(lengths, mesh.faces).tocsc()
     halves = np.abs(lengths - lengths.sum(axis=1, keepdims=True) / 2)
     areas = np.sqrt(halves.prod(axis=1) * lengths.sum(axis=1) / 2)  # Heron's formula
-    shares = np.repeat(areas / areas.sum() / 3, 3)
-    return stiffness, np.bincount(mesh.faces.ravel(), shares, len(mesh.vertices))
+    return stiffness, mesh.sum_at_vertices(areas / areas.sum() / 3)

@@ -47,42 +47,36 @@ def compute_spectrum(
     The mesh is scaled to area 1, so the unit of length has no effect. The computation uses float64 on the CPU
     and fixed random seeds, so the same mesh gives the same spectrum. The sign of each eigenvector is chosen
     so that its entry of largest absolute value is positive. The eigenpairs of each connected component are
-    computed separately and then merged.
+    computed separately and then merged. Results are cached on disk (`jaxsmw.runtime.cache`).
 
     The exact solver is a shift-invert Lanczos method. The number of eigenvalues, the residuals and the
     orthonormality are checked. If the Lanczos method fails, ARPACK computes the eigenpairs.
 
     The approximate solver is the Rayleigh–Ritz method in a smooth subspace of far fewer dimensions
-    (`jaxsmw.geometry.coarsening`). The approximate eigenvectors are also orthonormal, up to rounding errors.
-    The computation time of the approximate solver is nearly proportional to the number of vertices. The
-    approximate solver requires triangles of similar size and shape. If the sizes or shapes of the triangles
-    differ too much, the function issues a `RuntimeWarning` and uses the exact solver. Results are cached on
-    disk (`jaxsmw.runtime.cache`).
+    (`jaxsmw.geometry.coarsening`). Its time is nearly proportional to the number of vertices. Its
+    eigenvectors are also orthonormal. If the sizes or shapes of the triangles differ too much, the function
+    issues a `RuntimeWarning` and uses the exact solver.
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices, a `Mesh`.
     - `number_of_eigenvectors`: the number k of eigenvectors, at least 1 and less than the number of
       referenced vertices.
-    - `laplacian`: the discretization of the Laplacian.
-        - `"cotangent"`: linear finite elements with barycentric vertex areas.
-        - `"robust"`: the tufted intrinsic Delaunay Laplacian (Sharp and Crane 2020), which also handles
-          non-manifold and badly shaped meshes.
-        - `"auto"`: robust if a triangle is degenerate or an edge has more than two faces, else cotangent.
-    - `eigensolver`: the solver of the eigenproblem.
-        - `"exact"`: the exact solver.
-        - `"approximate"`: the approximate solver. Connected components with fewer than 400 vertices, or fewer
-          than 30 vertices per eigenvector, are still solved exactly.
-        - `"auto"`: approximate if the mesh has at least 50 000 referenced vertices, else exact.
+    - `laplacian`: the discretization of the Laplacian. `"cotangent"` means linear finite elements with
+      barycentric vertex areas. `"robust"` is the tufted intrinsic Delaunay Laplacian (Sharp and Crane 2020),
+      which also handles non-manifold and badly shaped meshes. `"auto"` is robust if a triangle is degenerate
+      or an edge has more than two faces, else cotangent.
+    - `eigensolver`: `"exact"`, `"approximate"`, or `"auto"`, which is approximate if the mesh has at least 50
+      000 referenced vertices. Connected components with fewer than 400 vertices, or fewer than 30 vertices
+      per eigenvector, are always solved exactly.
 
-    **Returns:** A `Spectrum` with eigenvalues (k,), eigenvectors (n, k), vertex areas (n,), positions (n, 3)
-    and normals (n, 3), in units in which the area of the surface is 1. The spectrum has no descriptors. The
-    float type is JAX's default (float32 unless `jax_enable_x64` is set). Unreferenced vertices are masked.
+    **Returns:** A `Spectrum` with positions and normals, without descriptors, in units in which the area is
+    1. The float type is JAX's default (float32 unless `jax_enable_x64` is set). Unreferenced vertices are
+    masked.
 
-    **Raises:** `InputError` if k is not an integer, is less than 1, or is not less than the number of
-    referenced vertices. `InputError` is also raised if the Laplacian or the eigensolver is unknown, if faces
-    without area make the cotangent Laplacian undefined, or if the eigenproblem cannot be solved accurately.
-    `TypeError` if `mesh` is not a `Mesh`.
+    **Raises:** `InputError` if k is not an integer in its range, if the Laplacian or the eigensolver is
+    unknown, if faces without area make the cotangent Laplacian undefined, or if the eigenproblem cannot be
+    solved accurately. `TypeError` if `mesh` is not a `Mesh`.
     """
     pairs = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
     return as_spectrum(mesh, *pairs)
@@ -113,9 +107,7 @@ def eigenpairs(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"], Float64[np.ndarray, " n"]]:
-    """Compute the eigenpairs and the vertex areas of a mesh as NumPy arrays in float64.
-
-    The arguments and the errors are those of `compute_spectrum`.
+    """Compute the eigenpairs and the vertex areas of a mesh in float64; see `compute_spectrum`.
 
     **Returns:** Eigenvalues (k,), eigenvectors (n, k) and vertex areas (n,), in units in which the area is 1.
     """
@@ -143,7 +135,7 @@ def check_number_of_eigenvectors(mesh: Mesh, number: int) -> None:
     """Refuse a number that `compute_spectrum` would refuse."""
     if not isinstance(number, int | np.integer):
         raise InputError(f"{mesh.name}: the number of eigenvectors is {number!r}: give an integer.")
-    referenced = int(mesh.referenced_vertices.sum())
+    referenced = len(mesh.used_vertices)
     if not 1 <= number < referenced:
         raise InputError(
             f"{mesh.name}: cannot compute {number} eigenvectors from {referenced} referenced vertices: "
@@ -160,29 +152,23 @@ def solve_on_surface(
 ) -> tuple[Float64[np.ndarray, " k"], Float64[np.ndarray, "n k"]]:
     """Compute the k smallest eigenpairs of a stiffness matrix (n, n) and vertex areas (n,) of a mesh.
 
-    The conventions and the errors are those of `compute_spectrum`. The unit is the unit of the areas.
+    The unit is the unit of the areas. The rest is as in `compute_spectrum`.
     """
-    referenced = np.flatnonzero(mesh.referenced_vertices)
-    if all_referenced := len(referenced) == len(areas):
-        local = stiffness, areas
-    else:
-        local = stiffness[referenced][:, referenced], areas[referenced]
+    used = mesh.used_vertices
+    if len(used) < len(areas):
+        stiffness, areas = stiffness[used][:, used], areas[used]
     with one_blas_thread():
-        values, vectors = _solve(*local, number, eigensolver, mesh.name)
+        values, vectors = _solve(stiffness, areas, number, eigensolver, mesh.name)
     # Signs are changed in place, because another copy of the eigenvectors of a large mesh may not fit into
     # memory.
     for column in vectors.T:
         column *= np.sign(column[np.argmax(np.abs(column))])
-    if not all_referenced:
-        eigenvectors = np.zeros((len(areas), number))
-        eigenvectors[referenced] = vectors
-        vectors = eigenvectors
-    return values, vectors
+    return values, mesh.spread(vectors)
 
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
     """Choose the eigensolver that `"auto"` stands for if the spectra of the meshes will be compared."""
-    most = max(int(mesh.referenced_vertices.sum()) for mesh in meshes)
+    most = max(len(mesh.used_vertices) for mesh in meshes)
     return "exact" if most < APPROXIMATE_FROM else "approximate"
 
 

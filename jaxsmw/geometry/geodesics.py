@@ -1,20 +1,19 @@
 """Geodesic distances on piecewise flat surfaces, accurate even for short distances.
 
-Maps are evaluated by the distances between matches and true points. These distances are often short. For
-short distances, the heat method has errors of several percent. Exact window propagation takes about 100 times
-as long as the method of this module.
+Maps are evaluated by the distances between matches and true points, which are often short. There, the heat
+method has errors of several percent, and exact window propagation takes about 100 times as long as this
+module.
 
 This module runs Dijkstra's algorithm on a graph of mesh edges and of straight lines across faces. Strips of
 triangles around each vertex are unfolded into the plane. If a straight line within a strip joins two
 vertices, the graph contains an edge with the length of this line. Paths in this graph are paths on the
-surface, so computed distances are never too short. On meshes of bodies, computed distances are too long by
-0.03 to 0.07 % on average.
+surface, so computed distances are never too short. On meshes of bodies, they are too long by 0.03 to 0.07 %
+on average.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -26,7 +25,9 @@ from scipy.sparse import csgraph, csr_array
 
 from jaxsmw.choices import GeodesicMethod
 from jaxsmw.errors import InputError, check_choice
+from jaxsmw.geometry.arrays import ranges, ratio, sides_of
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints, check_points
 from jaxsmw.runtime.cache import cached
 
 # A straight line of the graph may cross at most this number of edges of the mesh.
@@ -44,44 +45,6 @@ _RADII = (0.01, 0.05, 0.25)
 
 # libigl may never finish if the height of a triangle is less than this fraction of its longest edge.
 _EXACT_HEIGHT = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class SurfacePoints:
-    """Points on the faces of a mesh, given by barycentric weights.
-
-    `len(points)` is the number p of points, and `points[rows]` selects points by 0-based indices. The
-    constructor checks nothing. Functions that receive `SurfacePoints` check them.
-
-    **Attributes:**
-
-    - `faces`: the face of each point, as 0-based indices (p,) into `Mesh.faces`, int64.
-    - `weights`: the barycentric weights (p, 3) of the three corners of the face, in the order of the corners,
-      float64. The weights are at least 0, and each row sums to 1.
-    """
-
-    faces: Int64[np.ndarray, " p"]
-    weights: Float64[np.ndarray, "p 3"]
-
-    def __len__(self) -> int:
-        return len(self.faces)
-
-    def __getitem__(self, rows: Int[np.ndarray, " q"]) -> SurfacePoints:
-        return SurfacePoints(self.faces[rows], self.weights[rows])
-
-    def positions(self, mesh: Mesh) -> Float64[np.ndarray, "p 3"]:
-        """Return the positions (p, 3) of the points in space, in the unit of their mesh."""
-        return self.interpolate(mesh.vertices, mesh)
-
-    def interpolate(self, values: Float64[np.ndarray, "n x"], mesh: Mesh) -> Float64[np.ndarray, "p x"]:
-        """Return the values at the points (p, x), given the values at the n vertices of the mesh."""
-        return np.einsum("pk,pkx->px", self.weights, values[mesh.faces[self.faces]])
-
-    def nearest_corners(self, mesh: Mesh) -> Int64[np.ndarray, " p"]:
-        """Return for each point the nearest corner of its face, as an array of vertices (p,)."""
-        corners = mesh.faces[self.faces]
-        distances = np.linalg.norm(mesh.vertices[corners] - self.positions(mesh)[:, None], axis=2)
-        return corners[np.arange(len(corners)), distances.argmin(axis=1)]
 
 
 class _Sides(NamedTuple):
@@ -106,30 +69,24 @@ class _Sides(NamedTuple):
 def _sides(mesh: Mesh) -> _Sides:
     n, f = len(mesh.vertices), len(mesh.faces)
     triangles = np.concatenate([mesh.faces, mesh.faces[:, ::-1]])
-    tail, head, apex = (np.roll(triangles, -k, axis=1).ravel() for k in range(3))
+    tail, head, apex = sides_of(triangles)
     along = mesh.vertices[head] - mesh.vertices[tail]
     to_apex = mesh.vertices[apex] - mesh.vertices[tail]
     length = np.linalg.norm(along, axis=1)
     # For a side of length zero, `direction` and `shape` are zero. No line crosses such a side.
-    direction = np.divide(along, length[:, None], out=np.zeros_like(along), where=length[:, None] > 0)
+    direction = ratio(along, length[:, None])
     x, y = np.sum(direction * to_apex, axis=1), np.linalg.norm(np.cross(direction, to_apex), axis=1)
-    shape = np.divide(x + 1j * y, length, out=np.zeros(6 * f, complex), where=length > 0)
+    shape = ratio(x + 1j * y, length)
 
     order = np.argsort(tail * n + head, kind="stable")
     keys = (tail * n + head)[order]
     start = np.searchsorted(keys, head * n + tail)
     count = np.searchsorted(keys, head * n + tail, side="right") - start
-    leaving, position = _ranges(start, count)
+    leaving, position = ranges(start, count)
     across = order[position]
     to_other_face = leaving // 3 % f != across // 3 % f
     first = np.concatenate([[0], np.cumsum(np.bincount(leaving[to_other_face], minlength=6 * f))])
     return _Sides(tail, head, apex, length, shape, first, across[to_other_face])
-
-
-def _ranges(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs (i, start[i] + j) with 0 <= j < count[i], as two arrays."""
-    row = np.repeat(np.arange(len(count)), count)
-    return row, np.arange(len(row)) + np.repeat(start - (np.cumsum(count) - count), count)
 
 
 class _Beams(NamedTuple):
@@ -171,7 +128,7 @@ def _unfold(
     beams = _Beams(origin, side, right, left, right, left)
     for _ in range(depth):
         start = sides.first[beams.side]
-        beam, entry = _ranges(start, sides.first[beams.side + 1] - start)
+        beam, entry = ranges(start, sides.first[beams.side + 1] - start)
         beams = beams.at(beam)._replace(side=sides.across[entry])
         corner = beams.left + sides.shape[beams.side] * (beams.right - beams.left)
         yield beams, corner
@@ -200,6 +157,22 @@ class _Lines(NamedTuple):
     ends: Int[np.ndarray, " l"]
     lengths: Float64[np.ndarray, " l"]
 
+    def distances(
+        self,
+        to_vertices: Float64[np.ndarray, "s n"],
+        sources: Int64[np.ndarray, " q"],
+        points: Int64[np.ndarray, " q"],
+    ) -> Float64[np.ndarray, " q"]:
+        """Return the distances from `sources[i]` to the origin `points[i]`, given those to all vertices.
+
+        The origins must be ascending. A path ends with a line to one of them, in the opposite direction.
+        """
+        start = np.searchsorted(self.origins, points)
+        counts = np.searchsorted(self.origins, points, side="right") - start
+        pair, line = ranges(start, counts)
+        lengths = to_vertices[sources[pair], self.ends[line]] + self.lengths[line]
+        return np.minimum.reduceat(lengths, np.cumsum(counts) - counts)
+
 
 def _lines(sides: _Sides, origin: np.ndarray, side: np.ndarray, position: np.ndarray, depth: int) -> _Lines:
     """Return straight lines from the given points to vertices. Each line crosses at most `depth` sides."""
@@ -226,28 +199,24 @@ def geodesic_graph(mesh: Mesh, *, depth: int = _DEPTH) -> csr_array:
     """Return the graph of the edges of a mesh and of straight lines through strips of triangles.
 
     Graphs are cached on disk (`jaxsmw.runtime.cache`). The four most recently used graphs are also kept in
-    memory.
+    memory. All callers share a matrix and must not change it.
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices. Boundaries, several connected components and non-manifold edges are
-        allowed.
-    - `depth`: the maximum number of edges that a straight line may cross, at least 1. On meshes of bodies,
-        the shortest paths in a graph of depth 6 are too long by 0.1 to 0.2 % on average. The shortest paths
-        in a graph of depth 10 are too long by 0.03 to 0.07 % on average. Searches in a graph of depth 10 take
-        1.4 times as long as in a graph of depth 6.
+      allowed.
+    - `depth`: the maximum number of edges that a straight line may cross, at least 1. In a graph of depth 6,
+      the shortest paths on bodies are too long by 0.1 to 0.2 % on average, and searches take 0.7 of the time.
 
     **Returns:** The lengths of the edges and lines as a sparse symmetric matrix (n, n), in the unit of the
-    mesh. A stored zero is the length of a line between two vertices at the same position. All callers share
-    the matrix and must not change it.
+    mesh. A stored zero is the length of a line between two vertices at the same position.
     """
     n, s = len(mesh.vertices), 3 * len(mesh.faces)
 
     def build() -> dict[str, np.ndarray]:
         sides = _sides(mesh)
         smaller, larger = mesh.edges.T
-        edge_lengths = np.linalg.norm(mesh.vertices[larger] - mesh.vertices[smaller], axis=1)
-        lines = [_Lines(smaller, larger, edge_lengths)]
+        lines = [_Lines(smaller, larger, mesh.lengths(mesh.edges))]
         # Lines start only in the original triangles, because the mirrored triangles would give the same lines
         # again.
         for start in range(0, s, _SIDES_AT_ONCE):
@@ -277,15 +246,13 @@ def geodesic_distances(
 
     - `mesh`: the surface with n vertices.
     - `sources`: the s sources, as 0-based vertex indices (s,) or as `SurfacePoints`. The result contains s
-        times n numbers, so split a large number of sources into several calls. For distances between given
-        pairs of points, use `geodesic_distances_between`.
-    - `method`: `"strips"` or `"exact"`. `"strips"` is Dijkstra's algorithm on a graph of edges and straight
-        lines across faces. On meshes of bodies, distances computed with `"strips"` are too long by 0.03 to
-        0.07 % on average. `"exact"` propagates windows (Mitchell, Mount and Papadimitriou 1987, implemented
-        in libigl). `"exact"` works only between vertices of manifold meshes, and takes about 100 times as
-        long as `"strips"`.
+      times n numbers, so split a large number of sources into several calls.
+    - `method`: `"strips"` is Dijkstra's algorithm on a graph of edges and straight lines across faces. On
+      meshes of bodies, its distances are too long by 0.03 to 0.07 % on average. `"exact"` propagates windows
+      (Mitchell, Mount and Papadimitriou 1987, implemented in libigl). It works only between vertices of
+      manifold meshes, and takes about 100 times as long.
     - `limit`: the largest distance of interest, in the unit of the mesh. Larger distances become inf. With
-        `"strips"`, a limit reduces the computation time.
+      `"strips"`, a limit reduces the computation time.
 
     **Returns:** Distances (s, n), float64, in the unit of the mesh. A distance is inf if no path connects the
     source and the vertex, or if the distance is above the limit.
@@ -314,25 +281,14 @@ def geodesic_distances_between(
     *,
     method: GeodesicMethod = "strips",
 ) -> Float64[np.ndarray, " p"]:
-    """Compute the geodesic distance between the two points of each given pair.
+    """Compute the geodesic distance (p,) between `points[i]` and `partners[i]` of each pair i.
 
-    Pair i consists of `points[i]` and `partners[i]`. The search starts from `points` or from `partners`,
-    whichever has fewer distinct points. The radius of the search grows in steps. If the two points of each
-    pair are close together, the function is much faster than `geodesic_distances`. The function never stores
-    all p times n distances.
+    The search starts from `points` or from `partners`, whichever has fewer distinct points. Its radius grows
+    in steps, so the function is much faster than `geodesic_distances` if partners are close together, and it
+    never stores all p times n distances. Otherwise, both functions agree.
 
-    **Arguments:**
-
-    - `mesh`: the surface with n vertices.
-    - `points`, `partners`: p points each, as 0-based vertex indices (p,) or as `SurfacePoints`.
-    - `method`: `"strips"` or `"exact"`; see `geodesic_distances`.
-
-    **Returns:** Distances (p,), one for each of the p pairs, in the unit of the mesh. A distance is inf if no
-    path connects the two points.
-
-    **Raises:** `InputError` for points that are not on the mesh, an unknown method, or different numbers of
-    points and partners. With `"exact"`, `InputError` is also raised for `SurfacePoints`, and for meshes with
-    non-manifold edges, non-manifold vertices or faces of almost zero height.
+    **Raises:** The errors of `geodesic_distances`, and `InputError` for different numbers of points and
+    partners.
     """
     check_choice(method, GeodesicMethod, "a method for geodesic distances")
     starts, ends = check_points(points, mesh, "points"), check_points(partners, mesh, "partners")
@@ -355,7 +311,7 @@ def geodesic_distances_between(
     if isinstance(starts, SurfacePoints) and isinstance(ends, SurfacePoints):
         distances = _straight_distances(mesh, starts, ends)
     graph, nodes = _network(mesh, starts)
-    arrivals = _arrivals(mesh, ends)
+    arrivals = _lines_from(mesh, ends)
     at_once = max(1, _DISTANCES_AT_ONCE // graph.shape[0])
     pending = np.argsort(nodes, kind="stable")
     for radius in [*(np.sqrt(mesh.area) * np.array(_RADII)), np.inf]:
@@ -412,52 +368,25 @@ def _network(
     if not isinstance(points, SurfacePoints):
         return graph, points
     coordinates = graph.tocoo()
-    number, vertices, lengths = _lines_from_points(mesh, points)
+    added = _lines_from(mesh, points)
     lines = (
         _Lines(coordinates.row, coordinates.col, coordinates.data),
-        _Lines(size + number, vertices, lengths),
+        added._replace(origins=size + added.origins),
     )
     return _shortest(lines, size + len(points)), size + np.arange(len(points))
 
 
-def _lines_from_points(mesh: Mesh, points: SurfacePoints) -> _Lines:
-    """Return straight lines from points on faces to vertices; an origin is the number of a point."""
+def _lines_from(mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints) -> _Lines:
+    """Return straight lines from points to vertices, with the numbers of the points as origins, ascending."""
+    if not isinstance(points, SurfacePoints):
+        return _Lines(np.arange(len(points)), points, np.zeros(len(points)))
     corners, sides = mesh.faces[points.faces], _sides(mesh)
     offsets = mesh.vertices[corners] - points.positions(mesh)[:, None]
     number = np.repeat(np.arange(len(points)), 3)
     near = _Lines(number, corners.ravel(), np.linalg.norm(offsets, axis=2).ravel())
     far = _lines(sides, *_exits(sides, points), _DEPTH)
-    return _Lines(*(np.concatenate(part) for part in zip(near, far, strict=True)))
-
-
-class _Arrivals(NamedTuple):
-    """The last lines of paths to points: those of point i are numbered `first[i]` to `first[i + 1] - 1`."""
-
-    first: Int64[np.ndarray, " p1"]
-    vertices: Int64[np.ndarray, " l"]
-    lengths: Float64[np.ndarray, " l"]
-
-    def distances(
-        self,
-        to_vertices: Float64[np.ndarray, "s n"],
-        sources: Int64[np.ndarray, " q"],
-        points: Int64[np.ndarray, " q"],
-    ) -> Float64[np.ndarray, " q"]:
-        """Return the distances from `sources[i]` to `points[i]`, given those to all vertices (s, n)."""
-        counts = self.first[points + 1] - self.first[points]
-        pair, line = _ranges(self.first[points], counts)
-        lengths = to_vertices[sources[pair], self.vertices[line]] + self.lengths[line]
-        return np.minimum.reduceat(lengths, np.cumsum(counts) - counts)
-
-
-def _arrivals(mesh: Mesh, points: Int64[np.ndarray, " p"] | SurfacePoints) -> _Arrivals:
-    """Return the last lines of the paths to points; a vertex is reached from itself by a line of length 0."""
-    if not isinstance(points, SurfacePoints):
-        return _Arrivals(np.arange(len(points) + 1), points, np.zeros(len(points)))
-    number, vertices, lengths = _lines_from_points(mesh, points)
-    order = np.argsort(number, kind="stable")
-    first = np.searchsorted(number[order], np.arange(len(points) + 1))
-    return _Arrivals(first, vertices[order], lengths[order])
+    order = np.argsort(np.concatenate([near.origins, far.origins]), kind="stable")
+    return _Lines(*(np.concatenate(part)[order] for part in zip(near, far, strict=True)))
 
 
 def _exact_search(mesh: Mesh) -> Callable[[np.int64, np.ndarray], np.ndarray]:
@@ -495,64 +424,3 @@ def _vertices(points: Int64[np.ndarray, " p"] | SurfacePoints) -> Int64[np.ndarr
             "method='strips'."
         )
     return points
-
-
-def check_points(
-    points: ArrayLike | SurfacePoints, mesh: Mesh, name: str
-) -> Int64[np.ndarray, " p"] | SurfacePoints:
-    """Check that points belong to a mesh.
-
-    **Arguments:**
-
-    - `points`: vertex indices (p,) or `SurfacePoints`.
-    - `mesh`: the mesh.
-    - `name`: the name of the points in error messages.
-
-    **Returns:** The points, with indices as int64.
-
-    **Raises:** `InputError` if a vertex or face does not exist, or barycentric weights are negative or do not
-    sum to 1.
-    """
-    if not isinstance(points, SurfacePoints):
-        return check_indices(points, len(mesh.vertices), f"{name} on {mesh.name}: vertex")
-    return check_surface_points(points, mesh, name)
-
-
-def check_surface_points(points: SurfacePoints, mesh: Mesh, name: str) -> SurfacePoints:
-    """Check that `SurfacePoints` belong to a mesh; see `check_points`."""
-    faces = check_indices(points.faces, len(mesh.faces), f"{name} on {mesh.name}: face")
-    with np.errstate(invalid="ignore"):  # comparisons with NaN are false
-        good = (points.weights >= 0).all(axis=1) & (np.abs(points.weights.sum(axis=1) - 1) < 1e-6)
-    if not good.all():
-        at = int(good.argmin())
-        raise InputError(
-            f"{name} on {mesh.name}: number {at} has the barycentric weights {points.weights[at].tolist()}, "
-            "which must be at least 0 and sum to 1: correct the weights, or divide them by their sum."
-        )
-    return SurfacePoints(faces, points.weights)
-
-
-def check_indices(values: ArrayLike, count: int, name: str) -> Int64[np.ndarray, " p"]:
-    """Check that values are indices (p,) from 0 to `count` - 1. Return them as int64.
-
-    `name` is the text before the word "indices" in error messages, such as "vertex".
-
-    **Raises:** `InputError` if the values are not a list of integers in this range, or if some values are
-    masked.
-    """
-    if np.ma.is_masked(values):
-        raise InputError(f"{name} indices are masked in part: fill in or remove the masked indices.")
-    indices = np.asarray(values)
-    if indices.ndim != 1 or indices.dtype.kind not in "iu":
-        raise InputError(
-            f"{name} indices must be a list of integers, but are {indices.dtype.name} of shape "
-            f"{indices.shape}: give one index for each point."
-        )
-    outside = (indices < 0) | (indices >= count)
-    if outside.any():
-        at = int(outside.argmax())
-        cure = "subtract 1, because they seem to count from 1" if indices.max() == count else "correct it"
-        raise InputError(
-            f"{name} indices must lie between 0 and {count - 1}, but entry {at} is {indices[at]}: {cure}."
-        )
-    return indices.astype(np.int64)

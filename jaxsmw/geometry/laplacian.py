@@ -25,11 +25,6 @@ def assemble_laplacian(
 ) -> tuple[sp.csc_matrix, Float64[np.ndarray, " n"]]:
     """Assemble the stiffness matrix W and the lumped vertex areas A of the problem `W phi = lambda A phi`.
 
-    **Arguments:**
-
-    - `mesh`: the surface with n vertices.
-    - `laplacian`: the discretization; see `jaxsmw.geometry.compute_spectrum`.
-
     **Returns:** The dimensionless matrix W (n, n), which is symmetric and positive semi-definite, and the
     areas A (n,), in the squared unit of the mesh. Both are zero at unreferenced vertices.
 
@@ -39,26 +34,21 @@ def assemble_laplacian(
         laplacian = choose_laplacian(mesh)
     if laplacian == "robust":
         # The package robust_laplacian requires that every vertex belongs to a face.
-        referenced = np.flatnonzero(mesh.referenced_vertices)
-        compact = np.full(len(mesh.vertices), -1)
-        compact[referenced] = np.arange(len(referenced))
-        local_stiffness, mass = robust_laplacian.mesh_laplacian(
-            np.ascontiguousarray(mesh.vertices[referenced]), np.ascontiguousarray(compact[mesh.faces])
-        )
+        stiffness, mass = robust_laplacian.mesh_laplacian(*mesh.compact())
         masses = mass.diagonal()
-        if not np.isfinite(local_stiffness.data).all() or not (masses > 0).all():
+        if not np.isfinite(stiffness.data).all() or not (masses > 0).all():
             raise InputError(
                 f"{mesh.name}: the robust Laplacian contains NaN, or a vertex has no positive area: remesh "
                 "the surface, or remove the triangles without area."
             )
+        used = mesh.used_vertices
         scatter = sp.csc_matrix(
-            (np.ones(len(referenced)), (referenced, np.arange(len(referenced)))),
-            shape=(len(mesh.vertices), len(referenced)),
+            (np.ones(len(used)), (used, np.arange(len(used)))), (len(mesh.vertices), len(used))
         )
-        return (scatter @ local_stiffness @ scatter.T).tocsc(), scatter @ masses
+        return (scatter @ stiffness @ scatter.T).tocsc(), mesh.spread(masses)
     stiffness = -igl.cotmatrix(mesh.vertices, mesh.faces).tocsc()
     areas = mesh.vertex_areas
-    if not np.isfinite(stiffness.data).all() or (areas[mesh.referenced_vertices] <= 0).any():
+    if not np.isfinite(stiffness.data).all() or (areas[mesh.used_vertices] <= 0).any():
         raise InputError(
             f"{mesh.name}: the cotangent Laplacian is undefined on zero-area faces: use the robust Laplacian "
             "(laplacian='robust', on the command line --laplacian robust)."

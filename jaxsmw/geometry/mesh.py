@@ -16,6 +16,7 @@ from scipy.sparse import coo_array, csgraph
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.arrays import first_equal_rows, ranges, sides_of
 from jaxsmw.geometry.scans import between_neighbors, in_small_components, lost_vertices
 from jaxsmw.wording import count_of
 
@@ -46,24 +47,21 @@ _ROUNDING = 0.01
 class Mesh:
     """A triangle mesh whose vertices have the same order as in the file or in the given array.
 
-    Vertex i of the mesh is always vertex i of the file, because cleaning drops only faces. A vertex without
-    faces keeps its number, and its entry in `referenced_vertices` is False.
-
-    Use `read_mesh` or `make_mesh` to make a `Mesh`, because the constructor does not check or clean its
-    input. Properties such as `area`, `vertex_areas` (n,), `vertex_normals` (n, 3) and `edges` (e, 2) are
-    computed when they are first used.
+    Cleaning drops only faces. A vertex without faces keeps its number, and its entry in `referenced_vertices`
+    is False. Use `read_mesh` or `make_mesh` to make a `Mesh`, because the constructor does not check or clean
+    its input. All properties are computed when they are first used. Lengths and areas are in the unit of the
+    vertices.
 
     **Attributes:**
 
     - `vertices`: positions (n, 3), float64, in the unit of the file.
     - `faces`: vertex indices (f, 3), int64, 0-based.
-    - `name`: the name of the mesh in messages. The name of a mesh from a file is the file's path.
-    - `notes`: a tuple of sentences about changes made by cleaning, and about unusual elements such as
-      unreferenced vertices.
-    - `dropped_faces`: the faces of the file that cleaning dropped, as ascending 0-based indices (d,).
-      In ground-truth files, face numbers refer to all faces of the mesh file, including dropped faces.
-    - `small_faces`: the faces of small components (g, 3), which are among the dropped faces. Small components
-      take no part in a match, but move with their surroundings; see `make_mesh`.
+    - `name`: the name of the mesh in messages, which is the path of a mesh from a file.
+    - `notes`: sentences about changes made by cleaning, and about unusual elements such as unreferenced
+      vertices.
+    - `dropped_faces`: the faces of the file that cleaning dropped, as ascending 0-based indices (d,). In
+      ground-truth files, face numbers refer to all faces of the mesh file, including dropped faces.
+    - `small_faces`: the faces of small components (g, 3), which are among the dropped faces; see `make_mesh`.
     """
 
     vertices: Float64[np.ndarray, "n 3"]
@@ -76,8 +74,7 @@ class Mesh:
     def mirrored(self) -> Mesh:
         """Return the mirror image of the mesh: all x coordinates change sign.
 
-        Vertices and faces keep their numbers. The corners of each face are reversed, so that normals that
-        point outward still point outward.
+        The corners of each face are reversed, so that normals that point outward still point outward.
         """
         return replace(
             self,
@@ -93,36 +90,29 @@ class Mesh:
 
     @cached_property
     def area_vectors(self) -> Float64[np.ndarray, "f 3"]:
-        """The normals of the faces (f, 3). The length of each normal is twice the area of its face."""
+        """The normals of the faces (f, 3), each with a length of twice the area of its face."""
         corners = self.vertices[self.faces]
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
     @cached_property
     def face_areas(self) -> Float64[np.ndarray, " f"]:
-        """The areas of the faces (f,), in the squared unit of the vertices."""
+        """The areas of the faces (f,)."""
         return 0.5 * np.linalg.norm(self.area_vectors, axis=1)
 
     @cached_property
     def area(self) -> float:
-        """The total surface area, in the squared unit of the vertices."""
+        """The total surface area."""
         return float(self.face_areas.sum())
 
     @cached_property
     def vertex_areas(self) -> Float64[np.ndarray, " n"]:
-        """The vertex areas (n,), in the squared unit of the vertices.
-
-        The area of a vertex is a third of the total area of the faces around the vertex. Unreferenced
-        vertices have area 0.
-        """
-        return self._sum_at_vertices(self.face_areas / 3)
+        """The vertex areas (n,): a third of the total area of the faces around each vertex."""
+        return self.sum_at_vertices(self.face_areas / 3)
 
     def average(
         self, values: Float[np.ndarray, "n ..."] | Bool[np.ndarray, " n"]
     ) -> Float[np.ndarray, " ..."] | np.floating:
-        """Return the area-weighted mean of values at the vertices (n, ...), in the unit of the values.
-
-        The mean of a mask is the share of the area in which the mask is True.
-        """
+        """Return the area-weighted mean of values at the vertices (n, ...), or the share of a mask's area."""
         return np.average(values, axis=0, weights=self.vertex_areas)
 
     @cached_property
@@ -131,7 +121,7 @@ class Mesh:
 
         The normal is 0 where the normals of the faces cancel, and at vertices without faces.
         """
-        total = np.stack([self._sum_at_vertices(component) for component in self.area_vectors.T], axis=1)
+        total = np.stack([self.sum_at_vertices(component) for component in self.area_vectors.T], axis=1)
         length = np.linalg.norm(total, axis=1, keepdims=True)
         # If the normals of the faces do not cancel, `length` is about six times the vertex area.
         defined = length > 1e-10 * 6 * self.vertex_areas[:, None]
@@ -140,7 +130,7 @@ class Mesh:
     @cached_property
     def is_inside_out(self) -> bool:
         """Whether the normals point inward: True if the enclosed signed volume is negative."""
-        corners = self.vertices[self.faces] - self.vertices[self.referenced_vertices].mean(axis=0)
+        corners = self.vertices[self.faces] - self.middle
         return bool(np.linalg.det(corners).sum() < 0)
 
     @cached_property
@@ -149,6 +139,29 @@ class Mesh:
         referenced = np.zeros(len(self.vertices), dtype=bool)
         referenced[self.faces] = True
         return referenced
+
+    @cached_property
+    def used_vertices(self) -> Int64[np.ndarray, " u"]:
+        """The indices of the referenced vertices (u,), ascending."""
+        return np.flatnonzero(self.referenced_vertices)
+
+    @cached_property
+    def middle(self) -> Float64[np.ndarray, " 3"]:
+        """The mean position of the referenced vertices (3,)."""
+        return self.vertices[self.used_vertices].mean(axis=0)
+
+    def compact(self) -> tuple[Float64[np.ndarray, "u 3"], Int64[np.ndarray, "f 3"]]:
+        """Return the positions of the `used_vertices`, and the faces as rows of these positions."""
+        number = np.cumsum(self.referenced_vertices) - 1
+        return self.vertices[self.used_vertices], number[self.faces]
+
+    def spread(self, rows: Shaped[np.ndarray, "u ..."]) -> Shaped[np.ndarray, "n ..."]:
+        """Return the rows of the `used_vertices` as rows of all vertices, with zeros at the others."""
+        if len(rows) == len(self.vertices):
+            return rows
+        everywhere = np.zeros((len(self.vertices), *rows.shape[1:]), rows.dtype)
+        everywhere[self.used_vertices] = rows
+        return everywhere
 
     @cached_property
     def degenerate_faces(self) -> Bool[np.ndarray, " f"]:
@@ -166,10 +179,21 @@ class Mesh:
         """The edges (e, 2) in lexicographic order. The lower vertex index of each edge is first."""
         return self._edge_table.edges
 
+    def lengths(self, edges: Int64[np.ndarray, "b 2"]) -> Float64[np.ndarray, " b"]:
+        """Return the lengths of edges, given as pairs of vertices."""
+        return np.linalg.norm(np.diff(self.vertices[edges], axis=1)[:, 0], axis=1)
+
     @cached_property
     def boundary_edges(self) -> Int64[np.ndarray, "b 2"]:
         """The edges with exactly one face, (b, 2)."""
         return self.edges[self._edge_table.faces == 1]
+
+    @cached_property
+    def boundary_vertices(self) -> Bool[np.ndarray, " n"]:
+        """A mask (n,), True for the ends of boundary edges."""
+        at_boundary = np.zeros(len(self.vertices), dtype=bool)
+        at_boundary[self.boundary_edges] = True
+        return at_boundary
 
     @cached_property
     def nonmanifold_edges(self) -> Int64[np.ndarray, "b 2"]:
@@ -178,10 +202,7 @@ class Mesh:
 
     @cached_property
     def misoriented_edges(self) -> Int64[np.ndarray, "b 2"]:
-        """The edges whose two faces have opposite orientations, (b, 2).
-
-        Both faces traverse such an edge in the same direction.
-        """
+        """The edges that both of their two faces traverse in the same direction, (b, 2)."""
         return self.edges[(self._edge_table.faces == 2) & (self._edge_table.balance != 0)]
 
     @cached_property
@@ -196,7 +217,7 @@ class Mesh:
     def _edge_table(self) -> _EdgeTable:
         """The edges, their numbers of faces, and how many more faces traverse them one way than the other."""
         n = len(self.vertices)
-        tail, head = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
+        tail, head, _ = sides_of(self.faces)
         key = np.minimum(tail, head) * n + np.maximum(tail, head)
         key, edge_of_side, faces = np.unique(key, return_inverse=True, return_counts=True)
         balance = np.bincount(edge_of_side, weights=np.sign(head - tail))
@@ -205,20 +226,15 @@ class Mesh:
     def faces_around(
         self, vertices: Int64[np.ndarray, " q"]
     ) -> tuple[Int64[np.ndarray, " p"], Int64[np.ndarray, " p"]]:
-        """Return all faces around each given vertex.
-
-        **Returns:** Two arrays (p,) with one entry per pair of a given vertex and a face around it. The first
-        array contains indices into `vertices`, and the second array contains indices of faces.
-        """
+        """Return all pairs of a given vertex and a face around it: rows of `vertices` (p,) and faces (p,)."""
         faces = np.argsort(self.faces.ravel(), kind="stable") // 3
         counts = np.bincount(self.faces.ravel(), minlength=len(self.vertices))
-        number = counts[vertices]
-        rows = np.repeat(np.arange(len(vertices)), number)
         first = np.cumsum(counts) - counts
-        position = np.arange(len(rows)) - np.repeat(np.cumsum(number) - number, number)
-        return rows, faces[first[vertices][rows] + position]
+        rows, position = ranges(first[vertices], counts[vertices])
+        return rows, faces[position]
 
-    def _sum_at_vertices(self, per_face: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, " n"]:
+    def sum_at_vertices(self, per_face: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, " n"]:
+        """Return the sums of values of faces (f,) over the faces around each vertex (n,)."""
         return np.bincount(self.faces.ravel(), weights=np.repeat(per_face, 3), minlength=len(self.vertices))
 
 
@@ -228,24 +244,33 @@ class _EdgeTable(NamedTuple):
     balance: Float64[np.ndarray, " e"]
 
 
+# The attribute of `Diagnosis` for each kind of unusual element, and its name, place and meaning in words.
+_UNUSUAL = (
+    ("unreferenced_vertices", "unreferenced vertex", " (in no face)", "never chosen as a match"),
+    ("boundary_edges", "boundary edge", " in {}", "the surface ends there"),
+    ("nonmanifold_edges", "non-manifold edge", " (more than two faces)", "sheets of surface meet there"),
+    ("nonmanifold_vertices", "non-manifold vertex", "", "sheets of surface touch in a single point there"),
+    ("misoriented_edges", "edge", " between faces of opposite orientation", "normals are unreliable there"),
+    ("degenerate_faces", "degenerate triangle", " without area", "corners coincide or lie on a line"),
+)
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """The result of `diagnose`, which counts all unusual elements of a mesh, such as boundary edges.
 
-    An unusual element is not necessarily an error. `str` of a `Diagnosis` explains the counts in sentences,
-    one per line.
+    An unusual element is not necessarily an error. `str` explains the counts in sentences, one per line.
 
     **Attributes:**
 
     - `vertices`, `faces`: the numbers of vertices and of faces.
-    - `components`: the number of connected components. Unreferenced vertices are not counted.
+    - `components`: the number of connected components, without unreferenced vertices.
     - `unreferenced_vertices`: the number of vertices that no face references.
     - `boundary_edges`: the number of edges with exactly one face.
     - `boundary_loops`: the number of connected chains that the boundary edges form.
     - `nonmanifold_edges`: the number of edges with more than two faces.
     - `nonmanifold_vertices`: the number of vertices whose faces form several fans that share no edge.
-    - `misoriented_edges`: the number of edges whose two faces have opposite orientations. A consistently
-      oriented mesh has no such edges.
+    - `misoriented_edges`: the number of edges whose two faces have opposite orientations.
     - `degenerate_faces`: the number of triangles whose height is at most 1e-10 of their longest edge.
     """
 
@@ -262,17 +287,14 @@ class Diagnosis:
 
     def sentences(self) -> tuple[str, ...]:
         """Return a sentence about the size of the mesh, and one for each kind of unusual element."""
-        return self._size(), *(f"{number}: {meaning}." for number, meaning in self._unusual().values())
+        return self._size(), *(f"{number}: {meaning}." for number, meaning in self._unusual())
 
     def brief_sentences(self) -> tuple[str, ...]:
-        """Return a sentence about the size of the mesh, and one that counts all unusual elements.
+        """Return a sentence about the size of the mesh, and one that counts its unusual elements, if any.
 
-        The second sentence leaves out unreferenced vertices, because the notes of a mesh report them. If the
-        mesh has no unusual elements besides unreferenced vertices, only the first sentence is returned.
+        Unreferenced vertices do not count, because the notes of a mesh report them.
         """
-        unusual = self._unusual()
-        unusual.pop("unreferenced vertices", None)
-        numbers = ", ".join(number for number, _ in unusual.values())
+        numbers = ", ".join(number for number, _ in replace(self, unreferenced_vertices=0)._unusual())
         return (self._size(), f"Unusual elements: {numbers}.") if numbers else (self._size(),)
 
     def _size(self) -> str:
@@ -282,57 +304,22 @@ class Diagnosis:
             f"{'open' if self.boundary_edges else 'closed'}."
         )
 
-    def _unusual(self) -> dict[str, tuple[str, str]]:
-        """For each kind of unusual element that occurs, return the count and the meaning, both as text."""
+    def _unusual(self) -> list[tuple[str, str]]:
+        """Return the count and the meaning, both as text, of each kind of unusual element that occurs."""
         loops = count_of(self.boundary_loops, "loop")
-        found = {
-            "unreferenced vertices": (
-                self.unreferenced_vertices,
-                f"{count_of(self.unreferenced_vertices, 'unreferenced vertex')} (in no face)",
-                "never chosen as a match",
-            ),
-            "boundary edges": (
-                self.boundary_edges,
-                f"{count_of(self.boundary_edges, 'boundary edge')} in {loops}",
-                "the surface ends there",
-            ),
-            "non-manifold edges": (
-                self.nonmanifold_edges,
-                f"{count_of(self.nonmanifold_edges, 'non-manifold edge')} (more than two faces)",
-                "sheets of surface meet there",
-            ),
-            "non-manifold vertices": (
-                self.nonmanifold_vertices,
-                count_of(self.nonmanifold_vertices, "non-manifold vertex"),
-                "sheets of surface touch in a single point there",
-            ),
-            "misoriented edges": (
-                self.misoriented_edges,
-                f"{count_of(self.misoriented_edges, 'edge')} between faces of opposite orientation",
-                "normals are unreliable there",
-            ),
-            "degenerate triangles": (
-                self.degenerate_faces,
-                f"{count_of(self.degenerate_faces, 'degenerate triangle')} without area",
-                "corners coincide or lie on a line",
-            ),
-        }
-        return {kind: (number, meaning) for kind, (count, number, meaning) in found.items() if count}
+        return [
+            (count_of(count, name) + place.format(loops), meaning)
+            for attribute, name, place, meaning in _UNUSUAL
+            if (count := getattr(self, attribute))
+        ]
 
     def __str__(self) -> str:
         return "\n".join(self.sentences())
 
 
 def diagnose(mesh: Mesh) -> Diagnosis:
-    """Count all unusual elements of a mesh, such as boundary edges and degenerate triangles.
-
-    **Arguments:**
-
-    - `mesh`: a `Mesh` from `read_mesh` or `make_mesh`.
-
-    **Returns:** A `Diagnosis`, whose `str` explains the counts in sentences, one per line.
-    """
-    unreferenced = int((~mesh.referenced_vertices).sum())
+    """Count all unusual elements of a mesh, such as boundary edges and degenerate triangles."""
+    unreferenced = len(mesh.vertices) - len(mesh.used_vertices)
     boundary_chain = connected_components(mesh.boundary_edges, len(mesh.vertices))[1]
     return Diagnosis(
         vertices=len(mesh.vertices),
@@ -352,6 +339,11 @@ def connected_components(edges: Int64[np.ndarray, "e 2"], n: int) -> tuple[int, 
     """Return the number of components of a graph with n vertices, and each vertex's component (n,)."""
     graph = coo_array((np.ones(len(edges), dtype=bool), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return csgraph.connected_components(graph, directed=False)
+
+
+def components_of_faces(faces: Int64[np.ndarray, "f 3"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
+    """Return what `connected_components` returns, for the edges of faces."""
+    return connected_components(np.concatenate([faces[:, :2], faces[:, 1:]]), n)
 
 
 def extend_to_unreferenced(mesh_x: Mesh, matches: Shaped[np.ndarray, "m ..."]) -> Shaped[np.ndarray, "m ..."]:
@@ -381,50 +373,43 @@ def make_mesh(
 ) -> Mesh:
     """Make a mesh from vertices and faces, or from a mesh of another library, after checks and cleaning.
 
-    The function drops two kinds of faces: faces that repeat a vertex, and faces with the same three vertices
-    as an earlier face. Vertices are never dropped or renumbered.
+    The function drops faces that repeat a vertex, and faces with the same three vertices as an earlier face.
+    Vertices are never dropped or renumbered.
 
     Scans may contain vertices without a usable position, and small components such as dust. A vertex is lost
     if its position is not finite or is very far away. If at most one vertex in 1000 is lost, the faces of
-    lost vertices are dropped. Each lost vertex is moved to the mean of its usable neighbours. A lost vertex
-    without usable neighbours is moved to the mean of all usable vertices. If more than one vertex in 1000 is
-    lost, no vertex is moved, and the checks under "Raises" apply to the lost vertices. Vertices without
-    faces do not count: they are always moved if their position is not finite. If one component has
-    at least half of the area, the faces of components with less than 1 % of the area are dropped. For closed
-    components, such as enclosed bubbles, the limit is 5 %. Vertices that lose all their faces become
-    unreferenced. The vertices of small components are matched by `jaxsmw.transfer.match_small_components`.
-    All other unreferenced vertices receive the match of the nearest vertex.
+    lost vertices are dropped, and each lost vertex is moved to the mean of its usable neighbours, or of all
+    usable vertices. Otherwise, the checks under "Raises" apply to the lost vertices. Vertices without faces
+    do not count: they are always moved if their position is not finite. If one component has at least half of
+    the area, the faces of components with less than 1 % of the area are dropped. For closed components, such
+    as enclosed bubbles, the limit is 5 %. The vertices of these small components become unreferenced, and
+    `jaxsmw.transfer.match_small_components` matches them. All other unreferenced vertices receive the match
+    of the nearest vertex.
 
     **Arguments:**
 
     - `vertices`: positions (n, 3) of any integer or float type, in any unit. The array is copied. If `faces`
-        is None, `vertices` is a mesh of another library in one of these forms:
-        - an object with `vertices` and `faces`, as in trimesh, pyFM and geomfum;
-        - an object with `points` and `faces`, such as a `PolyData` of PyVista;
-        - a tuple of vertices and faces, as in potpourri3d.
-    - `faces`: vertex indices (f, 3), 0-based, as integers of any type, or as floats with integer values. The
-        array is copied.
+      is None, `vertices` is a mesh of another library: an object with `vertices` and `faces` (trimesh, pyFM,
+      geomfum), an object with `points` and `faces` (a `PolyData` of PyVista), or a tuple of both
+      (potpourri3d).
+    - `faces`: vertex indices (f, 3), 0-based, as integers or as floats with integer values. The array is
+      copied.
     - `name`: the name of the mesh in messages.
     - `weld`: whether to merge vertices at the same position. If True, faces use only the lowest-numbered
-        vertex at each position, and the other vertices at this position become unreferenced. Welding closes
-        seams along which some programs duplicate vertices. Vertices at the boundary are also merged if
-        rounding can explain their distance, which is then at most 1 % of the shortest edge at both.
+      vertex at each position, and the others become unreferenced. Welding closes seams along which some
+      programs duplicate vertices. Vertices at the boundary are also merged if rounding can explain their
+      distance, which is then at most 1 % of the shortest edge at both.
     - `notes`: sentences to which this function appends its own notes.
 
-    **Returns:**
-
-    A `Mesh` with the attributes `vertices` (n, 3), float64, and `faces` (f, 3), int64. The `notes` of the
-    mesh report how many faces were dropped, and how many faces welding changed. The notes also report lost
+    **Returns:** A `Mesh`. Its `notes` report how many faces were dropped or changed by welding, lost
     vertices, ignored small components, vertices that appear to be duplicated along a seam, and unreferenced
     vertices.
 
-    **Raises:**
-
-    `InputError` if an array has a wrong shape or type, a coordinate is not finite, or an index is out of
-    range. `InputError` is also raised if there are no faces, all faces are degenerate, or an object is not a
-    triangle mesh. `InputError` is also raised if the extent of the mesh is below 1e-60 or above 1e60.
-    `InputError` is also raised if a vertex is more than 1e12 median edge lengths from the origin, or if a
-    vertex of a face is more than 1e6 median edge lengths from the middle of the mesh.
+    **Raises:** `InputError` if an array has a wrong shape or type, a coordinate is not finite, an index is
+    out of range, there are no faces, all faces are degenerate, or an object is not a triangle mesh.
+    `InputError` is also raised if the extent of the mesh is below 1e-60 or above 1e60, if a vertex is more
+    than 1e12 median edge lengths from the origin, or if a vertex of a face is more than 1e6 median edge
+    lengths from the middle of the mesh.
     """
     if faces is None:
         vertices, faces = _parts(vertices, name)
@@ -469,9 +454,7 @@ def make_mesh(
         )
     _check_resolution(mesh)
     component = connected_components(mesh.edges, len(position))[1][mesh.faces[:, 0]]
-    on_boundary = np.zeros(len(position), bool)
-    on_boundary[mesh.boundary_edges] = True
-    at_boundary = np.asarray(on_boundary[mesh.faces].any(axis=1))
+    at_boundary = np.asarray(mesh.boundary_vertices[mesh.faces].any(axis=1))
     small, count = in_small_components(component, mesh.face_areas, at_boundary)
     if count:
         notes.append(
@@ -484,10 +467,7 @@ def make_mesh(
 
 
 def as_mesh(mesh: Mesh | MeshLike, name: str) -> Mesh:
-    """Return a `Mesh` unchanged, and any other mesh as a `Mesh` with the given name.
-
-    **Raises:** `InputError` if `make_mesh` refuses the mesh.
-    """
+    """Return a `Mesh` unchanged, and any other mesh as the result of `make_mesh`."""
     return mesh if isinstance(mesh, Mesh) else make_mesh(mesh, name=name)
 
 
@@ -515,8 +495,7 @@ def _unusual_vertices(mesh: Mesh) -> list[str]:
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
             "surface should be closed there, weld it (`weld=True`, on the command line `--weld`)."
         )
-    unreferenced = int((~mesh.referenced_vertices).sum())
-    if unreferenced:
+    if unreferenced := len(mesh.vertices) - len(mesh.used_vertices):
         notes.append(
             f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) among {len(mesh.vertices)} "
             "vertices."
@@ -543,13 +522,12 @@ def check_extent(position: Float64[np.ndarray, "n 3"], name: str) -> None:
 
 def _check_resolution(mesh: Mesh) -> None:
     """Refuse a mesh with a vertex so far away that rounding errors are comparable to edge lengths."""
-    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
+    lengths = mesh.lengths(mesh.edges)
     median = np.median(lengths[lengths > 0])
-    referenced = np.flatnonzero(mesh.referenced_vertices)
-    middle = np.median(mesh.vertices[referenced], axis=0)
+    middle = np.median(mesh.vertices[mesh.used_vertices], axis=0)
     for vertices, center, limit, place in (
         (np.arange(len(mesh.vertices)), 0, LARGEST_COORDINATE, "origin"),
-        (referenced, middle, LARGEST_DISTANCE, "middle of the mesh"),
+        (mesh.used_vertices, middle, LARGEST_DISTANCE, "middle of the mesh"),
     ):
         distances = np.abs(mesh.vertices[vertices] - center).max(axis=1) / median
         if distances.max() > limit:
@@ -646,19 +624,8 @@ def _split_vertices(mesh: Mesh) -> tuple[Int64[np.ndarray, "b 2"], Bool[np.ndarr
     if not len(boundary):
         return np.empty((0, 2), np.int64), np.empty(0, bool)
     shortest = np.full(len(mesh.vertices), np.inf)
-    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
+    lengths = mesh.lengths(mesh.edges)
     np.minimum.at(shortest, mesh.edges, lengths[:, None])
     distance, nearest = KDTree(mesh.vertices[boundary]).query(mesh.vertices[boundary], k=2)
     pairs = np.stack([boundary, boundary[nearest[:, 1]]], axis=1)
     return pairs, distance[:, 1] <= _ROUNDING * shortest[pairs].min(axis=1)
-
-
-def first_equal_rows(rows: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """For each row of an array (n, 3), return the index of the first equal row, as an array (n,)."""
-    order = np.lexsort(rows.T)  # a stable sort: equal rows keep their order
-    sorted_rows = rows[order]
-    starts = np.ones(len(rows), dtype=bool)
-    starts[1:] = (sorted_rows[1:] != sorted_rows[:-1]).any(axis=1)
-    lowest = np.empty(len(rows), dtype=np.int64)
-    lowest[order] = order[starts][np.cumsum(starts) - 1]
-    return lowest

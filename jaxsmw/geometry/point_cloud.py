@@ -1,9 +1,8 @@
 """Surfaces of point clouds: triangle meshes whose vertices are the given points.
 
-After triangulation, a point cloud is a mesh, so all methods for meshes can be applied. The tetrahedra of the
-Delaunay triangulation of the points are labelled inside or outside, and the surface consists of the triangles
-between inside and outside tetrahedra. Unlike triangulations in tangent planes, this method separates sheets
-that nearly touch, and orients the surface consistently.
+The tetrahedra of the Delaunay triangulation of the points are labelled inside or outside, and the surface
+consists of the triangles between inside and outside tetrahedra. Unlike triangulations in tangent planes, this
+method separates sheets that nearly touch, and orients the surface consistently.
 """
 
 from __future__ import annotations
@@ -20,7 +19,8 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, check_extent, first_equal_rows, make_mesh, numeric_rows
+from jaxsmw.geometry.arrays import first_equal_rows
+from jaxsmw.geometry.mesh import Mesh, check_extent, make_mesh, numeric_rows
 from jaxsmw.geometry.scans import usable_positions
 from jaxsmw.wording import count_of
 
@@ -63,32 +63,31 @@ def triangulate_points(
 
     The function labels the tetrahedra of the Delaunay triangulation as inside or outside, with the weights of
     Kolluri, Shewchuk, O'Brien, "Spectral surface reconstruction from noisy point clouds", SGP 2004. Adjacent
-    tetrahedra whose circumspheres overlap deeply are likely to have the same label. Each point has two
-    poles, which are vertices of its Voronoi cell: the farthest vertex on each side of the surface. The
-    tetrahedra of the two poles are likely to have opposite labels. The labels are real numbers that minimise
-    a weighted sum of squared violations of these two conditions. Tetrahedra far from the points are labelled
-    outside in advance. The function solves a linear system, whereas the paper solves an eigenvalue problem.
+    tetrahedra whose circumspheres overlap deeply are likely to have the same label. Each point has two poles,
+    which are vertices of its Voronoi cell: the farthest vertex on each side of the surface. The tetrahedra of
+    the two poles are likely to have opposite labels. The labels are real numbers that minimise a weighted sum
+    of squared violations of these two conditions. Tetrahedra far from the points are labelled outside in
+    advance. The function solves a linear system, whereas the paper solves an eigenvalue problem.
 
     Triangles whose edges are much longer than the distances between neighbouring points are dropped, so open
-    surfaces stay open. Points that the surface does not use, such as outliers, are unreferenced vertices. If
-    several points have the same position, only the first of them is used. Points that are not finite, or are
-    very far from the other points, have no triangles.
+    surfaces stay open. These points are unreferenced vertices: outliers that the surface does not use, later
+    points at the position of another point, and points that are not finite or very far from the others.
 
     **Arguments:**
 
     - `points`: positions (n, 3) in any unit, on the surface of a solid body. The points may be noisy and have
       holes.
     - `normals`: the normals of the points (n, 3), of any length and either sign, or None. Normals help to
-        find the poles where the surface is thin.
+      find the poles where the surface is thin.
     - `name`: the name of the point cloud in messages.
     - `notes`: sentences that precede the notes of the mesh.
 
-    **Returns:** A `Mesh` with the n points as vertices, in the same unit. Its normals point outward. Its
+    **Returns:** A `Mesh` with the n points as vertices, in the same unit, whose normals point outward. Its
     `notes` say how many triangles join the points.
 
-    **Raises:** `InputError` if an array has a wrong shape or type, or if there are fewer than 20 different
-    points. `InputError` is also raised if the extent of the points is below 1e-60 or above 1e60, or if fewer
-    than half of the points lie on the surface of a body.
+    **Raises:** `InputError` if an array has a wrong shape or type, if there are fewer than 20 different
+    points, if the extent of the points is below 1e-60 or above 1e60, or if fewer than half of the points lie
+    on the surface of a body.
     """
     position = numeric_rows(points, "points", name).astype(np.float64)
     direction = None if normals is None else numeric_rows(normals, "normals", name).astype(np.float64)

@@ -19,8 +19,7 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
     """Choose vertices one by one, each as far as possible from all earlier samples, in Euclidean distance.
 
     The first sample is the vertex farthest from the centroid of the vertices, so the samples do not depend on
-    the order of the vertices. (If several vertices are equally far, the vertex with the lowest index is
-    chosen.)
+    the order of the vertices. Of several equally far vertices, the lowest-numbered one is chosen.
 
     **Arguments:**
 
@@ -29,9 +28,9 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
 
     **Returns:** The samples as 0-based vertex indices (s,), int64, in the order in which they were chosen.
 
-    **Raises:** `InputError` if the number of samples is below 1 or above the number of referenced vertices.
+    **Raises:** `InputError` if the number of samples is out of its range.
     """
-    referenced = np.flatnonzero(mesh.referenced_vertices)
+    referenced = mesh.used_vertices
     if not 1 <= number_of_samples <= len(referenced):
         raise InputError(
             f"{mesh.name}: cannot choose {number_of_samples} samples from {len(referenced)} referenced "
@@ -69,8 +68,7 @@ class SurfaceSamples(NamedTuple):
     **Attributes:**
 
     - `vertices`: the sampled vertices (s,), 0-based and ascending.
-    - `nearest`: an array (n,) with one entry per vertex of the mesh. `vertices[nearest[i]]` is the sample
-      nearest to vertex i.
+    - `nearest`: (n,), for each vertex of the mesh the row of its nearest sample in `vertices`.
     """
 
     vertices: Int64[np.ndarray, " s"]
@@ -78,14 +76,13 @@ class SurfaceSamples(NamedTuple):
 
     @classmethod
     def along_surface(cls, mesh: Mesh, vertices: Int64[np.ndarray, " s"]) -> SurfaceSamples:
-        """Return given samples (s,) in ascending order, and each vertex's nearest sample along the surface.
+        """Return given samples (s,) in ascending order, and each vertex's nearest sample along the edges.
 
-        Distances are measured along edges, so limbs that touch each other do not share samples. For a vertex
-        of a connected component without samples, the nearest sample is the sample nearest in space.
+        Limbs that touch each other therefore do not share samples. A vertex of a connected component without
+        samples has the sample nearest in space.
         """
         vertices = np.sort(vertices)
-        lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.edges], axis=1)[:, 0], axis=1)
-        graph = sp.csr_array((lengths, tuple(mesh.edges.T)), (len(mesh.vertices),) * 2)
+        graph = sp.csr_array((mesh.lengths(mesh.edges), tuple(mesh.edges.T)), (len(mesh.vertices),) * 2)
         _, _, source = csgraph.dijkstra(
             graph, directed=False, indices=vertices, min_only=True, return_predecessors=True
         )
@@ -99,24 +96,21 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
 
     This is Poisson-disk sampling. The candidates are one vertex from each occupied box of a grid. Any two
-    samples are farther apart than a minimum Euclidean distance, and every candidate is within this distance
-    of a sample. The minimum distance follows from the area and the number of samples. The side of a box is a
-    third of the minimum distance. Two sheets of surface that are closer to each other than the minimum
-    distance share their samples. For many samples, the function is much faster than `farthest_point_samples`.
+    samples are farther apart than a minimum Euclidean distance, which follows from the area and the number of
+    samples, and every candidate is within this distance of a sample. The side of a box is a third of this
+    distance. Two sheets of surface that are closer to each other share their samples. For many samples, the
+    function is much faster than `farthest_point_samples`.
 
     **Arguments:**
 
     - `mesh`: the surface with n vertices. Unreferenced vertices are never chosen.
-    - `number_of_samples`: the approximate number of samples. If the mesh is too coarse for this number, there
-      are fewer samples.
-
-    **Returns:** The samples, and the nearest sample of each vertex, as `SurfaceSamples`.
+    - `number_of_samples`: the approximate number of samples; a coarse mesh has fewer.
     """
-    candidates = np.flatnonzero(mesh.referenced_vertices)
+    candidates = mesh.used_vertices
     # At a minimum distance d, a surface has room for about 0.7 area / d² samples.
     distance = (0.7 * mesh.area / number_of_samples) ** 0.5
     # In each box of a grid around the centroid, only the lowest-numbered vertex remains a candidate.
-    positions = mesh.vertices - mesh.vertices[candidates].mean(axis=0)
+    positions = mesh.vertices - mesh.middle
     boxes = np.floor(positions[candidates] / (distance / 3)).astype(np.int64)
     _, first = np.unique(boxes, axis=0, return_index=True)
     candidates = np.sort(candidates[first])

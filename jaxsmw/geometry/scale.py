@@ -45,9 +45,9 @@ class ScaleEstimate(NamedTuple):
 
     **Attributes:**
 
-    - `scale`: the factor by which lengths on X are multiplied to become lengths in the unit of Y, a float.
-    - `support`: the mean number of other matches that confirm a match, a float without unit. Two matches
-      confirm each other if the distance on X, times `scale`, is nearly the distance on Y.
+    - `scale`: the factor by which lengths on X are multiplied to become lengths in the unit of Y.
+    - `support`: the mean number of other matches that confirm a match. Two matches confirm each other if the
+      distance on X, times `scale`, is nearly the distance on Y.
     - `uncertain`: whether `support` is below 1.5, so that the scale can be wrong.
     """
 
@@ -57,7 +57,7 @@ class ScaleEstimate(NamedTuple):
 
 
 def estimate_scale(mesh_x: Mesh, mesh_y: Mesh) -> ScaleEstimate:
-    """Estimate the relative scale of a partial shape and a full shape.
+    """Estimate the relative scale of a partial shape and a full shape, in either order and in any units.
 
     The shape with the longer boundary, relative to the square root of its area, is taken as the partial
     shape. The function tests several ratios of the partial shape's area to the full shape's area (shares).
@@ -68,12 +68,6 @@ def estimate_scale(mesh_x: Mesh, mesh_y: Mesh) -> ScaleEstimate:
     function chooses the share with the largest support (see `ScaleEstimate`). The corrected share and the
     areas of both meshes give the scale. Pairs of samples are compared only if their normals agree (point pair
     features; Drost, Ulrich, Navab, Ilic, "Model globally, match locally", 2010).
-
-    **Arguments:**
-
-    - `mesh_x`, `mesh_y`: a partial shape and a full shape, in either order and in any units of length.
-
-    **Returns:** A `ScaleEstimate`. Its scale leads from X to Y, even if Y is the partial shape.
 
     **Raises:** `InputError` if neither mesh has a boundary, or if the meshes are too coarse.
     """
@@ -119,8 +113,7 @@ class _Samples(NamedTuple):
 
 def relative_boundary(mesh: Mesh) -> float:
     """Return the length of the boundary, divided by the square root of the area; 0 for a closed surface."""
-    lengths = np.linalg.norm(np.diff(mesh.vertices[mesh.boundary_edges], axis=1)[:, 0], axis=1)
-    return float(lengths.sum() / mesh.area**0.5)
+    return float(mesh.lengths(mesh.boundary_edges).sum() / mesh.area**0.5)
 
 
 def _sample(mesh: Mesh, share: float) -> _Samples:

@@ -60,8 +60,8 @@ def in_small_components(
 ) -> tuple[Bool[np.ndarray, " f"], int]:
     """Return a mask of the triangles in small components, and the number of small components.
 
-    `component` numbers the component of each triangle (f,). A component is closed if none of its triangles is
-    in the mask `at_boundary` (f,).
+    `component` numbers the component of each triangle. A component is closed if `at_boundary` is False for
+    all of its triangles.
     """
     areas = np.bincount(component, weights=face_areas)
     has_faces = np.bincount(component) > 0

@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.sparse import csgraph, csr_array
 
-from jaxsmw.geometry.geodesics import SurfacePoints
-from jaxsmw.geometry.mesh import Mesh, connected_components
+from jaxsmw.geometry.arrays import sides_of, unit_vectors
+from jaxsmw.geometry.mesh import Mesh, components_of_faces, connected_components
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.scans import in_small_components
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.wording import count_of
 
 logger = logging.getLogger("jaxsmw")
@@ -43,11 +44,7 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
     *Greedy optimal homotopy and homology generators*). For each handle, the function cuts the loop that
     follows valleys best, if most of this loop is in valleys. The cut is a gap, which is one face wide.
 
-    **Arguments:**
-
-    - `mesh`: the surface, a `Mesh` (n vertices).
-
-    **Returns:** A `Mesh` with the same n vertices and fewer faces. A few vertices beside a gap can lose all
+    **Returns:** A `Mesh` with the same vertices and fewer faces. A few vertices beside a gap can lose all
     their faces. The result is `mesh` itself if no loop is cut, or if the surface has more than 30 handles.
     Handles are not found if many faces are misoriented, or if the faces share no vertices (triangle soup).
     """
@@ -78,7 +75,7 @@ def cut_shortcuts(mesh: Mesh) -> Mesh:
         removed |= min(strips, key=lambda strip: float(mesh.face_areas[strip].sum()))
     # A gap can isolate a few faces, whose eigenfunctions would be useless.
     kept = np.flatnonzero(~removed)
-    _, component = _components_of_faces(mesh.faces[kept], len(mesh.vertices))
+    _, component = components_of_faces(mesh.faces[kept], len(mesh.vertices))
     at_gap = np.isin(component[mesh.faces[kept, 0]], component[mesh.faces[removed]])
     small, _ = in_small_components(component[mesh.faces[kept, 0]], mesh.face_areas[kept], at_gap)
     removed[kept] = small & at_gap
@@ -94,14 +91,9 @@ def points_on_uncut(points: SurfacePoints, cut: Mesh, mesh: Mesh) -> SurfacePoin
 def _genus(manifold: Int64[np.ndarray, "f 3"]) -> int:
     """Return the number of handles of a manifold surface, with any boundaries and components."""
     # With c components and b boundary loops, Euler's formula is V - E + F = 2 (c - genus) - b.
-    components, _ = _components_of_faces(manifold, int(manifold.max()) + 1)
+    components, _ = components_of_faces(manifold, int(manifold.max()) + 1)
     boundaries = len(igl.boundary_loop_all(manifold))
     return components - (igl.euler_characteristic(manifold) + boundaries) // 2
-
-
-def _components_of_faces(faces: Int64[np.ndarray, "f 3"], n: int) -> tuple[int, Int32[np.ndarray, " n"]]:
-    """Return what `connected_components` returns, for the edges of faces."""
-    return connected_components(np.concatenate([faces[:, :2], faces[:, 1:]]), n)
 
 
 def _faces_along(opened: Int64[np.ndarray, "f 3"], sides: Int64[np.ndarray, " l"]) -> Bool[np.ndarray, " f"]:
@@ -147,11 +139,10 @@ class _Edges(NamedTuple):
         """Return the interior edges; `twin` is the number of the same side in the other face, or -1."""
         left = np.flatnonzero(np.arange(len(twin)) < twin)
         right = twin[left]
-        tail, head = surface.faces.ravel()[left], np.roll(surface.faces, -1, axis=1).ravel()[left]
-        beyond = np.roll(surface.faces, -2, axis=1).ravel()[right]
+        tails, heads, opposite = sides_of(surface.faces)
+        tail, head, beyond = tails[left], heads[left], opposite[right]
         # Unit vectors keep products of normals in the range of float64, whatever the unit of length.
-        lengths = np.linalg.norm(surface.area_vectors, axis=1, keepdims=True)
-        unit = np.divide(surface.area_vectors, lengths, out=np.zeros((len(lengths), 3)), where=lengths > 0)
+        unit = unit_vectors(surface.area_vectors)
         normals = unit[left // 3], unit[right // 3]
         # Normals point outward, so the face to the right of a valley rises above the plane of the left
         # face. If the surface is inside out, the signs are reversed.
@@ -178,7 +169,7 @@ def _handle_loops(surface: Mesh, genus: int) -> Iterator[_HandleLoop]:
     valleys = replace(surface, faces=surface.faces[np.unique(edges.left[edges.in_valley] // 3)])
     # The handles can belong to different components.
     number = max(min(_BASE_POINTS, max(_FEWEST_BASE_POINTS, _REACHED // n)), 3 * genus)
-    number = min(number, int(valleys.referenced_vertices.sum()))
+    number = min(number, len(valleys.used_vertices))
     graph = csr_array((edges.weighted_length, (edges.tail, edges.head)), shape=(n, n))
     distances, predecessors = csgraph.dijkstra(
         graph, directed=False, indices=farthest_point_samples(valleys, number), return_predecessors=True
@@ -224,7 +215,8 @@ def _dual_arcs(
 ) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray, "b 2"]]:
     """Return the dual arcs across interior and boundary edges; nodes are faces, and then boundary loops."""
     boundary = np.flatnonzero(twin < 0)
-    ends = np.stack([np.roll(surface.faces, -i, axis=1).ravel()[boundary] for i in range(2)], axis=1)
+    tails, heads, _ = sides_of(surface.faces)
+    ends = np.stack([tails[boundary], heads[boundary]], axis=1)
     loop = connected_components(ends, len(surface.vertices))[1][ends[:, 0]]
     interior = np.sort(np.stack([edges.left // 3, edges.right // 3], axis=1), axis=1)
     return interior, np.stack([boundary // 3, len(surface.faces) + loop], axis=1)

@@ -41,13 +41,11 @@ def shot_descriptors(
     The frame divides the neighbourhood into 32 sectors: 8 ranges of azimuth times 2 ranges of elevation times
     2 ranges of distance. Each sector has an 11-bin histogram of the cosine of the angle between a neighbour's
     normal and the z axis. A neighbour contributes to the two nearest bins in each of azimuth, elevation,
-    distance and cosine, with the weights of linear interpolation. All neighbours have equal total weights in
-    the histograms. Each descriptor is scaled to unit length.
+    distance and cosine, with the weights of linear interpolation. Each descriptor is scaled to unit length.
 
     Descriptors are invariant to rotation, translation and scale, but not to reflection, so they distinguish
-    left from right. A renumbering of the vertices only permutes the rows of the result. If the enclosed
-    volume is negative, all normals are reversed first, so an inside-out mesh has the same descriptors.
-    Results are cached on disk (`jaxsmw.runtime.cache`).
+    left from right. An inside-out mesh has the same descriptors. Results are cached on disk
+    (`jaxsmw.runtime.cache`).
 
     **Arguments:**
 
@@ -61,10 +59,9 @@ def shot_descriptors(
     - `required`: whether the caller needs SHOT. If False (the default), messages about coarse meshes also
       explain how to match without SHOT.
 
-    **Returns:** Dimensionless descriptors as float32: one row per vertex (n, 352), or one row per sample (s,
-    352) if samples are given. The row is zero for unreferenced vertices and for vertices with fewer than 3
-    neighbours. The function issues a `UserWarning` if more than 1 % of the vertices have fewer than 3
-    neighbours.
+    **Returns:** Dimensionless descriptors as float32, (n, 352) for all vertices or (s, 352) for the samples.
+    The row is zero for unreferenced vertices and for vertices with fewer than 3 neighbours. The function
+    issues a `UserWarning` if more than 1 % of the vertices have fewer than 3 neighbours.
 
     **Raises:** `InputError` if the radius is not positive, or if most vertices have fewer than 3 neighbours.
     """
@@ -73,11 +70,10 @@ def shot_descriptors(
 
     def compute() -> dict[str, np.ndarray]:
         if samples is None:
-            vertices = rows = np.flatnonzero(mesh.referenced_vertices)
-            normals, number = mesh.vertex_normals[vertices], len(mesh.vertices)
+            vertices = mesh.used_vertices
+            normals = mesh.vertex_normals[vertices]
         else:
             vertices, number = samples.vertices, len(samples.vertices)
-            rows = np.arange(number)
             weighted = mesh.vertex_areas[:, None] * mesh.vertex_normals
             normals = np.stack([np.bincount(samples.nearest, axis, number) for axis in weighted.T], axis=1)
             normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
@@ -92,16 +88,15 @@ def shot_descriptors(
             raise InputError(_too_coarse(mesh, lonely, radius, required))
 
         # Single precision is accurate enough for descriptors.
-        descriptors = np.zeros((number, SHOT_DIMENSION), np.float32)
+        descriptors = np.zeros((len(vertices), SHOT_DIMENSION), np.float32)
         block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
         for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
             pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
             # Pairs of vertices at the same position are left out, because they define no direction.
             apart = pairs["v"] > 0
             center, neighbor, distance = (pairs[column][apart] for column in "ijv")
-            descriptors[rows[block]] = _histograms(
-                positions, normals, block, center, neighbor, distance, radius
-            )
+            descriptors[block] = _histograms(positions, normals, block, center, neighbor, distance, radius)
+        descriptors = mesh.spread(descriptors) if samples is None else descriptors
         return {"descriptors": descriptors, "lonely": np.asarray(lonely)}
 
     chosen = () if samples is None else samples

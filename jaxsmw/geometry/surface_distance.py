@@ -8,8 +8,9 @@ import igl
 import numpy as np
 from jaxtyping import Float64
 
-from jaxsmw.geometry.geodesics import SurfacePoints
+from jaxsmw.geometry.arrays import ratio
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 
 # If more than this share of the nearest triangles face away from the given normals, the triangles are not
 # oriented consistently.
@@ -21,13 +22,9 @@ def nearest_surface_points(
 ) -> tuple[SurfacePoints, Float64[np.ndarray, " p"]]:
     """Find the nearest point on the triangles of a mesh for each point in space.
 
-    **Arguments:**
+    `points` (p, 3) are positions in the unit and the coordinate system of the mesh.
 
-    - `points`: positions (p, 3), in the unit and the coordinate system of the mesh.
-    - `mesh`: a `Mesh`. Unreferenced vertices have no influence.
-
-    **Returns:** The nearest points as a `SurfacePoints` with p points, and the Euclidean distances to these
-    points (p,), in the unit of the mesh.
+    **Returns:** The nearest points as p `SurfacePoints`, and the Euclidean distances to them (p,).
     """
     return SurfaceTree(mesh).nearest(points)
 
@@ -39,13 +36,13 @@ class SurfaceTree:
         self._faces = mesh.faces
         # Coordinates relative to the middle of the mesh reduce rounding errors if the mesh is far from the
         # origin.
-        self._middle = mesh.vertices[mesh.referenced_vertices].mean(axis=0)
+        self._middle = mesh.middle
         self._vertices = mesh.vertices - self._middle
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
 
     def nearest(self, points: Float64[np.ndarray, "p 3"]) -> tuple[SurfacePoints, Float64[np.ndarray, " p"]]:
-        """Find the nearest point on the triangles for each point in space; see `nearest_surface_points`."""
+        """Return the result of `nearest_surface_points`."""
         if not len(points):
             return SurfacePoints(np.empty(0, np.int64), np.empty((0, 3))), np.empty(0)
         vertices = self._vertices
@@ -72,10 +69,9 @@ def nearest_facing_points(
     """Replace nearest points on triangles that face away from the given normals.
 
     A triangle faces away if the angle between its normal and the given normal is above 90 degrees. For
-    example, if two legs touch, a point on one leg can be nearest to a triangle of the other leg.
-
-    A second search considers only triangles whose normals have roughly the direction of the given normal. The
-    new point is used if its triangle does not face away. Nothing is replaced if more than 20 % of the nearest
+    example, if two legs touch, a point on one leg can be nearest to a triangle of the other leg. A second
+    search considers only triangles whose normals have roughly the direction of the given normal. The new
+    point is used if its triangle does not face away. Nothing is replaced if more than 20 % of the nearest
     triangles face away, because the triangles of the mesh are then not oriented consistently.
 
     **Arguments:**
@@ -85,7 +81,7 @@ def nearest_facing_points(
     - `nearest`: the result of `nearest_surface_points` for the positions.
     - `mesh`: a `Mesh`.
 
-    **Returns:** A `SurfacePoints` with p points.
+    **Returns:** p `SurfacePoints`.
     """
     of_faces = mesh.area_vectors
     away = np.einsum("px,px->p", normals, of_faces[nearest.faces]) < 0
@@ -108,21 +104,13 @@ def nearest_facing_points(
 
 
 def distances_to_surface(points: Float64[np.ndarray, "p 3"], mesh: Mesh) -> Float64[np.ndarray, " p"]:
-    """Compute the distance from each point to the nearest point on the triangles of a mesh.
-
-    **Arguments:**
-
-    - `points`: positions (p, 3), in the unit and the coordinate system of the mesh.
-    - `mesh`: a `Mesh`. Unreferenced vertices have no influence.
-
-    **Returns:** The Euclidean distances (p,), in the unit of the mesh.
-    """
+    """Return the distance from each point (p, 3) to the nearest point on the triangles of a mesh, (p,)."""
     return nearest_surface_points(points, mesh)[1]
 
 
 def bounding_box_diagonal(mesh: Mesh) -> float:
-    """Return the length of the diagonal of the box around all faces of a mesh, in the unit of the mesh."""
-    return float(np.linalg.norm(np.ptp(mesh.vertices[mesh.referenced_vertices], axis=0)))
+    """Return the length of the diagonal of the box around all faces of a mesh."""
+    return float(np.linalg.norm(np.ptp(mesh.vertices[mesh.used_vertices], axis=0)))
 
 
 def nearest_points_of_triangles(
@@ -136,9 +124,6 @@ def nearest_points_of_triangles(
     away = points - a
     uu, uv, vv = (u * u).sum(axis=1), (u * v).sum(axis=1), (v * v).sum(axis=1)
     along_u, along_v = (away * u).sum(axis=1), (away * v).sum(axis=1)
-
-    def ratio(along: np.ndarray, length: np.ndarray) -> np.ndarray:
-        return np.divide(along, length, out=np.zeros_like(along), where=length > 0)
 
     # The nearest point a + s u + t v lies on one of the three edges, or inside the triangle.
     on_u, on_v = np.clip(ratio(along_u, uu), 0, 1), np.clip(ratio(along_v, vv), 0, 1)

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError, naming
-from jaxsmw.geometry.geodesics import check_indices
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.formats.mat import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
 from jaxsmw.io.formats.npz import read_array
@@ -119,20 +118,6 @@ def check_map_name(path: str | os.PathLike[str]) -> None:
             f"{path}: maps are written as text, .npy or .mat, not as {suffix}: choose a name with another "
             "suffix, such as .txt."
         )
-
-
-def check_pointwise_map(pointwise_map: ArrayLike, mesh_x: Mesh, mesh_y: Mesh) -> Int64[np.ndarray, " m"]:
-    """Check a pointwise map T: X -> Y, and return it as int64 (m,).
-
-    **Raises:** `InputError` if the map does not have one 0-based vertex of Y for every vertex of X.
-    """
-    targets = check_indices(pointwise_map, len(mesh_y.vertices), f"pointwise map on {mesh_y.name}: vertex")
-    if len(targets) != (m := len(mesh_x.vertices)):
-        raise InputError(
-            f"the pointwise map has {len(targets)} vertices, but {mesh_x.name} has "
-            f"{count_of(m, 'vertex')}: give a map from X to Y."
-        )
-    return targets
 
 
 def _is_npy_file(path: str | os.PathLike[str]) -> bool:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import functools
 import warnings
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,8 +20,8 @@ from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
-from jaxsmw.geometry.geodesics import SurfacePoints, check_indices
 from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
+from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map
 from jaxsmw.matching.executor import SpectralPair, Start, embeddings, nearest_points, reverse_map
 from jaxsmw.matching.judge import Scored, estimate_error, overlap, wrong_probability
 from jaxsmw.matching.pair import Pair
@@ -40,7 +39,7 @@ class Correspondence:
 
     The methods `surface_points`, `one_to_one`, `soft_map`, `expected_error`, `wrong_probability` and others
     compute further results. The results of `surface_points` and `expected_error` are kept, so further calls
-    cost no time.
+    cost no time. In all results, an unreferenced vertex has the value of the nearest referenced vertex.
 
     **Attributes:**
 
@@ -51,14 +50,12 @@ class Correspondence:
     - `initial_map`: the map from which refinement started (m,), int64, as 0-based vertices of Y.
     - `init`: the name of the initial map, such as `"shot"`; None if a map or landmarks were given. If repair
       chose an alternative initial map, `initial_map` is the alternative.
-    - `preset`: the `Preset` with the stages of refinement and the settings of the repair. For small meshes,
-      the stages of a preset differ from the stages in `PRESETS`; see `match`.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. They contain the k_X and k_Y
-      eigenvectors that the last stage uses. Two full shapes are each scaled to area 1. The shapes of a
-      partial pair are scaled by one common factor, so that the larger shape has area 1. If a mesh was cut
-      before it was matched (`jaxsmw.geometry.cut_shortcuts`), or was trimmed
-      (`jaxsmw.matching.search.trimming`), the spectrum belongs to the cut or trimmed mesh. The mask of the
-      spectrum is False for trimmed vertices.
+    - `preset`: the `Preset` with the stages of refinement and the settings of the repair, adapted to the
+      meshes; see `Preset.fitted`.
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y in `Pair.units_of_length`, each a `Spectrum` with the
+      k_X or k_Y eigenvectors that the last stage uses. If a mesh was cut before it was matched
+      (`jaxsmw.geometry.cut_shortcuts`), or was trimmed (`jaxsmw.matching.search.trimming`), the spectrum
+      belongs to the cut or trimmed mesh. The mask of the spectrum is False for trimmed vertices.
     - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
@@ -71,12 +68,10 @@ class Correspondence:
     - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
       hands, such as a left and a right tooth. Entry i of `pointwise_map` is always the match of vertex i of
       X, even if X was mirrored.
-    - `mirror_evidence`: the evidence that the mirror image of X, and not X itself, corresponds to Y; None if
-      `match` computed no evidence. The evidence is the logarithm of a ratio: the distance error of a coarse
-      map of X itself, divided by the distance error of a coarse map of the mirror image. `match` compares up
-      to two pairs of coarse maps and keeps the smaller evidence (`jaxsmw.matching.search.chirality.Hands`).
-      If X and Y differ enough from their own mirror images, a value of at least 0.05 leads to
-      `mirrored=True`. Most correct decisions with `mirrored=True` have values above 0.3.
+    - `mirror_evidence`: the evidence that the mirror image of X, and not X itself, corresponds to Y, a number
+      without unit; None if `match` computed no evidence. If X and Y differ enough from their own mirror
+      images, a value of at least 0.05 leads to `mirrored=True`. Most correct decisions with `mirrored=True`
+      have values above 0.3. See `jaxsmw.matching.search.chirality.Hands`.
     - `left_out`: the share of X's area in small components that have no counterpart on Y and only move with
       their surroundings; see `jaxsmw.transfer.match_small_components`.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. If meshes of a certain
@@ -114,20 +109,21 @@ class Correspondence:
                 else ""
             )
             raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
-        extended = extend_to_unreferenced(prepared.pair.mesh_x, outcome.pointwise_map)
-        found, left_out = pair.with_small_components(extended)
+        initial_map, refined_map = (
+            extend_to_unreferenced(prepared.pair.mesh_x, matches)
+            for matches in (outcome.initial_map, outcome.pointwise_map)
+        )
+        pointwise_map, left_out = pair.with_small_components(refined_map)
         seen = prepared.spectra.seen_by(preset.stages[-1])
         return cls(
             pair=pair,
-            pointwise_map=found,
-            initial_map=outcome.initial_map,
+            pointwise_map=pointwise_map,
+            initial_map=initial_map,
             init=start.origin if start.origin in INITIAL_MAPS else None,
             preset=preset,
             spectrum_x=seen.x.reflect() if prepared.mirrored else seen.x,
             spectrum_y=seen.y,
-            refinement=eqx.tree_at(
-                lambda tree: tree.pointwise_map, last, jax.device_put(found.astype(np.int32))
-            ),
+            refinement=replace(last, pointwise_map=jax.device_put(pointwise_map.astype(np.int32))),
             iterations=sum(int(refinement.iterations) for refinement in outcome.refinements),
             distortion=scored.distortion,
             suspicious=scored.suspicious,
@@ -153,11 +149,7 @@ class Correspondence:
 
     @property
     def functional_map(self) -> Float[np.ndarray, "k_out k_in"]:
-        """The functional map of the last iteration, in the convention of the last stage's refiner.
-
-        The map has no unit. The shape is (k_X, k_Y) for a pullback, from functions on Y to functions on X.
-        The shape is (k_Y, k_X) for a pushforward, from functions on X to functions on Y.
-        """
+        """The functional map of the last iteration; see `jaxsmw.Refinement`."""
         return np.asarray(self.refinement.functional_map)
 
     def surface_points(self) -> SurfacePoints:
@@ -167,7 +159,6 @@ class Correspondence:
         that is nearest to a vertex of X. This method searches the triangles around that vertex of Y for the
         nearest point. For 98 % of the vertices of X, this point is also the nearest point on all triangles of
         Y. `jaxsmw.functional_maps.decode_to_triangles` searches all triangles, which takes 20 times as long.
-        An unreferenced vertex of X receives the point of the nearest referenced vertex.
 
         **Returns:** A `SurfacePoints` with m points on Y, one for each vertex of X. Its attribute `faces`
         (m,) contains 0-based rows of `mesh_y.faces`, and its attribute `weights` (m, 3) contains barycentric
@@ -185,8 +176,7 @@ class Correspondence:
 
         The method uses the same embeddings as `surface_points`, so `match` is not called again.
 
-        **Returns:** A `SurfacePoints` with n points on X, one for each vertex of Y. An unreferenced vertex of
-        Y receives the point of the nearest referenced vertex.
+        **Returns:** A `SurfacePoints` with n points on X, one for each vertex of Y.
         """
         embedded_x, embedded_y = self._embeddings()
         return self._points_near(self.pair.reversed(), self.reverse_map(), embedded_y, embedded_x)
@@ -194,8 +184,7 @@ class Correspondence:
     def reverse_map(self) -> Int64[np.ndarray, " n"]:
         """Compute the map Y -> X from the embeddings of the last stage, without a second call of `match`.
 
-        **Returns:** The match of every vertex of Y (n,), int64, as a 0-based vertex of X. An unreferenced
-        vertex of Y receives the match of the nearest referenced vertex.
+        **Returns:** The match of every vertex of Y (n,), int64, as a 0-based vertex of X.
         """
         with self._precision():
             found = reverse_map(self._refiner, self._spectra, self.refinement.state)
@@ -245,7 +234,7 @@ class Correspondence:
 
         See `jaxsmw.geometry.one_to_one_map`. The map is intended for shapes with the same triangulation. For
         shapes with different triangulations, the attribute `pointwise_map` has much smaller errors than the
-        one-to-one map. An unreferenced vertex of X receives the match of the nearest referenced vertex.
+        one-to-one map.
 
         **Returns:** The map X -> Y (m,), int64, as 0-based vertices of Y.
 
@@ -261,15 +250,12 @@ class Correspondence:
     def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
         """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
 
-        `SoftMap.pull_back` transfers functions smoothly from Y to X. `SoftMap.pointwise_map` covers more of Y
-        than `Correspondence.pointwise_map`. Both maps were compared on four remeshed FAUST pairs.
-        `SoftMap.pointwise_map` covers 76 to 82 % of Y's vertices, depending on the pair, and
-        `Correspondence.pointwise_map` covers 69 to 75 %. The error of `SoftMap.pointwise_map` is up to 4 %
-        smaller or up to 2 % larger than the error of `Correspondence.pointwise_map`. One iteration takes 0.2
-        seconds for 5000 vertices, and 20 iterations are needed.
+        `SoftMap.pull_back` transfers functions smoothly from Y to X. On four remeshed FAUST pairs,
+        `SoftMap.pointwise_map` covers 76 to 82 % of Y's vertices, and `Correspondence.pointwise_map` covers
+        69 to 75 %. The errors differ by at most 4 %. One iteration takes 0.2 seconds for 5000 vertices, and
+        20 iterations are needed.
 
-        An unreferenced vertex of X is mapped like the nearest referenced vertex. The method issues a
-        `UserWarning` if the iterations end before they reach the tolerance.
+        The method issues a `UserWarning` if the iterations end before they reach the tolerance.
 
         **Arguments:**
 
@@ -313,13 +299,9 @@ class Correspondence:
         return found
 
     def expected_error(self) -> Float[np.ndarray, " m"]:
-        """Estimate the geodesic error of every match without ground truth.
+        """Estimate the geodesic error of every match (m,), divided by the square root of Y's area.
 
-        See `jaxsmw.matching.judge.expected_error`. An unreferenced vertex of X receives the value of the
-        nearest referenced vertex.
-
-        **Returns:** The expected geodesic distance between every match and the true match (m,), divided by
-        the square root of Y's area.
+        See `jaxsmw.matching.judge.expected_error`.
         """
         return self._expected_error.copy()
 
@@ -343,13 +325,7 @@ class Correspondence:
         if reverse_map is None:
             reverse = self.reverse_map()
         else:
-            name = f"map to {self.mesh_x.name}: vertex"
-            reverse = check_indices(reverse_map, len(self.mesh_x.vertices), name)
-            if len(reverse) != len(self.mesh_y.vertices):
-                raise InputError(
-                    f"{self.mesh_y.name}: the reverse map has {len(reverse)} entries for "
-                    f"{len(self.mesh_y.vertices)} vertices: give one vertex of X for each vertex."
-                )
+            reverse = check_pointwise_map(reverse_map, self.mesh_y, self.mesh_x, "reverse map")
         return (
             overlap(self.pair, self.pointwise_map, reverse),
             overlap(self.pair.reversed(), reverse, self.pointwise_map),
@@ -372,14 +348,7 @@ class Correspondence:
         return self.estimate_error(ExpectedErrorSettings())
 
     def estimate_error(self, settings: ExpectedErrorSettings) -> Float[np.ndarray, " m"]:
-        """Estimate the geodesic error of every match (m,) with the given settings; see `expected_error`.
-
-        **Arguments:**
-
-        - `settings`: the `ExpectedErrorSettings`.
-
-        **Returns:** The expected errors (m,), divided by the square root of Y's area.
-        """
+        """Estimate the geodesic error of every match (m,) with other settings; see `expected_error`."""
         with self._precision():
             return estimate_error(
                 self.pair.mirrored() if self.mirrored else self.pair,

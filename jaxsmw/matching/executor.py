@@ -6,8 +6,7 @@ and come out have one entry per vertex of X.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, wait
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -15,19 +14,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Int64, PyTree
+from jaxtyping import Array, Bool, Float, Int, Int64
 
-from jaxsmw.core.refinement import Refinement, refine
-from jaxsmw.core.refiner import Problem, Refiner, Samples, State
-from jaxsmw.core.refiner import reverse_map as reverse_map_of_state
+from jaxsmw.core.refinement import Refinement, RefineSettings, refine
+from jaxsmw.core.refiner import Problem, Refiner, Samples, State, recover_reverse
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_candidates
 from jaxsmw.matching.stages import Stage
-from jaxsmw.runtime.batches import refine_pairs
+from jaxsmw.runtime.batches import pad_rows, padded_size, refine_pairs
 from jaxsmw.runtime.compilation import compile_ahead, compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
 
 # Shapes with more vertices than this number are not padded, because padding would need too much memory.
 _PADDED_UP_TO = 50_000
@@ -212,10 +209,7 @@ def _run_one(stages: Sequence[Stage], seen: Sequence[SpectralPair], start: Start
             excluded = jnp.asarray(pad_rows(start.excluded, len(spectra.x.mask)))
             spectra = replace(spectra, x=spectra.x.excluding(excluded))
         x, y, samples, partial = spectra.x, spectra.y, spectra.samples, spectra.partial
-        if _compiling:
-            key = _key(stage, (x, y, matches, samples), partial, history)
-            wait([program] if (program := _compiling.pop(key, None)) else [])
-        settings = {**stage.settings, "partial": partial, "history": history}
+        settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
         found = compiled(refine)(x, y, matches, samples=samples, **settings)
         refinements.append(found)
         matches = found.pointwise_map
@@ -280,22 +274,10 @@ def padded_map(pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
     return jax.device_put(padded.astype(np.int32))
 
 
-# The programs that are being compiled in the background; see `compile_stage`.
-_compiling: dict[Hashable, Future[object]] = {}
-
-
-def _key(stage: Stage, arrays: PyTree, partial: bool, history: bool) -> Hashable:
-    """Return what distinguishes the program of a stage from other programs. Levels are traced."""
-    sizes = tuple(leaf.shape for leaf in jax.tree.leaves(arrays))
-    return repr(stage.settings), sizes, partial, history
-
-
 def compile_stage(
     stage: Stage, number_x: int, number_y: int, *, partial: bool = False, history: bool = False
 ) -> None:
-    """Compile the program of a stage in the background. `run` waits for the program when it needs it.
-
-    Both shapes must have as many eigenvectors as the stage.
+    """Compile the program of a stage in the background. Both shapes must have its number of eigenvectors.
 
     **Arguments:**
 
@@ -313,10 +295,8 @@ def compile_stage(
         x, y = (_outline(stage, size) for size in sizes)
         return (x, y, jnp.zeros(sizes[0], jnp.int32)), {"samples": samples}
 
-    key = _key(stage, jax.eval_shape(arguments), partial, history)
-    if key not in _compiling:  # stages that differ only in their levels share a program
-        settings = {**stage.settings, "partial": partial, "history": history}
-        _compiling[key] = compile_ahead(refine, arguments, **settings)
+    settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
+    compile_ahead(refine, arguments, **settings)
 
 
 def _outline(stage: Stage, number_of_vertices: int) -> Spectrum:
@@ -338,7 +318,7 @@ def reverse_map(refiner: Refiner, spectra: SpectralPair, state: State) -> Int64[
     - `spectra`: the spectra that the stage has seen, without padding; see `SpectralPair.seen_by`.
     - `state`: the `State` of the refiner.
     """
-    found = compiled(reverse_map_of_state)(refiner, _problem(spectra), state)
+    found = compiled(recover_reverse)(refiner, _problem(spectra), state)
     return np.asarray(found)[: spectra.y.mask.shape[0]].astype(np.int64)
 
 

@@ -1,4 +1,11 @@
-"""Judges maps without ground truth: how good a map is, where it is wrong, and which of two is better."""
+"""Judges maps without ground truth: how good a map is, where it is wrong, and which of two is better.
+
+The functions share these arguments. `pair` is the `Pair` of the source X (m vertices) and the target Y (n
+vertices). `pointwise_map` is T: X -> Y (m,), 0-based vertices of Y. `reverse_map` is a map Y -> X (n,),
+0-based vertices of X. `spectrum_x` and `spectrum_y` are the spectra of X and Y in `Pair.units_of_length`,
+without padding and with a few hundred eigenvectors. `settings` and `scores` are settings of
+`jaxsmw.matching.settings`.
+"""
 
 from __future__ import annotations
 
@@ -37,13 +44,6 @@ def dirichlet_energy_ratio(
     errors of single matches. The energy of these errors grows with the density of the mesh. For true maps
     between poses of one body, the ratio is about 1, even if the triangulations differ. For true maps between
     non-isometric shapes, the ratio is up to 1.1. Discontinuous maps have larger ratios.
-
-    **Arguments:**
-
-    - `pair`: the `Pair` of the source X (m vertices) and the target Y.
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the `Spectrum` of X in `Pair.units_of_length`, with a few hundred eigenvectors.
-    - `settings`: the settings of the scores, a `ScoreSettings`.
 
     **Returns:** The ratio, a float without unit, for positions in `Pair.units_of_length`.
     """
@@ -86,13 +86,6 @@ def distortion(
     Correct maps from `Registration` have a distortion of at most 1.12 between poses of one body, and at most
     1.2 between non-isometric shapes. Most maps with swapped limbs have a distortion above 1.3.
 
-    **Arguments:**
-
-    - `pair`: the `Pair` of the source X (m vertices) and the target Y.
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the `Spectrum` of X in `Pair.units_of_length`, with a few hundred eigenvectors.
-    - `settings`: the settings of the scores, a `ScoreSettings`.
-
     **Returns:** The distortion, a float without unit. For two full shapes, the distortion is at least 1.
     """
     reversed_ = orientation_reversal(pair, pointwise_map, spectrum_x, settings)
@@ -112,12 +105,6 @@ def discontinuous_parts(
     An edge is discontinuous if its ends have matches that are far apart (`ScoreSettings` contains the
     thresholds). After the removal of discontinuous edges, X consists of one or more connected components. All
     components except the component of largest area are discontinuous parts.
-
-    **Arguments:**
-
-    - `pair`: the source X (m vertices) and the target Y.
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `settings`: the settings of the scores.
 
     **Returns:** A mask (m,), True for vertices in discontinuous parts.
     """
@@ -142,13 +129,6 @@ def orientation_reversal(
     taken as negative if the triangle is oriented opposite to Y's surface. The density of signed area is
     the ratio of this area to the area on X. The density is smoothed by projection onto X's first
     eigenvectors. The orientation is reversed where the smoothed density is below a threshold.
-
-    **Arguments:**
-
-    - `pair`: the source X (m vertices) and the target Y.
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`: the spectrum of X in `Pair.units_of_length`.
-    - `settings`: the settings of the scores.
 
     **Returns:** A mask (m,), True for vertices around which the orientation is reversed.
     """
@@ -186,13 +166,6 @@ def area_shape_difference(
     g ∘ T on X. In the basis of the first eigenfunctions of Y, the operator is a symmetric matrix. This matrix
     is the identity if the map preserves areas.
 
-    **Arguments:**
-
-    - `pair`: the source X (m vertices) and the target Y, two full shapes.
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y.
-    - `settings`: the settings of the scores.
-
     **Returns:** The root mean square difference between the eigenvalues of the operator and 1, without unit.
     Typical values are 0.03 to 0.12 between poses of one body, and 0.15 to 0.5 between different animals.
     """
@@ -206,13 +179,7 @@ def area_shape_difference(
 def edge_lengths(
     pair: Pair, edges: Int64[np.ndarray, "e 2"], pointwise_map: Int64[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " e"], Float[np.ndarray, " e"]]:
-    """Compute the lengths of edges of X, and the distances between the matches of their ends.
-
-    **Arguments:**
-
-    - `pair`: the source X (m vertices) and the target Y.
-    - `edges`: pairs of vertices of X (e, 2).
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    """Compute the lengths of edges (e, 2) of X, and the distances between the matches of their ends.
 
     **Returns:** The lengths of the edges on X (e,), and the Euclidean distances between the matches on Y
     (e,), both in `Pair.units_of_length`.
@@ -233,12 +200,6 @@ def detours(
 ) -> Float[np.ndarray, " m"]:
     """Return the distance from each vertex of X to its image under the map and then the reverse map.
 
-    **Arguments:**
-
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `reverse_map`: a map Y -> X (n,), 0-based vertices of X.
-
     **Returns:** The Euclidean distances (m,), in the unit of X in `Pair.units_of_length`.
     """
     vertices = pair.mesh_x.vertices
@@ -255,12 +216,6 @@ def overlap(
     not lead from this match back to the vertex. A vertex is therefore in the overlap if its detour is small.
     The prediction is wrong where a part of X without a counterpart is matched to a part of Y without a
     counterpart.
-
-    **Arguments:**
-
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `reverse_map`: a map Y -> X (n,), 0-based vertices of X.
 
     **Returns:** A mask (m,), True for the vertices in the overlap.
     """
@@ -290,15 +245,6 @@ def expected_error(
     with the size of the limb. `docs/accuracy.md` reports how well the expected errors rank the vertices by
     their true errors. If a map is wrong but consistent everywhere, the expected error does not reveal the
     fault.
-
-    **Arguments:**
-
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
-    - `reverse_map`: a map Y -> X (n,), 0-based vertices of X.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, in `Pair.units_of_length` and without padding.
-    - `settings`: the weights of the estimate.
-    - `scores`: the settings of `discontinuous_parts`, `orientation_reversal` and `area_shape_difference`.
 
     **Returns:** The expected geodesic distance between every match and the true match (m,), divided by the
     square root of Y's area.
@@ -498,11 +444,8 @@ def estimate_error(
 
     **Arguments:**
 
-    - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
     - `spectra`: the spectra that the last stage has seen; see `SpectralPair.seen_by`.
     - `refiner`, `state`: the refiner of the last stage, and its `State`.
-    - `settings`, `scores`: the settings of `expected_error`.
 
     **Returns:** The expected errors (m,), divided by the square root of Y's area. A vertex that was not
     matched has the value of the nearest matched vertex.

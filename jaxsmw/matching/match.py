@@ -25,9 +25,9 @@ from jaxsmw.choices import (
     Scale,
 )
 from jaxsmw.errors import check_choice
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh, MeshLike
 from jaxsmw.geometry.scans import SMALL_CLOSED
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import Outcome, Start, compile_stage
 from jaxsmw.matching.judge import Scored, discontinuous_parts, estimate_error, orientation_reversal
@@ -73,63 +73,38 @@ def match(
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y (n vertices), in any unit of length. Each
       argument is a `Mesh`, a mesh of trimesh, pyFM, geomfum or PyVista, or a tuple of vertices and faces; see
       `make_mesh`.
-    - `preset`: the method of refinement, which is one of the following. The number of eigenvectors of a
-      preset is limited to half the number of vertices of the smaller mesh. If the number of samples of a
-      preset is at least the number of vertices of the smaller mesh, the preset uses all vertices instead of
-      samples. If you give stages instead of a preset, `match` uses the stages unchanged.
+    - `preset`: the method of refinement, which is one of the following.
 
         - `"accurate"` (the default): four stages, with repair; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
         - `"fast"`: the method of the MWP paper on 500 samples of each shape.
-        - a `Preset`.
-        - a `Stage`, or a list or tuple of stages. An example is
+        - a `Preset`. Its sizes are adapted to small meshes; see `Preset.fitted`.
+        - a `Stage`, or a list or tuple of stages, which are used unchanged. An example is
           `Stage(WaveletPreservation(bank=Meyer(8)), number_of_eigenvectors=60)`.
 
     - `init`: the initial map, which is one of the following.
 
-        - `"auto"` (the default): `"shot"`. For shapes that differ from their own mirror images, such as
-          teeth, the initial map `"aligned"` is refined as well. This happens only if `partial` is False and
-          the preset has repair. `match` then prefers the map from `"aligned"`. The map from `"shot"` is
-          chosen only if its mean expected error is more than 10 % smaller. Both expected errors are computed
-          with `ExpectedErrorSettings(area_weight=0)`.
-        - `"shot"`, `"wks"`, `"hks"` or `"wavelet"`: the initial map sends each vertex of X to the vertex of Y
-          with the nearest descriptor of this kind. Only SHOT distinguishes left from right.
-          With `"shot"`, repair also tries alternative maps.
-        - `"functional"`: the initial map is computed from the functional map that preserves SHOT and commutes
-          with the Laplacian (section 3.2 of the MWP paper). This initial map is smoother than the initial map
-          `"shot"` and has smaller errors. After refinement, however, the map often has larger errors than
-          with `"shot"` (docs/results.md).
-        - `"aligned"`: X is scaled to the area of Y and aligned rigidly. The initial map sends each vertex of
-          X to the vertex of Y with the most similar SHOT descriptor and position. Use this map for shapes
-          that differ little in pose, such as teeth and bones.
-        - an integer array (m,) of 0-based vertices of Y, or a `SurfacePoints` with m points on Y: a given
-          pointwise map.
-        - an integer array (l, 2) of landmarks, where each row contains a vertex of X and its match on Y, both
-          0-based. The initial map then sends each vertex of X to the vertex of Y with the most similar
-          features. The features are SHOT and the geodesic distances to the landmarks. Give a few landmarks on
-          the left side and on the right side of the body.
+        - `"auto"` (the default): `"shot"`. If shapes differ from their own mirror images, as teeth do,
+          `"aligned"` is refined as well and preferred; see `RepairSettings.aligned_preference`. This happens
+          only if `partial` is False and the preset has repair.
+        - `"shot"`, `"wks"`, `"hks"`, `"wavelet"`, `"functional"`, `"aligned"`, a given map (m,) or landmarks
+          (l, 2): see `initial_map`. With `"shot"`, repair also tries alternative maps. `"functional"` is
+          smoother than `"shot"` and has smaller errors, but after refinement, the map often has larger errors
+          (docs/results.md).
 
-    - `laplacian`: the discretization of the Laplacian: `"cotangent"`, `"robust"` or `"auto"` (the default).
-      `"robust"` also handles non-manifold and badly shaped meshes. `"auto"` chooses `"robust"` for a mesh
-      with degenerate triangles or edges with more than two faces, else `"cotangent"`.
-    - `eigensolver`: `"exact"`, `"approximate"` or `"auto"` (the default). `"approximate"` takes less time on
-      large meshes. `"auto"` chooses `"approximate"` if one mesh has at least 50 000 referenced vertices, else
-      `"exact"`.
+    - `laplacian`, `eigensolver`: see `compute_spectrum`. `"auto"` chooses `"approximate"` for both meshes if
+      one mesh has at least 50 000 referenced vertices, else `"exact"`.
     - `partial`: True if one mesh or both meshes are partial shapes of the body; see `paired_spectra`. The
       default is False, for two full shapes. `Correspondence.overlap` predicts which vertices have a
       counterpart on the other mesh.
-    - `scale`: for a partial pair, the factor by which lengths on X are multiplied to become lengths in the
-      unit of Y. The default is 1, for meshes in the same unit. With `"unknown"`, the factor is estimated; see
-      `jaxsmw.geometry.estimate_scale`. Full shapes are always scaled to the same area.
+    - `scale`: see `Pair.make`. Full shapes are always scaled to the same area.
     - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. If they are, the
       mirror image of X is matched instead of X. Whether X is mirrored or not, entry i of the map is the match
       of vertex i of X.
 
-        - `"auto"` (the default): decide by a comparison of coarse maps
-          (`jaxsmw.matching.search.chirality.Hands`). If
-          a coarse map of the mirror image of X preserves distances better than a coarse map of X itself, the
-          mirror image is matched. X itself is matched if X and Y are nearly their own mirror images, as
-          people and animals are. X itself is also matched if `partial` is True.
+        - `"auto"` (the default): the mirror image is matched if a coarse map of it preserves distances better
+          than a coarse map of X itself; see `jaxsmw.matching.search.chirality.Hands`. X itself is matched if
+          X and Y are nearly their own mirror images, as people and animals are, or if `partial` is True.
         - `"no"`: match X itself.
         - `"yes"`: match the mirror image of X.
 
@@ -137,10 +112,9 @@ def match(
       attribute `refinement.history`.
 
     **Returns:** A `Correspondence`, whose attribute `pointwise_map` (m,) is an int64 array of 0-based
-    vertices of Y. A `Correspondence` also has the attributes `functional_map`, `spectrum_x`, `spectrum_y`,
-    `distortion` and `suspicious`. Small components, such as eyes, move with their surroundings and are
-    matched to their counterparts on Y; see `jaxsmw.transfer.match_small_components`. Any other unreferenced
-    vertex of X (in no face) receives the match of the nearest vertex. Such vertices of Y are never matched.
+    vertices of Y. Small components, such as eyes, move with their surroundings and are matched to their
+    counterparts on Y; see `jaxsmw.transfer.match_small_components`. Any other unreferenced vertex of X (in no
+    face) receives the match of the nearest vertex. Such vertices of Y are never matched.
 
     **Raises:** `InputError` if a mesh cannot be used or has too few vertices, if the preset or the initial
     map is unknown or does not fit the meshes, or if another argument is invalid. `ArithmeticError` if the
@@ -149,25 +123,23 @@ def match(
     check_choice(mirror, Mirror, "a mirror setting")
     pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
     adapts = isinstance(preset, str | Preset)
-    chosen = choose_preset(preset)
-    surfaces = pair.without_shortcuts() if chosen.cuts_shortcuts else pair
+    method = choose_preset(preset)
+    surfaces = pair.without_shortcuts() if method.cuts_shortcuts else pair
     fewest = surfaces.fewest_vertices()
     if adapts:
-        chosen = chosen.fitted(fewest)
+        method = method.fitted(fewest)
     automatic = isinstance(init, str) and init == "auto"
-    first_init = DEFAULT_INITIAL_MAP if automatic else init
-    check_initial_map(pair, first_init)  # the check runs before the slow computation of the eigenbases
-    if isinstance(first_init, SurfacePoints):
-        first_init = first_init.nearest_corners(pair.mesh_y)  # cut meshes have other face numbers
-    _compile_ahead(pair, chosen, history)
+    # The check runs before the slow computation of the eigenbases.
+    first_init = check_initial_map(pair, DEFAULT_INITIAL_MAP if automatic else init)
+    _compile_ahead(pair, method, history)
 
     seconds: dict[str, float] = {}
     step = functools.partial(timed, seconds=seconds)
     prepared = prepare(
-        surfaces, chosen.sizes, given=pair, laplacian=laplacian, eigensolver=eigensolver, step=step
+        surfaces, method.sizes, given=pair, laplacian=laplacian, eigensolver=eigensolver, step=step
     )
     decision = Decision(mirror == "yes")
-    aligns = automatic and chosen.repair is not None  # "aligned" is used only for asymmetric shapes
+    aligns = automatic and method.repair is not None  # "aligned" is used only for asymmetric shapes
     if (mirror == "auto" or aligns) and not partial:
         with step("mirror test"):
             decision = Hands(surfaces, *prepared.spectra.both).decide(mirror)
@@ -176,22 +148,21 @@ def match(
     if decision.mirrored:
         prepared = prepared.mirror()
     with step("initial map"):
-        starts = [make_start(prepared, first_init)]
-        if aligns and decision.asymmetric:
-            starts.append(make_start(prepared, "aligned"))
-    if chosen.number_of_descriptors:
+        inits = [first_init, "aligned"] if aligns and decision.asymmetric else [first_init]
+        starts = [make_start(prepared, one) for one in inits]
+    if method.number_of_descriptors:
         with step("descriptors"):
-            prepared = prepared.describe(chosen.number_of_descriptors, required=not adapts)
-    found = match_prepared(prepared, starts, chosen, history=history, step=step)
-    if found.suspicious:
-        warnings.warn(_warning(found, landmarks=starts[0].origin == "landmarks"), stacklevel=2)
-    if found.left_out > SMALL_CLOSED:
-        warnings.warn(_omission(found), stacklevel=2)
+            prepared = prepared.describe(method.number_of_descriptors, required=not adapts)
+    correspondence = match_prepared(prepared, starts, method, history=history, step=step)
+    if correspondence.suspicious:
+        warnings.warn(_warning(correspondence, landmarks=starts[0].origin == "landmarks"), stacklevel=2)
+    if correspondence.left_out > SMALL_CLOSED:
+        warnings.warn(_omission(correspondence), stacklevel=2)
     if decision.doubtful:
         warnings.warn(_doubt(pair, decision), stacklevel=2)
     return replace(
-        found,
-        suspicious=found.suspicious or decision.doubtful,
+        correspondence,
+        suspicious=correspondence.suspicious or decision.doubtful,
         mirror_evidence=decision.evidence,
         seconds=seconds,
     )
@@ -203,7 +174,6 @@ def match_prepared(
     preset: Preset,
     *,
     outcomes: Sequence[Outcome] = (),
-    alternatives: bool = True,
     history: bool = False,
     step: Step = no_step,
 ) -> Correspondence:
@@ -212,10 +182,9 @@ def match_prepared(
     **Arguments:**
 
     - `prepared`: the prepared pair. If it has no descriptors, the stages use none.
-    - `starts`: the initial maps. If there are two, the first is `"shot"` and the second is `"aligned"`.
+    - `starts`: the initial maps: one map, or `"shot"` and `"aligned"`.
     - `preset`: the stages and the repair.
     - `outcomes`: the outcome of `preset.judged` for each start, if these stages have already run.
-    - `alternatives`: whether repair tries alternative maps.
     - `history`: whether to record a `History` of the last stage.
     - `step`: reports and measures the steps. By default, nothing is reported.
 
@@ -228,22 +197,15 @@ def match_prepared(
     return_free_memory()
     with step("refinement"), one_blas_thread():
         repaired = [
-            refine_and_repair(
-                prepared,
-                start,
-                preset,
-                outcome=outcome,
-                alternatives=None if alternatives else (),
-                history=history,
-            )
+            refine_and_repair(prepared, start, preset, outcome=outcome, history=history)
             for start, outcome in itertools.zip_longest(starts, outcomes)
         ]
-    candidates = [one for one in zip(starts, repaired, strict=True) if one[1].successful]
-    start, scored = candidates[0] if candidates else (starts[0], repaired[0])
-    if len(candidates) > 1 and preset.repair is not None:
+    successful = [pair for pair in zip(starts, repaired, strict=True) if pair[1].successful]
+    start, scored = successful[0] if successful else (starts[0], repaired[0])
+    if len(successful) > 1 and preset.repair is not None:
         with step("expected error"):
-            from_shot, from_aligned = (_inconsistency(prepared, preset, one) for _, one in candidates)
-        start, scored = candidates[int(from_shot >= preset.repair.aligned_preference * from_aligned)]
+            shot, aligned = (_mean_expected_error(prepared, preset, scored) for _, scored in successful)
+        start, scored = successful[int(shot >= preset.repair.aligned_preference * aligned)]
     last = step("final stages") if preset.final or preset.repair else nullcontext()
     with last, one_blas_thread():
         if found := match_trimmed(prepared, preset, scored, history=history):
@@ -254,7 +216,7 @@ def match_prepared(
     return Correspondence.of(prepared, start, preset, scored)
 
 
-def _inconsistency(prepared: PreparedPair, preset: Preset, scored: Scored) -> float:
+def _mean_expected_error(prepared: PreparedPair, preset: Preset, scored: Scored) -> float:
     """Return the mean expected error of a map, with `area_weight` 0.
 
     With a positive `area_weight`, the expected error would contain a factor that depends on the shapes, not

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Float64, Int, Int64, Shaped
 
 from jaxsmw.choices import Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.creases import crease_eigenvectors
 from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.mesh import Mesh
@@ -238,15 +238,6 @@ class DescriptorAxes(NamedTuple):
         return with_descriptors(shape, self.principal.components(_shot_rows(shape, self.radii).astype(dtype)))
 
 
-def check_number_of_descriptors(number: int) -> None:
-    """Check that SHOT has a number of principal components.
-
-    **Raises:** `InputError` if the number is not from 1 to 352.
-    """
-    if not 1 <= number <= SHOT_DIMENSION:
-        raise InputError(f"{number} descriptors were requested: give a number from 1 to {SHOT_DIMENSION}.")
-
-
 def with_descriptors(shape: PreparedShape, components: Float[np.ndarray, "a d"]) -> PreparedShape:
     """Return a shape with descriptors, given at its compared vertices (a, d)."""
     everywhere = shape.everywhere(components) * np.asarray(shape.spectrum.mask)[:, None]
@@ -426,7 +417,7 @@ class PreparedPair:
         - `required`: whether to raise `InputError` if a mesh is too coarse for descriptors. If False, the
           function issues a `UserWarning` instead, and the result has no descriptors.
         """
-        check_number_of_descriptors(number_of_descriptors)
+        check_whole_number("number_of_descriptors", number_of_descriptors, 1, SHOT_DIMENSION)
         try:
             shot = [self.shot]
         except InputError as error:
@@ -487,9 +478,9 @@ def prepare(
 def pair_up(pair: Pair, x: PreparedShape, y: PreparedShape, *, trimmed: bool = False) -> PreparedPair:
     """Return the prepared pair of two prepared shapes.
 
-    Two full shapes keep their own units, in which each has area 1. The shapes of a partial pair are scaled by
-    one common factor, so that the larger shape has area 1. Their spectra are then cut at a common limit; see
-    `common_range`.
+    Two full shapes keep their own units, in which each has area 1. This compensates for a difference in size.
+    The shapes of a partial pair are scaled by one common factor, so that the larger shape has area 1. Their
+    spectra are then cut at a common limit; see `common_range`.
 
     **Arguments:**
 
@@ -515,26 +506,19 @@ def paired_spectra(
 ) -> tuple[Spectrum, Spectrum]:
     """Compute the spectra of the two meshes of a pair in comparable units.
 
-    Two full shapes are each scaled to area 1, which compensates for a difference in size. The shapes of a
-    partial pair are scaled by one common factor, so that the larger shape has area 1. For a partial pair, the
-    spectra are then cut at a common limit. The limit is the largest eigenvalue of X or the largest eigenvalue
-    of Y, whichever is smaller. Eigenpairs with eigenvalues above this limit are removed, so k_X and k_Y
-    usually differ for a partial pair.
+    Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by one common factor,
+    and their spectra are cut at a common limit; see `pair_up`.
 
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices), a `Pair`.
     - `number_of_eigenvectors`: the number k of eigenvectors that are computed for each mesh. It must be at
       least 1, and less than the number of referenced vertices of each mesh.
-    - `laplacian`: the discretization of the Laplacian. `"cotangent"` is the usual discretization. `"robust"`
-      also handles non-manifold and badly shaped meshes. `"auto"` chooses `"robust"` for a mesh with
-      degenerate triangles or edges with more than two faces, else `"cotangent"`.
-    - `eigensolver`: `"exact"`, or `"approximate"`, which takes less time on large meshes. `"auto"` chooses
-      `"approximate"` for both meshes if one mesh has at least 50 000 referenced vertices, else `"exact"`.
+    - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`. Both meshes get the same eigensolver.
 
     **Returns:** Two spectra, each a `Spectrum` with positions and normals, in `Pair.units_of_length`. The
     spectrum of X has m vertices and k_X eigenvectors. The spectrum of Y has n vertices and k_Y eigenvectors.
-    For two full shapes, k_X = k_Y = k.
+    For two full shapes, k_X = k_Y = k. For a partial pair, k_X and k_Y usually differ.
 
     **Raises:** `InputError` if a spectrum cannot be computed (see `jaxsmw.compute_spectrum`), or if all
     eigenvalues of a mesh are zero. For a partial pair, `InputError` is also raised if the area of one mesh is

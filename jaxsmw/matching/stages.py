@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS, PresetName
-from jaxsmw.core.refinement import check_samples_use
+from jaxsmw.core.refinement import RefineSettings, check_samples_use
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
@@ -19,23 +19,28 @@ from jaxsmw.geometry.shot import SHOT_DIMENSION
 from jaxsmw.matching.settings import WITHOUT_REPAIR, RepairSettings
 
 
-@dataclass(frozen=True, init=False)
+class _FromRefiner(int):
+    """The default of a number that follows from the refiner. A caller's 0 is another object, and refused."""
+
+
+_FROM_REFINER = _FromRefiner()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Stage:
     """A stage of refinement: a refiner with its numbers of eigenvectors, iterations, descriptors and samples.
 
-    `jaxsmw.match` and `Preset` accept stages. All arguments except `refiner` are keyword arguments. All
-    arguments become attributes of the same names.
+    `jaxsmw.match` and `Preset` accept stages. All arguments except `refiner` are keyword arguments.
 
     **Attributes:**
 
     - `refiner`: the method, an instance of a subclass of `Refiner`: `WaveletPreservation` (the default),
       `FeatureRegression`, `Registration` or your own subclass. An example is
       `WaveletPreservation(bank=Meyer(8))`.
-    - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1; 100 by default. Leave
-      the argument out for a refiner with levels, such as `Registration(levels=(35, 60))`. The stage then uses
-      the largest level.
-    - `iterations`: the number of iterations, at least 1; 3 by default. For a refiner with levels, leave the
-      argument out, because each level is one iteration.
+    - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1; 100 by default. For a
+      refiner with levels, such as `Registration(levels=(35, 60))`, it is the largest level.
+    - `iterations`: the number of iterations, at least 1; 3 by default. For a refiner with levels, each level
+      is one iteration.
     - `number_of_descriptors`: the number of principal components of SHOT that the refiner uses, from 0 to
       352; 0 by default.
     - `number_of_crease_eigenvectors`: the number of crease eigenvectors of each shape that the refiner uses,
@@ -56,94 +61,62 @@ class Stage:
     samples is not an integer, is out of range or contradicts the refiner's levels.
     """
 
-    refiner: Refiner
-    number_of_eigenvectors: int
-    iterations: int
-    number_of_descriptors: int
-    number_of_crease_eigenvectors: int
-    number_of_samples: int | None
-    starts_on_samples: bool
-    ends_on_samples: bool
-    stop_when_unchanged: bool
+    refiner: Refiner = field(default=WaveletPreservation(), kw_only=False)
+    number_of_eigenvectors: int = _FROM_REFINER
+    iterations: int = _FROM_REFINER
+    number_of_descriptors: int = 0
+    number_of_crease_eigenvectors: int = 0
+    number_of_samples: int | None = None
+    starts_on_samples: bool = False
+    ends_on_samples: bool = False
+    stop_when_unchanged: bool = False
 
-    def __init__(
-        self,
-        refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
-        *,
-        number_of_eigenvectors: int | None = None,
-        iterations: int | None = None,
-        number_of_descriptors: int = 0,
-        number_of_crease_eigenvectors: int = 0,
-        number_of_samples: int | None = None,
-        starts_on_samples: bool = False,
-        ends_on_samples: bool = False,
-        stop_when_unchanged: bool = False,
-    ) -> None:
-        if not isinstance(refiner, Refiner):
+    def __post_init__(self) -> None:
+        if not isinstance(self.refiner, Refiner):
             raise InputError(
-                f"refiner is {refiner!r}: give a Refiner such as WaveletPreservation(bank=Meyer(8))."
+                f"refiner is {self.refiner!r}: give a Refiner such as WaveletPreservation(bank=Meyer(8))."
             )
-        largest, count = max(refiner.levels, default=None), len(refiner.levels) or None
-        sizes = {
-            "number_of_eigenvectors": _derived(
-                "number_of_eigenvectors", number_of_eigenvectors, largest, NUMBER_OF_EIGENVECTORS
-            ),
-            "iterations": _derived("iterations", iterations, count, ITERATIONS),
-            "number_of_descriptors": number_of_descriptors,
-            "number_of_crease_eigenvectors": number_of_crease_eigenvectors,
-        }
-        if number_of_samples is not None:
-            sizes["number_of_samples"] = number_of_samples
-        checked = {name: check_whole_number(name, value) for name, value in sizes.items()}
-        try:
-            check_samples_use(refiner, number_of_samples is not None, starts_on_samples, ends_on_samples)
-        except ValueError as error:
-            raise InputError(f"{error}.") from None
-        others = {
-            "refiner": refiner,
-            "number_of_samples": None,
-            "starts_on_samples": starts_on_samples,
-            "ends_on_samples": ends_on_samples,
-            "stop_when_unchanged": stop_when_unchanged,
-        }
-        for name, value in (others | checked).items():
-            object.__setattr__(self, name, value)
-        self._check_sizes()
+        self._derive("number_of_eigenvectors", max(self.refiner.levels, default=None), NUMBER_OF_EIGENVECTORS)
+        self._derive("iterations", len(self.refiner.levels) or None, ITERATIONS)
+        for name in ("number_of_eigenvectors", "iterations"):
+            check_whole_number(name, getattr(self, name), 1)
+        check_whole_number("number_of_descriptors", self.number_of_descriptors, 0, SHOT_DIMENSION)
+        check_whole_number("number_of_crease_eigenvectors", self.number_of_crease_eigenvectors, 0)
+        if self.number_of_samples is not None:
+            check_whole_number("number_of_samples", self.number_of_samples, 1)
+            if self.number_of_samples < self.number_of_eigenvectors:
+                raise InputError(
+                    f"number_of_samples is {self.number_of_samples}, too few for "
+                    f"{self.number_of_eigenvectors} eigenvectors: use more samples (usually five per "
+                    "eigenvector) or fewer eigenvectors."
+                )
+        samples_use = self.number_of_samples is not None, self.starts_on_samples, self.ends_on_samples
+        check_samples_use(self.refiner, *samples_use)
 
-    def _check_sizes(self) -> None:
-        if self.number_of_eigenvectors < 1:
-            raise InputError(f"{self.number_of_eigenvectors} eigenvectors were requested: give at least 1.")
-        if self.iterations < 1:
-            raise InputError(f"{self.iterations} iterations were requested: give at least 1.")
-        if not 0 <= self.number_of_descriptors <= SHOT_DIMENSION:
+    def _derive(self, name: str, derived: int | None, default: int) -> None:
+        """Set a number that was left out, and check that a given number agrees with the refiner's levels."""
+        number = getattr(self, name)
+        if number is _FROM_REFINER:
+            object.__setattr__(self, name, default if derived is None else derived)
+        elif derived is not None and number != derived:
             raise InputError(
-                f"{self.number_of_descriptors} descriptors were requested, but SHOT has {SHOT_DIMENSION}: "
-                f"give a number from 0 to {SHOT_DIMENSION}."
-            )
-        if self.number_of_crease_eigenvectors < 0:
-            raise InputError(
-                f"{self.number_of_crease_eigenvectors} crease eigenvectors were requested: give 0 or more."
-            )
-        if self.number_of_samples is not None and self.number_of_samples < self.number_of_eigenvectors:
-            raise InputError(
-                f"number_of_samples is {self.number_of_samples}, too few for {self.number_of_eigenvectors} "
-                "eigenvectors: use more samples (usually five per eigenvector) or fewer eigenvectors."
+                f"{name} is {number!r}, but the refiner's levels require {derived}: leave {name} out."
             )
 
     @property
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> RefineSettings:
         """The refiner, the iterations and the Boolean attributes, as keyword arguments of `jaxsmw.refine`.
 
         The levels of the refiner are an array, so stages with equally many levels share a compiled program.
         """
         refiner = self.refiner
-        return {
-            "refiner": refiner.with_traced_levels() if isinstance(refiner, CoarseToFine) else refiner,
-            "iterations": self.iterations,
-            "starts_on_samples": self.starts_on_samples,
-            "ends_on_samples": self.ends_on_samples,
-            "stop_when_unchanged": self.stop_when_unchanged,
-        }
+        return RefineSettings(
+            refiner=refiner.with_traced_levels() if isinstance(refiner, CoarseToFine) else refiner,
+            iterations=self.iterations,
+            starts_on_samples=self.starts_on_samples,
+            ends_on_samples=self.ends_on_samples,
+            stop_when_unchanged=self.stop_when_unchanged,
+        )
 
     def with_levels(self, levels: tuple[int, ...]) -> Stage:
         """Return the stage with other levels.
@@ -162,8 +135,7 @@ class Stage:
                 f"{type(self.refiner).__name__} has no levels: use FeatureRegression or Registration."
             )
         refiner = replace(self.refiner, levels=levels)
-        derived: dict[str, Any] = {"number_of_eigenvectors": None, "iterations": None}
-        return replace(self, refiner=refiner, **derived)
+        return replace(self, refiner=refiner, number_of_eigenvectors=_FROM_REFINER, iterations=_FROM_REFINER)
 
     def coarsened(self, levels: tuple[int, ...]) -> Stage:
         """Return the stage with other levels, at most its number of eigenvectors each.
@@ -199,17 +171,6 @@ class Stage:
         if self.refiner.levels:
             return fitted.with_levels(tuple(min(level, most) for level in self.refiner.levels))
         return replace(fitted, number_of_eigenvectors=most)
-
-
-def _derived(name: str, given: int | None, derived: int | None, default: int) -> int:
-    """Return `derived` if the refiner has levels; else `given`, or `default` if `given` is None."""
-    if derived is None:
-        return default if given is None else given
-    if given is not None and given != derived:
-        raise InputError(
-            f"{name} is {given!r}, but the refiner's levels require {derived}: leave {name} out."
-        )
-    return derived
 
 
 class Sizes(NamedTuple):
@@ -302,6 +263,13 @@ class Preset:
         if self.large is not None and number_of_vertices >= _LARGE_FROM:
             return self.large.fitted(number_of_vertices)
         return replace(self, large=None)._with_stages(lambda stage: stage.fitted(number_of_vertices))
+
+    def without_alternatives(self) -> Preset:
+        """Return the preset whose repair tries no alternative maps."""
+        if self.repair is None:
+            return self
+        large = None if self.large is None else self.large.without_alternatives()
+        return replace(self, repair=replace(self.repair, finalists=0), large=large)
 
     def without_descriptors(self) -> Preset:
         """Return the preset with stages that use no descriptors."""

@@ -19,9 +19,10 @@ from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.alignment import align_rigidly
-from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points, geodesic_distances
+from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import poisson_disk_samples
+from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, check_surface_points
 from jaxsmw.matching.executor import Start, nearest_rows
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -71,21 +72,24 @@ def initial_map(
     another mesh, a mesh that is too coarse for SHOT, or signatures that are not finite. `ArithmeticError` if
     the functional map of `"functional"` cannot be computed.
     """
-    check_initial_map(pair, init)
-    return make_start(PreparedPair.of(pair, spectrum_x, spectrum_y), init).pointwise_map
+    start = make_start(PreparedPair.of(pair, spectrum_x, spectrum_y), init)
+    return extend_to_unreferenced(pair.mesh_x, start.pointwise_map)
 
 
 def make_start(prepared: PreparedPair, init: InitialMap | ArrayLike | SurfacePoints) -> Start:
-    """Return the start of a prepared pair from the initial map that `initial_map` describes."""
-    given, mesh_x = check_initial_map(prepared.pair, init), prepared.pair.mesh_x
-    if isinstance(given, str):
-        found = nearest_map(prepared, _finite(prepared, given, FEATURES[given](prepared)))
-        return Start(extend_to_unreferenced(mesh_x, found), given)
-    if given.ndim == 1:
-        return Start(extend_to_unreferenced(mesh_x, given), "map")
-    found = nearest_map(prepared, _finite(prepared, "landmark", _landmark_features(prepared, given)))
-    found[given[:, 0]] = given[:, 1]
-    return Start(extend_to_unreferenced(mesh_x, found), "landmarks")
+    """Return the start of a prepared pair from the initial map that `initial_map` describes.
+
+    The matches of unreferenced vertices have no meaning.
+    """
+    init = check_initial_map(prepared.pair, init)
+    if isinstance(init, str):
+        return Start(nearest_map(prepared, _finite(prepared, init, FEATURES[init](prepared))), init)
+    if init.ndim == 1:
+        return Start(init, "map")
+    features = _finite(prepared, "landmark", _landmark_features(prepared, init))
+    pointwise_map = nearest_map(prepared, features)
+    pointwise_map[init[:, 0]] = init[:, 1]
+    return Start(pointwise_map, "landmarks")
 
 
 def check_initial_map(
@@ -136,20 +140,15 @@ def _finite(prepared: PreparedPair, name: str, features: _Features) -> _Features
 
 def _checked_map(pair: Pair, init: ArrayLike) -> Int64[np.ndarray, " m"]:
     mesh_x, mesh_y = pair.meshes
-    given = check_indices(init, len(mesh_y.vertices), f"initial map on {mesh_y.name}: vertex")
-    if len(given) != (m := len(mesh_x.vertices)):
-        raise InputError(
-            f"the initial map has {len(given)} entries, but {mesh_x.name} has {m} vertices: give one entry "
-            "for each vertex."
-        )
-    unused = ~mesh_y.referenced_vertices[given] & mesh_x.referenced_vertices
+    matches = check_pointwise_map(init, mesh_x, mesh_y, "initial map")
+    unused = ~mesh_y.referenced_vertices[matches] & mesh_x.referenced_vertices
     if unused.any():
         raise InputError(
             f"the initial map sends {unused.sum()} vertices to vertices of {mesh_y.name} that are in no "
-            f"face, for example vertex {np.flatnonzero(unused)[0]} to vertex {given[unused][0]}: choose "
-            "vertices in faces."
+            f"face, for example vertex {np.flatnonzero(unused)[0]} to vertex {matches[unused][0]}: "
+            "choose vertices in faces."
         )
-    return given
+    return matches
 
 
 def _shot_features(prepared: PreparedPair) -> _Features:

@@ -21,7 +21,7 @@ from jaxsmw.choices import Axis
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.errors import InputError, check_number
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.io.maps import check_pointwise_map
+from jaxsmw.geometry.surface_points import check_pointwise_map
 from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, error_colors, position_colors
 from jaxsmw.report.inputs import check_errors, check_functional_map
 from jaxsmw.report.rendering import camera_axes, choose_azimuth, render

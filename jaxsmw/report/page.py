@@ -18,8 +18,8 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_number
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import check_pointwise_map
 from jaxsmw.io.landmarks import Landmarks
-from jaxsmw.io.maps import check_pointwise_map
 from jaxsmw.report.colors import ERROR_LIMIT, position_colors
 from jaxsmw.report.inputs import check_errors
 from jaxsmw.report.page_data import (

@@ -25,8 +25,8 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import check_pointwise_map
 from jaxsmw.io.landmarks import Landmarks
-from jaxsmw.io.maps import check_pointwise_map
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import paired_spectra

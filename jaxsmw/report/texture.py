@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64
 from matplotlib.image import imsave
 
-from jaxsmw.geometry.geodesics import SurfacePoints
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.report.standing import visible
 from jaxsmw.runtime.files import atomic_write
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple, TypedDict, TypeVar
+from typing import NamedTuple, TypeVar, Unpack
 
 import equinox as eqx
 import jax
@@ -13,25 +13,45 @@ import numpy as np
 from jax import lax
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int, Int32
+from jaxtyping import Array, Int, Int32, Shaped
 
-from jaxsmw.choices import ITERATIONS
-from jaxsmw.core.refinement import Refinement, refine
-from jaxsmw.core.refiner import Refiner
-from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.core.search import queries_per_block
+from jaxsmw.core.checks import check_pointwise_map
+from jaxsmw.core.refinement import Refinement, RefineSettings, refine
+from jaxsmw.core.search import BLOCK, queries_per_block
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows, padded_size
 from jaxsmw.runtime.threads import one_blas_thread
 
 # In scripts/benchmark_batches.py, larger batches save no time on any tested device.
 _LARGEST_BATCH = 64
 # The assumed memory, in bytes, of a device that does not report its memory.
 _USUAL_MEMORY = 8 * 2**30
+# A padded size is a multiple of `power / _SUBDIVISION`, where `power` is the largest power of two below the
+# number of vertices. Every padded size is also a multiple of the block size of the search. At most 1/8 of the
+# vertices of a padded shape are padding if the padded size is at least 1024. Shapes with 4000 to 16 000
+# vertices have only 17 different padded sizes.
+_SUBDIVISION = 8
 
 Tree = TypeVar("Tree")
+
+
+def padded_size(number_of_vertices: int) -> int:
+    """Return the number of vertices to which a shape is padded.
+
+    One compiled program serves all shapes with the same padded size.
+    """
+    power = 2 ** max(number_of_vertices - 1, 1).bit_length() // 2
+    step = max(power // _SUBDIVISION, BLOCK)
+    return -(-number_of_vertices // step) * step
+
+
+def pad_rows(rows: Shaped[np.ndarray, "n ..."], number_of_rows: int) -> Shaped[np.ndarray, "p ..."]:
+    """Return an array (n, ...) extended by rows of zeros to a given number of rows.
+
+    `number_of_rows` must be at least n.
+    """
+    return np.pad(rows, ((0, number_of_rows - len(rows)), *((0, 0),) * (rows.ndim - 1)))
 
 
 def stack(spectra: Sequence[Spectrum]) -> Spectrum:
@@ -39,14 +59,6 @@ def stack(spectra: Sequence[Spectrum]) -> Spectrum:
 
     Every array of the result has a leading axis, with one entry per shape. All shapes are padded with masked
     vertices to the number of vertices of the largest shape.
-
-    **Arguments:**
-
-    - `spectra`: at least one `Spectrum`. All spectra need the same number k of eigenvectors and the same
-      optional arrays, such as descriptors.
-
-    **Returns:** The stacked `Spectrum`, in the units of the given spectra. For s shapes and n vertices in the
-    largest shape, `eigenvectors` has shape (s, n, k).
 
     **Raises:** `InputError` if there are no shapes, if the shapes have different numbers of eigenvectors, or
     if only some of them have an optional array.
@@ -63,14 +75,11 @@ def stack(spectra: Sequence[Spectrum]) -> Spectrum:
 
 
 def check_devices(devices: Sequence[jax.Device] | None) -> None:
-    """Check that `devices` is None or contains at least one JAX device and nothing else.
-
-    **Raises:** `InputError` if not.
-    """
+    """Raise `InputError` unless `devices` is None or contains JAX devices only, at least one."""
     if devices is None:
         return
-    found = list(devices) if isinstance(devices, Iterable) else []
-    if not found or not all(isinstance(device, jax.Device) for device in found):
+    checked = list(devices) if isinstance(devices, Iterable) else []
+    if not checked or not all(isinstance(device, jax.Device) for device in checked):
         raise InputError(f"devices is {devices!r}: give at least one JAX device, or None for all devices.")
 
 
@@ -79,104 +88,80 @@ def refine_pairs(
     pairs: Sequence[tuple[int, int]],
     pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     *,
-    refiner: Refiner = WaveletPreservation(),  # noqa: B008 (immutable)
-    iterations: int = ITERATIONS,
     samples: Sequence[Int[Array, " _"]] | None = None,
-    starts_on_samples: bool = False,
-    ends_on_samples: bool = False,
-    partial: bool = False,
-    stop_when_unchanged: bool = False,
-    history: bool = False,
     batch_size: int | None = None,
     memory: int | None = None,
     devices: Sequence[jax.Device] | None = None,
+    **settings: Unpack[RefineSettings],
 ) -> Iterator[tuple[int, Refinement]]:
     """Refine many pairs of shapes, of equal or different sizes, in batches on all devices.
 
-    Shapes are padded to a few common sizes (`jaxsmw.runtime.padding.padded_size`). One compiled program
-    serves all pairs with the same combination of sizes. Each batch is divided among all devices. With several
-    processes (`jax.distributed`), call this function with the same arguments in each process. The function
-    uses the devices of all processes, and every process receives all results.
+    Shapes are padded to a few common sizes, so that pairs of similar sizes share one compiled program. With
+    several processes (`jax.distributed`), call this function with the same arguments in each process. It
+    divides each batch among the devices of all processes, and every process receives all results.
 
     The functional maps equal those of `refine` up to rounding errors. A match can differ only if two vertices
     of Y are equally near up to rounding errors.
 
     **Arguments:**
 
-    - `spectra`: a sequence of shapes, each a `Spectrum`. Unless `partial` is True, each shape should have
-      area 1, as from `compute_spectrum`. Not all refiners scale the shapes. The shapes may have different
-      numbers of eigenvectors. All shapes must have the same number of descriptors, or no shape may have
-      descriptors.
-    - `pairs`: for each pair, a tuple of two integers: the indices of source X and target Y in `spectra`,
-      counted from 0. A pair may occur several times with different initial maps.
-    - `pointwise_maps`: for each pair, the initial map T: X -> Y, an integer array (m,) with one 0-based
-      vertex of Y per vertex of X.
-    - `refiner`: the method, a `Refiner` such as `WaveletPreservation()`.
-    - `iterations`: the number of iterations, an integer of at least 1.
-    - `samples`: for each shape, an integer array (s,) of the 0-based vertices on which the refiner iterates.
-      The number s must be the same for all shapes. If None, all iterations use all vertices.
-    - `starts_on_samples`, `ends_on_samples`: whether the first and the last step of each refinement use only
-      the samples; see `refine`.
-    - `partial`: whether one shape of each pair is a partial shape and the other shape is the full shape. If
-      True, both shapes must have the same unit of length.
-    - `stop_when_unchanged`: whether to stop the refinement of a pair when an iteration changes no match.
-    - `history`: whether to record a `History` of each pair.
-    - `batch_size`: the number of pairs that each device receives at the same time. Accelerators refine these
-      pairs at the same time, and CPUs refine them one after another. The default on CPUs is 1, because larger
-      batches save no time there. On other devices, the default is the number of pairs that fit into `memory`,
-      but at most 64.
+    - `spectra`: the shapes, each a `Spectrum`. The shapes may have different numbers of eigenvectors, but all
+      or none of them must have descriptors, and in the same number.
+    - `pairs`: for each pair, the 0-based indices of source X and target Y in `spectra`. A pair may occur
+      several times with different initial maps.
+    - `pointwise_maps`: for each pair, the initial map T: X -> Y (m,), 0-based vertices of Y.
+    - `samples`: for each shape, the samples (s,), as 0-based vertices; s must be the same for all shapes.
+    - `batch_size`: the number of pairs that each device receives at the same time. The default on CPUs is 1,
+      because larger batches save no time there. On other devices, it is the number of pairs that fit into
+      `memory`, but at most 64.
     - `memory`: the memory in bytes that a batch may use on each device if `batch_size` is None. The default
       is half of the device's memory.
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
+    - `settings`: the arguments of `refine` that all pairs share: `refiner`, `iterations`,
+      `starts_on_samples`, `ends_on_samples`, `partial`, `stop_when_unchanged` and `history`.
 
-    **Returns:** An iterator over tuples of two elements: the 0-based index of a pair in `pairs`, and the
-    `Refinement` of this pair. The iterator groups the pairs by their padded sizes, so their order differs
-    from the order in `pairs`. Numerical failures raise no error, so compare the `result` of each refinement
-    with `RESULTS.successful`.
+    **Returns:** An iterator over tuples of the 0-based index of a pair in `pairs` and its `Refinement`. Pairs
+    are grouped by their padded sizes, so their order differs from the order in `pairs`. Numerical failures
+    raise no error, so compare the `result` of each refinement with `RESULTS.successful`.
 
-    **Raises:** `InputError` if the length of `pointwise_maps` differs from that of `pairs`, or the length of
-    `samples` differs from that of `spectra`. `InputError` is also raised if a pair refers to a shape that
-    does not exist, an initial map does not contain one integer per vertex of X, a shape is not a `Spectrum`,
-    `batch_size` is below 1, or there are no devices. The errors of `refine` are raised while the iterator
-    runs.
+    **Raises:** `InputError` if an argument is not as described. The errors of `refine` are raised while the
+    iterator runs.
     """
     _check_pairs(spectra, pairs, pointwise_maps, samples)
     check_devices(devices)
     if batch_size is not None and batch_size < 1:
         raise InputError(f"batch_size is {batch_size}, but a batch needs at least 1 pair")
-    settings = _Settings(
-        iterations=iterations,
-        starts_on_samples=starts_on_samples,
-        ends_on_samples=ends_on_samples,
-        partial=partial,
-        stop_when_unchanged=stop_when_unchanged,
-        history=history,
-    )
     devices = jax.devices() if devices is None else devices
     mesh = Mesh(np.array(devices), ("pairs",))
 
     def results() -> Iterator[tuple[int, Refinement]]:
         for sizes, positions in _positions_by_size(spectra, pairs).items():
-            pair = sizes.bytes_per_pair(spectra[0].eigenvectors.dtype.itemsize)
-            side_by_side = batch_size or _default_batch_size(pair, memory, devices[0])
+            needed = bytes_per_pair(
+                sizes.m, sizes.n, max(sizes.k_x, sizes.k_y), spectra[0].eigenvectors.dtype.itemsize
+            )
+            side_by_side = batch_size or _default_batch_size(needed, memory, devices[0])
             per_call = min(side_by_side, -(-len(positions) // len(devices))) * len(devices)
             x, y = (
                 _Stack(spectra, samples, [pairs[position][side] for position in positions], size, mesh)
                 for side, size in ((0, sizes.m), (1, sizes.n))
             )
             for begin in range(0, len(positions), per_call):
-                chosen = positions[begin : begin + per_call]
+                of_batch = positions[begin : begin + per_call]
                 # The last batch is filled with copies of its last pair, because a smaller batch would need
                 # another compiled program.
-                filled = chosen + chosen[-1:] * (per_call - len(chosen))
+                filled = of_batch + of_batch[-1:] * (per_call - len(of_batch))
                 maps = np.stack([pad_rows(np.asarray(pointwise_maps[p]), sizes.m) for p in filled])
                 batch = _Batch(
                     x.rows([pairs[p][0] for p in filled]),
                     y.rows([pairs[p][1] for p in filled]),
                     jax.device_put(maps.astype(np.int32), NamedSharding(mesh, _DIVIDED)),
                 )
-                for position, one in zip(chosen, _refinements(refiner, batch, mesh, settings), strict=False):
-                    yield position, one.unpadded(len(pointwise_maps[position]))
+                with one_blas_thread():
+                    refined = compiled(_refine_batch)(batch, mesh, settings)
+                    refined = multihost_utils.process_allgather(refined, tiled=True)
+                for row, position in enumerate(of_batch):
+                    of_pair = jax.tree.map(lambda leaf, row=row: jnp.asarray(leaf[row]), refined)
+                    yield position, of_pair.unpadded(len(pointwise_maps[position]))
 
     return results()
 
@@ -187,7 +172,6 @@ def _check_pairs(
     pointwise_maps: Sequence[Int[Array, " _"] | Int[np.ndarray, " _"]],
     samples: Sequence[Int[Array, " _"]] | None,
 ) -> None:
-    """Raise `InputError` if the shapes, pairs, initial maps or samples of `refine_pairs` are not valid."""
     if len(pairs) != len(pointwise_maps):
         raise InputError(
             f"there are {len(pairs)} pairs and {len(pointwise_maps)} initial maps: give one map per pair"
@@ -209,28 +193,7 @@ def _check_pairs(
                 f"pair {position} is {tuple(pair)}, but there are {len(spectra)} shapes: give the indices of "
                 "two shapes, counted from 0"
             )
-        if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
-            raise InputError(
-                f"the initial map of pair {position} has type {pointwise_map.dtype}: give integer vertex "
-                "indices"
-            )
-        vertices = spectra[pair[0]].mask.shape
-        if pointwise_map.shape != vertices:
-            raise InputError(
-                f"the initial map of pair {position} has shape {pointwise_map.shape}, but X has "
-                f"{vertices[0]} vertices: give one vertex of Y for each vertex of X"
-            )
-
-
-class _Settings(TypedDict):
-    """The arguments of `refine` that are the same for all pairs."""
-
-    iterations: int
-    starts_on_samples: bool
-    ends_on_samples: bool
-    partial: bool
-    stop_when_unchanged: bool
-    history: bool
+        check_pointwise_map(f"initial map of pair {position}", pointwise_map, len(spectra[pair[0]].mask))
 
 
 class _Sizes(NamedTuple):
@@ -241,15 +204,10 @@ class _Sizes(NamedTuple):
     k_x: int
     k_y: int
 
-    def bytes_per_pair(self, itemsize: int) -> int:
-        """Return the memory of one pair of these sizes; see the function `bytes_per_pair`."""
-        return bytes_per_pair(self.m, self.n, max(self.k_x, self.k_y), itemsize)
-
 
 def _positions_by_size(
     spectra: Sequence[Spectrum], pairs: Sequence[tuple[int, int]]
 ) -> dict[_Sizes, list[int]]:
-    """Return a dictionary from each combination of sizes to the indices of its pairs in `pairs`."""
     groups: dict[_Sizes, list[int]] = {}
     for position, pair in enumerate(pairs):
         (m, k_x), (n, k_y) = (spectra[shape].eigenvectors.shape for shape in pair)
@@ -303,13 +261,12 @@ def _take(tree: Tree, places: Int[Array, " batch"], mesh: Mesh) -> Tree:
     return lax.with_sharding_constraint(taken, NamedSharding(mesh, _DIVIDED))
 
 
-def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settings) -> Refinement:
+def _refine_batch(batch: _Batch, mesh: Mesh, settings: RefineSettings) -> Refinement:
     def one(pair: _Batch) -> Refinement:
         (spectrum_x, samples_x), (spectrum_y, samples_y), initial_map = pair
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
-        return refine(spectrum_x, spectrum_y, initial_map, refiner=refiner, samples=samples, **settings)
+        return refine(spectrum_x, spectrum_y, initial_map, samples=samples, **settings)
 
-    # CPUs use `lax.map`, because a batch of pairs takes more time than the pairs one after another.
     each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
     if mesh.size == 1:
         return each(batch)
@@ -320,47 +277,23 @@ def _refine_batch(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settin
     return lax.with_sharding_constraint(refined, NamedSharding(mesh, _DIVIDED))
 
 
-def _refinements(refiner: Refiner, batch: _Batch, mesh: Mesh, settings: _Settings) -> Iterator[Refinement]:
-    """Refine a batch and yield the refinement of each pair."""
-    with one_blas_thread():
-        refined = compiled(_refine_batch)(refiner, batch, mesh, settings)
-        refined = multihost_utils.process_allgather(refined, tiled=True)
-    for row in range(len(batch.initial_maps)):
-        yield jax.tree.map(lambda leaf, row=row: jnp.asarray(leaf[row]), refined)
-
-
 def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.Device) -> int:
-    """Return the default number of pairs that a device refines at the same time.
-
-    The number is 1 on CPUs. On other devices, it is the number of pairs that fit into the memory, at most 64.
-    """
     if _one_at_a_time(device):
         return 1
     if memory is None:
-        known = device.memory_stats() or {}
-        memory = known.get("bytes_limit", _USUAL_MEMORY) // 2
+        memory = (device.memory_stats() or {}).get("bytes_limit", _USUAL_MEMORY) // 2
     return int(np.clip(memory // bytes_of_a_pair, 1, _LARGEST_BATCH))
 
 
 def _one_at_a_time(device: jax.Device) -> bool:
-    """Return whether a device should refine pairs one after another.
-
-    On CPUs, a batch of pairs takes about 33 % more time than the same pairs one after another.
-    """
+    # On CPUs, a batch of pairs takes about 33 % more time than the same pairs one after another.
     return device.platform == "cpu"
 
 
 def bytes_per_pair(m: int, n: int, k: int, itemsize: int = 4) -> int:
-    """Return the approximate memory that `refine` uses on a device for one pair, in bytes.
+    """Return the approximate memory in bytes that `refine` uses on a device for one pair, with its spectra.
 
-    The memory includes the spectra of the pair. On CPUs, it grows linearly with m and n. On accelerators, it
-    also includes the scores of a large block of queries; see `jaxsmw.core.search.queries_per_block`.
-
-    **Arguments:**
-
-    - `m`, `n`: the numbers of vertices of X and Y.
-    - `k`: the number of eigenvectors.
-    - `itemsize`: the size of one floating-point number, in bytes.
+    X has m vertices, Y has n vertices, both have k eigenvectors, and a number has `itemsize` bytes.
     """
     eigenvectors, embeddings, scores = (m + n) * k, 2 * (m + n) * k, 3 * n * queries_per_block(m, n)
     return itemsize * (eigenvectors + embeddings + scores)

@@ -45,11 +45,9 @@ Arrays = dict[str, np.ndarray]
 def cached(kind: str, inputs: Inputs, compute: Callable[[], Arrays]) -> Arrays:
     """Return the result of `compute`, or read the result from the disk if it was computed before.
 
-    The environment variable `JAXSMW_CACHE` names the directory of the cache. The default is the user's cache
-    directory. An empty name or `off` disables the cache. The environment variable `JAXSMW_CACHE_LIMIT` limits
-    the size of the cache in GiB, by default to 4. Above this limit, the least recently used entries are
-    removed. If an entry is damaged, its result is computed again. If an entry cannot be written, the function
-    issues a warning and returns the result.
+    The environment variable `JAXSMW_CACHE` names the directory; an empty name or `off` disables the cache.
+    `JAXSMW_CACHE_LIMIT` limits its size in GiB, by default to 4, by removing the least recently used entries.
+    A damaged entry is computed again. If an entry cannot be written, the function warns.
 
     **Arguments:**
 
@@ -87,8 +85,7 @@ def cached(kind: str, inputs: Inputs, compute: Callable[[], Arrays]) -> Arrays:
 class Store:
     """A store of results in an existing directory; without a directory, the store keeps nothing.
 
-    `cached` documents the arguments of the methods. `save` and `get` raise `OSError` or `InputError` if the
-    result cannot be written.
+    `cached` documents the arguments. `save` and `get` raise `InputError` if the result cannot be written.
     """
 
     def __init__(self, directory: Path | None = None):
@@ -99,14 +96,23 @@ class Store:
         if self.directory is None:
             return None
         key = _key(kind, inputs)
-        return _load(self._path(kind, key), key)
+        path = self.directory / f"{kind}-{key}.npz"
+        # Reading a damaged file can raise any exception.
+        with suppress(Exception), path.open("rb") as file, np.load(file, allow_pickle=False) as entry:
+            arrays = {name: entry[name] for name in entry.files}
+            # A zip file has checksums for its members, but not for the list of members.
+            if arrays.pop("contents").tolist() == [key, *arrays]:
+                with suppress(OSError):
+                    os.utime(path)  # `_remove_oldest` reads the time of the last use
+                return arrays
+        return None
 
     def save(self, kind: str, inputs: Inputs, arrays: Mapping[str, np.ndarray]) -> None:
         """Store a result."""
         if self.directory is None:
             return
         key = _key(kind, inputs)
-        with atomic_write(self._path(kind, key)) as temporary:
+        with atomic_write(self.directory / f"{kind}-{key}.npz") as temporary:
             np.savez(temporary, contents=np.array([key, *arrays]), **arrays)  # type: ignore[arg-type]
 
     def get(self, kind: str, inputs: Inputs, compute: Callable[[], Arrays]) -> Arrays:
@@ -116,10 +122,6 @@ class Store:
             arrays = compute()
             self.save(kind, inputs, arrays)
         return arrays
-
-    def _path(self, kind: str, key: str) -> Path:
-        assert self.directory is not None
-        return self.directory / f"{kind}-{key}.npz"
 
 
 _recomputing: ContextVar[bool] = ContextVar("recomputing", default=False)
@@ -138,10 +140,8 @@ def recomputing() -> Iterator[None]:
 def cache_compiled_programs() -> None:
     """Make JAX store compiled programs on disk for later processes, and remove damaged programs.
 
-    The programs take at most 0.25 GiB. This function sets environment variables of JAX, so it must run before
-    JAX is imported. If the user has set one of these variables, the function changes none of them.
-
-    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
+    The programs take at most 0.25 GiB. The function sets environment variables of JAX, so it must run before
+    JAX is imported. It changes nothing if the user has set one of these variables.
     """
     place = cache_directory()
     if place is None:
@@ -159,14 +159,10 @@ def cache_compiled_programs() -> None:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError:
         return  # `cached` will warn
-    if not os.access(directory, os.W_OK):
-        return  # JAX would issue a warning for each program that it cannot store
-    if not can_lock(directory):
-        return  # JAX would wait ten seconds for the lock of each program
-    try:
-        str(directory).encode()
-    except UnicodeEncodeError:
-        return  # JAX accepts only names in UTF-8
+    # JAX would warn about each program that it cannot store, would wait ten seconds for the lock of each
+    # program, and accepts only names in UTF-8.
+    if not os.access(directory, os.W_OK) or not can_lock(directory) or not _is_utf8(directory):
+        return
     settings = {
         "JAX_COMPILATION_CACHE_DIR": str(directory),
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(int(min(2**28, cache_limit()))),
@@ -183,13 +179,18 @@ def cache_compiled_programs() -> None:
         warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache entry")
 
 
+def _is_utf8(directory: Path) -> bool:
+    try:
+        str(directory).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def cache_contents() -> dict[str, list[int]]:
     """Return the sizes of the files of each kind in bytes; kinds with large files come first.
 
-    A kind is that of entries as passed to `cached`, `"compiled programs"` for the programs of JAX, or
-    `"temporary files"` for files that a killed process left behind.
-
-    **Raises:** `InputError` if the directory cannot be read.
+    A kind is that of `cached`, `"compiled programs"`, or `"temporary files"` that a killed process left.
     """
     sizes: dict[str, list[int]] = {}
     for kind, path in _own_files():
@@ -199,10 +200,7 @@ def cache_contents() -> dict[str, list[int]]:
 
 
 def clear_cache() -> None:
-    """Remove all entries and all compiled programs. Commands that run at the same time compute them again.
-
-    **Raises:** `InputError` if a file cannot be removed.
-    """
+    """Remove all entries and all compiled programs. Commands that run at the same time compute them again."""
     for _, path in _own_files():
         try:
             path.unlink(missing_ok=True)
@@ -247,10 +245,7 @@ def cache_directory() -> Path | None:
 
 
 def cache_limit() -> float:
-    """Return the largest total size of the entries in bytes, without compiled programs.
-
-    **Raises:** `InputError` if `JAXSMW_CACHE_LIMIT` is not a finite number, or is negative.
-    """
+    """Return the largest total size of the entries in bytes, without compiled programs."""
     text = os.environ.get("JAXSMW_CACHE_LIMIT", "4")
     try:
         limit = float(text)
@@ -270,18 +265,6 @@ def _key(kind: str, inputs: Inputs) -> str:
         digest.update(f"{type(value).__name__} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
-
-
-def _load(path: Path, key: str) -> Arrays | None:
-    # Reading a damaged file can raise any exception. The result is then computed again.
-    with suppress(Exception), path.open("rb") as file, np.load(file, allow_pickle=False) as entry:
-        arrays = {name: entry[name] for name in entry.files}
-        # A zip file has checksums for its members, but not for the list of members.
-        if arrays.pop("contents").tolist() == [key, *arrays]:
-            with suppress(OSError):
-                os.utime(path)  # `_remove_oldest` reads the time of the last use
-            return arrays
-    return None
 
 
 def _remove_oldest(directory: Path, limit: float) -> None:

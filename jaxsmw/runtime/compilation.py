@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
-from threading import Lock
-from typing import Any, TypeVar
+from threading import Lock, Thread
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ import numpy as np
 from jax import ShapeDtypeStruct
 from jaxtyping import PyTree
 
-from jaxsmw.runtime.traced_programs import UndescribedError, describe, rebuild, traced
+from jaxsmw.runtime.traced_programs import Structure, UndescribedError, describe, rebuild, traced
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -31,23 +31,19 @@ _LARGEST_SHARE = 0.25
 
 
 def compiler_options() -> dict[str, str | bool]:
-    """Return options of `jax.jit` that make nearest-neighbour searches fast on CPUs.
+    """Return options of `jax.jit` that make searches and compilation fast on CPUs (docs/speed.md).
 
-    Pass the result to `jax.jit` as `compiler_options`. By default, XLA uses the library YNNPACK for products
-    and sums on CPUs. Waking the threads of YNNPACK takes longer than a small operation. The options disable
-    YNNPACK, which reduces the time of a search in patches by 28 to 37 %. By default, XLA also splits each
-    long sum into several loops to reduce rounding errors. The options disable this splitting, so compilation
-    takes 30 % less time (docs/speed.md). Sums of a million numbers are still accurate to within 5e-6. Level 1
-    of optimisation instead of level 3 reduces the compilation time by a further 20 %. The programs return the
-    same maps and take about the same time.
+    XLA's library YNNPACK is disabled, because waking its threads takes longer than a small operation. Long
+    sums are not split into several loops; sums of a million numbers are still accurate to within 5e-6. Level
+    1 of optimisation instead of level 3 gives the same maps in about the same time. The level is not raised
+    if JAX's setting `jax_disable_most_optimizations` asks for the shortest compilation.
 
-    JAX accepts these options only in the outermost `jax.jit`. Other compiled functions may call
-    `jaxsmw.refine`, so `jaxsmw.refine` does not set the options itself. The options depend on the default
-    backend of JAX, not on `jax.default_device`. If JAX's setting `jax_disable_most_optimizations` asks for
-    the shortest compilation, the options do not raise the level of optimisation.
+    JAX accepts these options only in the outermost `jax.jit`, so `jaxsmw.refine` does not set them itself.
+    The options depend on the default backend of JAX, not on `jax.default_device`.
 
-    **Returns:** A dictionary from the names of the options to their values. Options that the installed XLA
-    does not support are left out. The dictionary is empty if the default backend is not the CPU.
+    **Returns:** A dictionary from the names of the options to their values, for the argument
+    `compiler_options` of `jax.jit`. Options that the installed XLA does not support are left out. The
+    dictionary is empty if the default backend is not the CPU.
     """
     return _options_for(jax.default_backend())
 
@@ -74,11 +70,8 @@ def _known(option: str, value: str | bool) -> bool:
 def compiled(function: Function) -> Function:
     """Return the function compiled with `compiler_options`, for calls from Python.
 
-    If JAX stores compiled programs on disk, the traced programs are stored as well
-    (`jaxsmw.runtime.traced_programs`). A later process then neither traces nor compiles the function.
-
-    Do not call the compiled function inside another compiled function. If `compiled` is called again with the
-    same function, it returns the same compiled function.
+    If JAX stores compiled programs on disk, a later process neither traces nor compiles the function
+    (`jaxsmw.runtime.traced_programs`). Equal functions give the same compiled function.
     """
     return _compiled(function, jax.default_backend())  # type: ignore[return-value]
 
@@ -88,129 +81,140 @@ def _compiled(function: Callable, backend: str) -> _CompiledFunction:
     return _CompiledFunction(function, backend)
 
 
+class _Program(NamedTuple):
+    """A compiled program from arrays to arrays, and the structure of its result."""
+
+    run: Callable
+    structure: Structure
+
+
+_Arguments = tuple[tuple[PyTree, ...], Mapping[str, PyTree]]
+
+
 class _CompiledFunction:
-    """A function with its compiled programs, one for each combination of sizes and settings."""
+    """A function with its compiled programs, one for each combination of sizes and settings.
+
+    The program is None if it cannot be stored on disk. JAX then keeps it in memory.
+    """
 
     def __init__(self, function: Callable, backend: str):
         self._function, self._backend = function, backend
         # The type annotations of Equinox do not declare that Equinox passes unknown options on to JAX.
         self._jitted: Any = eqx.filter_jit(function, compiler_options=_options_for(backend))  # type: ignore[call-overload]
-        self._programs: dict[Hashable, Future[tuple[Callable, Any]]] = {}
+        self._programs: dict[Hashable, Future[_Program | None]] = {}
         self._lock = Lock()
 
     def __call__(self, *positional: PyTree, **named: PyTree) -> PyTree:
-        """Call the function, and compile it first if needed."""
-        program, arrays = self._stored_program(positional, named)
-        if program is None:
+        """Call the function. Compile it first if needed, or wait for its compilation in the background."""
+        arguments = positional, named
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(arguments)):
             return self._jitted(*positional, **named)
-        run, structure = program
-        return rebuild(structure, run(*arrays))
+        future, is_new = self._reserved(arguments)
+        if is_new:
+            self._load(future, arguments, ahead=False)
+        if (program := future.result()) is None:
+            return self._jitted(*positional, **named)
+        return rebuild(program.structure, program.run(*describe(arguments)[1]))
 
-    def compile(self, positional: tuple[PyTree, ...], named: Mapping[str, PyTree]) -> None:
-        """Compile the program for given arguments. Later calls with such arguments find it."""
-        program, _ = self._stored_program(positional, named)
-        if program is None:
-            self._jitted.lower(*positional, **named).compile()
+    def compile_ahead(self, arguments: _Arguments) -> Future[_Program | None]:
+        """Start to compile the program for given arguments in the background."""
+        future, is_new = self._reserved(arguments)
+        x64 = jax.config.read("jax_enable_x64")
 
-    def _stored_program(
-        self, positional: tuple[PyTree, ...], named: Mapping[str, PyTree]
-    ) -> tuple[tuple[Callable, Any] | None, list[Any]]:
-        """Return a program that takes arrays and the structure of its result, and the arrays.
+        def compile_now() -> None:
+            with jax.enable_x64(x64):  # threads do not inherit this setting
+                self._load(future, arguments, ahead=True)
 
-        The program is None if it cannot be stored on disk.
-        """
-        settings: Any = jax.config  # JAX declares no types for its settings
-        stores = settings.jax_enable_compilation_cache and settings.jax_compilation_cache_dir
-        if self._backend != "cpu" or not stores:
-            return None, []
-        try:
-            structure, arrays = describe((positional, dict(named)))
-        except UndescribedError:
-            return None, []
-        if not all(map(_is_plain, arrays)):
-            return None, []
-        shapes = [ShapeDtypeStruct(a.shape, jax.dtypes.canonicalize_dtype(a.dtype)) for a in arrays]
-        key = str(structure), tuple((s.shape, s.dtype) for s in shapes), jax.config.read("jax_enable_x64")
+        if is_new:
+            Thread(target=compile_now).start()
+        return future
+
+    def _reserved(self, arguments: _Arguments) -> tuple[Future[_Program | None], bool]:
+        """Return the future of the program for given arguments, and whether the caller must load it."""
+        leaves, structure = jax.tree.flatten(arguments)
+        key = structure, tuple(map(_kind, leaves)), _stores_programs(), jax.config.read("jax_enable_x64")
         with self._lock:
-            first = key not in self._programs
-            future = self._programs.setdefault(key, Future())
-        if first:
-            try:
-                future.set_result(self._loaded(structure, shapes))
-            except (UndescribedError, ValueError) as error:
-                future.set_exception(error)
-            except BaseException as error:
-                del self._programs[key]  # the next call tries again
-                future.set_exception(error)
+            future = self._programs.get(key)
+            # After a failure, the next call tries again.
+            is_new = future is None or (future.done() and future.exception() is not None)
+            if future is None or is_new:
+                future = self._programs[key] = Future()
+            return future, is_new
+
+    def _load(self, future: Future[_Program | None], arguments: _Arguments, *, ahead: bool) -> None:
         try:
-            return future.result(), arrays
+            program = self._stored_program(arguments)
+            if program is None and ahead:
+                self._jitted.lower(*arguments[0], **arguments[1]).compile()
+            future.set_result(program)
+        except BaseException as error:
+            future.set_exception(error)
+
+    def _stored_program(self, arguments: _Arguments) -> _Program | None:
+        if self._backend != "cpu" or not _stores_programs():
+            return None
+        try:
+            structure, arrays = describe(arguments)
+            if not all(map(_is_plain, arrays)):
+                return None
+            shapes = [ShapeDtypeStruct(a.shape, jax.dtypes.canonicalize_dtype(a.dtype)) for a in arrays]
+            exported, result = traced(self._function, structure, shapes)
         except (UndescribedError, ValueError):
             # JAX raises `ValueError` for operations that it cannot store. If the function itself raised the
             # error, it raises the error again when it is traced without being stored.
-            return None, []
+            return None
+        function = jax.jit(exported.call, compiler_options=_options_for(self._backend))
+        return _Program(function.lower(*shapes).compile(), result)
 
-    def _loaded(self, structure: Any, shapes: list[ShapeDtypeStruct]) -> tuple[Callable, Any]:
-        program = traced(self._function, structure, shapes)
-        function = jax.jit(program.exported.call, compiler_options=_options_for(self._backend))
-        return function.lower(*shapes).compile(), program.structure
+
+def _stores_programs() -> bool:
+    settings: Any = jax.config  # JAX declares no types for its settings
+    return bool(settings.jax_enable_compilation_cache and settings.jax_compilation_cache_dir)
+
+
+def _kind(leaf: Any) -> Hashable:
+    """Return what distinguishes the programs for an argument: the type of an array, or any other value."""
+    if not eqx.is_array(leaf) and not isinstance(leaf, np.ndarray):
+        return type(leaf), leaf
+    return leaf.shape, jax.dtypes.canonicalize_dtype(leaf.dtype), _is_plain(leaf)
 
 
 def _is_plain(array: jax.Array | np.ndarray) -> bool:
     """Return whether an array is a NumPy array, or is on the first device and has a type of its own."""
     if isinstance(array, np.ndarray):
         return True
-    if isinstance(array, jax.core.Tracer) or array.weak_type:
-        return False
-    return array.devices() == {jax.local_devices()[0]}
+    return not array.weak_type and array.devices() == {jax.local_devices()[0]}
 
 
 def compile_ahead(
-    function: Callable,
-    arguments: Callable[[], tuple[tuple[PyTree, ...], Mapping[str, PyTree]]],
-    **settings: object,
-) -> Future[object]:
+    function: Callable, arguments: Callable[[], _Arguments], **settings: object
+) -> Future[_Program | None]:
     """Start to compile `compiled(function)` in the background, for arguments of given sizes.
 
-    Wait for the returned future before you call `compiled(function)`. Otherwise the call compiles the program
-    again.
+    A later call of `compiled(function)` with such arguments waits for the program.
 
     **Arguments:**
 
-    - `arguments`: a function without parameters. It returns the arrays that are passed to `function`: a
-      tuple of positional arguments and a mapping of named arguments. JAX traces `arguments` to determine the
-      sizes of the arrays, and does not compute the arrays.
+    - `arguments`: a function without parameters that returns the arrays passed to `function`: a tuple of
+      positional arguments and a mapping of named arguments. JAX only determines the sizes of the arrays.
     - `settings`: the remaining keyword arguments of `function`.
 
-    **Returns:** A future that is done when the program is compiled. If compilation raises an exception, the
-    future stores the exception. A later call of `compiled(function)` with the same arguments raises the
-    exception again.
+    **Returns:** A future that is done when the program is compiled, or when compilation raised an exception.
     """
+    # Equinox traces only arrays. An array that is broadcast from one element takes almost no memory.
+    positional, named = jax.tree.map(
+        lambda shape: np.broadcast_to(np.zeros((), shape.dtype), shape.shape), jax.eval_shape(arguments)
+    )
     program = _compiled(function, jax.default_backend())
-    x64 = jax.config.read("jax_enable_x64")
-
-    def compile_now() -> Any:
-        with jax.enable_x64(x64):  # threads do not inherit this setting
-            shapes = jax.eval_shape(arguments)
-            # Equinox traces only arrays. An array that is broadcast from one element takes almost no memory.
-            positional, named = jax.tree.map(
-                lambda shape: np.broadcast_to(np.zeros((), shape.dtype), shape.shape), shapes
-            )
-            program.compile(positional, {**named, **settings})
-
-    executor = ThreadPoolExecutor(1)
-    future = executor.submit(compile_now)
-    executor.shutdown(wait=False)
-    return future
+    return program.compile_ahead((positional, {**named, **settings}))
 
 
 def release_programs() -> None:
     """Release all compiled programs if the process uses a large share of its allowed memory maps.
 
-    Commands call this function between pairs. Functions that match many pairs also call it. Functions that
-    match one pair must not call it, because `jax.clear_caches` also clears the programs of the caller. On
-    Linux, the programs for a few dozen pairs of different sizes would use up all memory maps of the process.
-    LLVM would then end the process. JAX compiles released programs again when they are needed, or loads them
-    from the disk. On other systems the function does nothing.
+    On Linux, the programs for a few dozen pairs of different sizes would use up all memory maps, and LLVM
+    would end the process. JAX compiles released programs again or loads them from the disk. Call this
+    function only between pairs of many, because it also releases the programs of the caller.
     """
     try:
         used = Path("/proc/self/maps").read_bytes().count(b"\n")

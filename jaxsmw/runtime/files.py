@@ -31,18 +31,14 @@ FilePath = str | os.PathLike[str]
 def largest_contents(size_of_file: int) -> int:
     """Return the largest number of bytes to which a compressed file of a given size may unpack.
 
-    A malicious file can unpack to a thousand times its size. Contents of 1 GiB are a mesh of ten million
-    vertices. Only eigenvectors are larger, and compression hardly makes them smaller.
+    A malicious file can unpack to a thousand times its size. Of all honest contents, only eigenvectors can be
+    larger than `_LARGEST_FILE`, and compression hardly makes them smaller.
     """
-    return max(2**30, 4 * size_of_file)
+    return max(_LARGEST_FILE, 4 * size_of_file)
 
 
 def read_bytes(path: FilePath, *, largest: int | None = _LARGEST_FILE) -> bytes:
-    """Read a whole regular file of at most `largest` bytes. Reading pipes and devices may never end.
-
-    **Raises:** `InputError` if the file does not exist, is not a regular file, is too large, cannot be read,
-    or changes while it is read.
-    """
+    """Read a whole regular file of at most `largest` bytes, which must not change while it is read."""
     before = _status(path)
     if largest is not None and before.st_size > largest:
         raise InputError(
@@ -61,10 +57,7 @@ def read_bytes(path: FilePath, *, largest: int | None = _LARGEST_FILE) -> bytes:
 
 
 def size_of_file(path: FilePath) -> int:
-    """Return the size of a regular file in bytes.
-
-    **Raises:** `InputError` if the file does not exist, is not a regular file, or cannot be accessed.
-    """
+    """Return the size of a regular file in bytes."""
     return _status(path).st_size
 
 
@@ -75,7 +68,7 @@ def _status(path: FilePath) -> os.stat_result:
         raise InputError(f"{path}: does not exist: check the path.") from None
     except (OSError, ValueError) as error:  # `ValueError` if the name contains a null character
         raise _unreadable(path, error) from error
-    if not stat.S_ISREG(status.st_mode):
+    if not stat.S_ISREG(status.st_mode):  # reading pipes and devices may never end
         raise InputError(f"{path}: is not a regular file: give the path of a file.")
     return status
 
@@ -88,13 +81,9 @@ def _unreadable(path: FilePath, error: OSError | ValueError) -> InputError:
 def atomic_write(path: FilePath) -> Iterator[Path]:
     """Provide an empty temporary file to write to, and move the file to `path` when the block succeeds.
 
-    If the block raises an exception, the temporary file is removed, and `path` is unchanged. The temporary
+    If the block raises an exception, `path` is unchanged; an `OSError` becomes an `InputError`. The temporary
     file has the suffix of `path`, because writers such as `numpy.savez` and `savefig` depend on it. If `path`
-    is a symbolic link, the target of the link is replaced. Temporary files that killed processes left in the
-    directory are removed first.
-
-    **Raises:** `InputError` before the block if `path` cannot be written, and for each `OSError` in the
-    block.
+    is a symbolic link, the target of the link is replaced.
     """
     target = _target(path)
     temporary = _temporary(target)

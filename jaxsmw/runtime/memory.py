@@ -22,12 +22,7 @@ _INTERVAL = 10.0
 
 
 def check_address_space() -> None:
-    """Check that the process may use enough address space to load JAX and SciPy.
-
-    With less, these libraries abort the process or never return while they are loaded.
-
-    **Raises:** `InputError` if the limit of address space (`ulimit -v`) is below 2 GB.
-    """
+    """Raise `InputError` if JAX and SciPy would abort or hang while they are loaded (`ulimit -v`)."""
     if resource is None:
         return
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -42,8 +37,7 @@ def return_free_memory() -> None:
     """Return memory that the process has freed to the operating system, at most once in ten seconds.
 
     The compiler allocates several hundred MiB in its threads. The allocator of glibc keeps freed memory for
-    the thread that allocated it, so other threads cannot use it. On systems without glibc the function does
-    nothing.
+    the thread that allocated it, so other threads cannot use it.
     """
     global _previous
     if time.monotonic() - _previous < _INTERVAL:

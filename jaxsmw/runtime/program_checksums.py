@@ -24,28 +24,23 @@ _ZSTANDARD = b"\x28\xb5\x2f\xfd"
 
 
 def remove_damaged_programs(directory: Path) -> None:
-    """Remove damaged programs from a directory, so that JAX compiles them again.
+    """Remove damaged programs from the directory in which JAX stores programs.
 
-    A program is damaged if it differs from its recorded checksum. The checksum of a new program is recorded
-    if the program can be unpacked; otherwise the program is damaged. Other processes can use the directory
-    at the same time. Files that cannot be read or removed are left alone.
-
-    **Arguments:**
-
-    - `directory`: the directory in which JAX stores programs.
+    A program is damaged if it differs from its recorded checksum, or if a new program cannot be unpacked.
+    Other processes can use the directory at the same time. Files that cannot be read or removed stay.
     """
     record = directory / CHECKSUMS
-    known, whole = _recorded(record), {}
+    recorded, whole = _recorded(record), {}
     for path in sorted(directory.glob("*-cache")):
         with suppress(OSError):
             contents = path.read_bytes()
             checksum = hashlib.sha256(contents).hexdigest()
-            expected = known.get(path.name)
+            expected = recorded.get(path.name)
             if checksum == expected or (expected is None and _can_be_unpacked(contents)):
                 whole[path.name] = checksum
             else:
                 path.unlink()
-    if whole != known:
+    if whole != recorded:
         # If the record cannot be written, all programs are unpacked again next time.
         with suppress(InputError), atomic_write(record) as temporary:
             temporary.write_text(json.dumps(whole, indent=1), "utf-8")
@@ -54,17 +49,14 @@ def remove_damaged_programs(directory: Path) -> None:
 def _recorded(record: Path) -> dict[str, str]:
     """Return the recorded checksums. The dictionary is empty if the record is missing or damaged."""
     with suppress(OSError, ValueError):
-        known = json.loads(record.read_text("utf-8"))
-        if isinstance(known, dict):
-            return known
+        recorded = json.loads(record.read_text("utf-8"))
+        if isinstance(recorded, dict):
+            return recorded
     return {}
 
 
 def _can_be_unpacked(contents: bytes) -> bool:
-    """Return whether the compressed contents of a file are complete.
-
-    JAX compresses programs with zstandard if it is installed, and with zlib otherwise.
-    """
+    # JAX compresses programs with zstandard if it is installed, and with zlib otherwise.
     if not contents.startswith(_ZSTANDARD):
         with suppress(zlib.error):
             return bool(zlib.decompress(contents))

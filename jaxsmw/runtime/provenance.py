@@ -34,11 +34,11 @@ _PACKAGES = (
     "libigl",
     "robust-laplacian",
 )
-_LIBRARY = Path(__file__).parents[1]
+LIBRARY = Path(__file__).parents[1]
 
 
 def versions() -> dict[str, str]:
-    """Return a dictionary from names to versions, for Python and the packages on which results depend."""
+    """Return the versions of Python and of the packages on which results depend, by name."""
     return {
         **{package: metadata.version(package) for package in _PACKAGES},
         "python": platform.python_version(),
@@ -57,11 +57,8 @@ def machine() -> str:
 
 
 def commit() -> str:
-    """Return the git commit of the library. The suffix `-dirty` marks uncommitted changes.
-
-    If there is no git checkout or git is missing, return the installed version.
-    """
-    call = ["git", "-C", str(_LIBRARY), "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
+    """Return the git commit of the library (`-dirty` if it was changed), or else the installed version."""
+    call = ["git", "-C", str(LIBRARY), "describe", "--always", "--dirty", "--exclude=*", "--abbrev=40"]
     try:
         return subprocess.run(call, check=True, capture_output=True, text=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
@@ -74,19 +71,13 @@ def made_with() -> str:
 
 
 def measured_code() -> list[Path]:
-    """Return the library's Python files, except those of the command line and of the report.
-
-    Changes to these files can change numerical results.
-    """
+    """Return the library's Python files that can change numerical results."""
     left_out = ("report", "cli", "__main__.py")
-    return [p for p in sorted(_LIBRARY.rglob("*.py")) if p.relative_to(_LIBRARY).parts[0] not in left_out]
+    return [p for p in sorted(LIBRARY.rglob("*.py")) if p.relative_to(LIBRARY).parts[0] not in left_out]
 
 
 def code_digest(paths: Iterable[Path]) -> str:
-    """Return a hash of the code in Python files, as 16 hexadecimal digits.
-
-    The hash depends on the names and the order of the files, but not on comments, docstrings or layout.
-    """
+    """Return a hash of the code in Python files, without comments, docstrings and layout (16 digits)."""
     digest = hashlib.sha256()
     for path in paths:
         digest.update(f"{path.name}\n{_source_digest(path.read_text('utf-8'))}\n".encode())
@@ -108,22 +99,15 @@ def claimed_directory(
     provenance: Mapping[str, Mapping[str, Any]],
     noted: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[None]:
-    """Lock a directory against other processes while results are added.
-
-    The function is a context manager, and releases the lock at the end of the `with` block. The first call
-    for a directory writes `provenance` to the file `provenance.json`. Later calls check that their argument
-    `provenance` equals the stored provenance.
+    """Lock an existing directory against other processes while a `with` block adds results.
 
     **Arguments:**
 
-    - `directory`: an existing directory.
-    - `provenance`: a dictionary from the name of each group, such as `"settings"`, to a dictionary of named
-      values. These values must be the same for all results in the directory.
-    - `noted`: a dictionary of further information that the first call writes to the file. Later calls ignore
-      `noted`.
+    - `provenance`: groups of named values, such as `"settings"`, that must be the same for all results in the
+      directory. The first call writes them to `provenance.json`, and later calls compare them.
+    - `noted`: further information that the first call writes to the file.
 
-    **Raises:** `InputError` if the stored provenance differs from `provenance`, or if the directory contains
-    results but no `provenance.json`. `InputError` is also raised if `provenance.json` is damaged, if the
+    **Raises:** `InputError` if the stored provenance differs, is missing beside results or is damaged, if the
     directory cannot be locked, or if another process is adding results.
     """
     from filelock import FileLock, Timeout  # the import is slow

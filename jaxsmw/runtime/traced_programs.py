@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Sequence
 from functools import cache
 from types import FunctionType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,37 +17,28 @@ from jax import export
 from jaxtyping import PyTree
 
 from jaxsmw.runtime.cache import cached
-from jaxsmw.runtime.provenance import measured_code, versions
+from jaxsmw.runtime.provenance import LIBRARY, measured_code, versions
 
 # Objects of these packages can be described by the names of their classes, because `traced` knows the code of
 # the first package and the version of the second package.
 _PACKAGES = ("jaxsmw", "equinox")
+# The methods of a benchmark are traced in each process, so that changes of them need no other programs.
+_NEVER_STORED = "jaxsmw.benchmark"
 # These types are stored as they are.
 _VALUES = (type(None), bool, int, float, str)
+
+Structure = Any
+"""The structure of a pytree without its arrays, as lists, texts and numbers that JSON can store."""
 
 
 class UndescribedError(Exception):
     """A pytree contains an object that `describe` cannot describe, such as an object of the user's code."""
 
 
-class TracedProgram(NamedTuple):
-    """A traced function of arrays.
-
-    **Attributes:**
-
-    - `exported`: the function, which takes and returns a list of arrays.
-    - `structure`: the structure of the result, for `rebuild`.
-    """
-
-    exported: export.Exported
-    structure: Any
-
-
-def traced(function: Callable, structure: Any, shapes: Sequence[jax.ShapeDtypeStruct]) -> TracedProgram:
+def traced(
+    function: Callable, structure: Structure, shapes: Sequence[jax.ShapeDtypeStruct]
+) -> tuple[export.Exported, Structure]:
     """Trace a function for arguments of given structure and shapes, or load the program from the cache.
-
-    The cache is `jaxsmw.runtime.cache`. The key of a program contains the name of the function, the code of
-    jaxsmw, the versions of the packages, the settings of JAX, the structure and the shapes.
 
     **Arguments:**
 
@@ -56,68 +47,60 @@ def traced(function: Callable, structure: Any, shapes: Sequence[jax.ShapeDtypeSt
       dictionary); see `describe`.
     - `shapes`: the shape and the type of each array in the arguments.
 
-    **Returns:** The `TracedProgram`.
+    **Returns:** The function from a list of arrays to a list of arrays, and the structure of its result.
 
     **Raises:** `UndescribedError` if `function` or its result cannot be described. All errors that `function`
     raises.
     """
 
     def trace() -> dict[str, np.ndarray]:
-        found: list[Any] = []
+        of_result: list[Structure] = []
 
-        def of_arrays(*arrays: jax.Array) -> list[jax.Array]:
+        def of_arrays(*arrays: jax.Array) -> list[jax.Array | np.ndarray]:
             positional, named = rebuild(structure, arrays)
             described, results = describe(function(*positional, **named))
-            found.append(described)
+            of_result.append(described)
             return results
 
         exported = export.export(jax.jit(of_arrays))(*shapes)
         return {
             "exported": np.frombuffer(exported.serialize(), np.uint8),
-            "structure": np.array(json.dumps(found[-1])),
+            "structure": np.array(json.dumps(of_result[-1])),
         }
 
-    sizes = [(shape.shape, str(shape.dtype)) for shape in shapes]
-    key = json.dumps([_name(function), _environment(), structure, sizes])
-    entry = cached("traced-program", [key], trace)
-    exported = export.deserialize(bytearray(entry["exported"].tobytes()))
-    return TracedProgram(exported, json.loads(str(entry["structure"])))
-
-
-def _environment() -> list[Any]:
-    """Return the software and the settings of JAX, on which a traced program depends."""
     settings = {name: str(value) for name, value in jax.config.values.items() if "cache" not in name}
     # The dictionary `values` does not contain the setting of the present thread.
     settings["jax_enable_x64"] = str(jax.config.read("jax_enable_x64"))
-    return [_software(), sorted(settings.items())]
+    sizes = [(shape.shape, str(shape.dtype)) for shape in shapes]
+    key = json.dumps([_name(function), _software(), sorted(settings.items()), structure, sizes])
+    entry = cached("traced-program", [key], trace)
+    exported = export.deserialize(bytearray(entry["exported"].tobytes()))
+    return exported, json.loads(str(entry["structure"]))
 
 
 @cache
 def _software() -> str:
-    """Return a hash of the versions, and of all Python files that can change a traced program."""
+    """Return a hash of the versions, and of all Python files that can change a traced program.
+
+    Comments count too, because parsing the files would take more than a second.
+    """
     digest = hashlib.sha256(json.dumps(versions()).encode())
     for path in measured_code():
-        content = path.read_bytes()
-        digest.update(f"{path.name} {len(content)}\n".encode() + content)
+        if path.relative_to(LIBRARY).parts[0] != "benchmark":
+            content = path.read_bytes()
+            digest.update(f"{path.name} {len(content)}\n".encode() + content)
     return digest.hexdigest()
 
 
-def describe(tree: PyTree) -> tuple[Any, list[Any]]:
+def describe(tree: PyTree) -> tuple[Structure, list[jax.Array | np.ndarray]]:
     """Divide a pytree into its structure and its arrays.
 
-    **Arguments:**
-
-    - `tree`: a pytree of tuples, lists, dictionaries, named tuples, dataclasses, arrays, numbers, texts, and
-      classes and functions. All classes and functions must be defined in modules of jaxsmw or equinox.
-
-    **Returns:** The structure, which consists of lists, texts and numbers that JSON can store, and the list
-    of arrays.
-
-    **Raises:** `UndescribedError` if the pytree contains any other object.
+    **Raises:** `UndescribedError` if the pytree contains an object other than tuples, lists, dictionaries,
+    arrays, numbers, texts, and named tuples, dataclasses, classes and functions of jaxsmw or equinox.
     """
-    arrays: list[Any] = []
+    arrays: list[jax.Array | np.ndarray] = []
 
-    def described(value: Any) -> Any:
+    def described(value: Any) -> Structure:
         if isinstance(value, jax.Array | np.ndarray):
             arrays.append(value)
             return ["array"]
@@ -140,14 +123,11 @@ def describe(tree: PyTree) -> tuple[Any, list[Any]]:
     return described(tree), arrays
 
 
-def rebuild(structure: Any, arrays: Sequence[Any]) -> Any:
-    """Return the pytree that `describe` divided into a structure and arrays.
-
-    Dataclasses are made without their `__init__`, because their fields have been checked before.
-    """
+def rebuild(structure: Structure, arrays: Sequence[Any]) -> Any:
+    """Return the pytree that `describe` divided into a structure and arrays."""
     remaining = iter(arrays)
 
-    def rebuilt(part: Any) -> Any:
+    def rebuilt(part: Structure) -> Any:
         kind, *content = part
         if kind == "array":
             return next(remaining)
@@ -163,7 +143,7 @@ def rebuild(structure: Any, arrays: Sequence[Any]) -> Any:
             return known
         if kind == "named tuple":
             return known(*map(rebuilt, content[1:]))
-        made = object.__new__(known)
+        made = object.__new__(known)  # without `__init__`, because the fields have been checked before
         for name, value in zip(content[1], content[2:], strict=True):
             object.__setattr__(made, name, rebuilt(value))
         return made
@@ -172,13 +152,15 @@ def rebuild(structure: Any, arrays: Sequence[Any]) -> Any:
 
 
 def _name(known: type | Callable) -> str:
-    """Return the name of a class or function, as the module and the name in the module.
-
-    **Raises:** `UndescribedError` if the class or function has no such name in jaxsmw or equinox.
-    """
+    """Return the module and the name of a class or function; `UndescribedError` if they do not lead to it."""
     module, name = getattr(known, "__module__", ""), getattr(known, "__qualname__", "")
     full = f"{module}:{name}"
-    if module.partition(".")[0] not in _PACKAGES or "<locals>" in name or _known(full) is not known:
+    if (
+        module.partition(".")[0] not in _PACKAGES
+        or module.startswith(_NEVER_STORED)
+        or "<locals>" in name
+        or _known(full) is not known
+    ):
         raise UndescribedError(f"{known!r} has no name in {' or '.join(_PACKAGES)}")
     return full
 

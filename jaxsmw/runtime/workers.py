@@ -38,10 +38,9 @@ _ONE_THREAD_FLAG = "--xla_cpu_multi_thread_eigen=false"
 
 
 class Workers(ProcessPoolExecutor):
-    """An executor with `count` worker processes on this machine, each limited to one core.
+    """An executor with `count` worker processes on this machine, each limited to one core of the CPU.
 
-    In the workers JAX runs on the CPU, even if there is a GPU. If an exception ends the `with` block, the
-    processes are terminated immediately.
+    If an exception ends the `with` block, the processes are terminated immediately.
     """
 
     def __init__(self, count: int):
@@ -55,12 +54,13 @@ class Workers(ProcessPoolExecutor):
 
 
 class _OneCoreProcess(SpawnProcess):
-    """A process that is limited to one core."""
-
     def start(self) -> None:
         # Later changes of the environment would have no effect: a new process first imports the main module
         # of the calling program, which may import NumPy and JAX, and both read these variables only once.
-        with environment(_ONE_CORE | {"XLA_FLAGS": _one_thread_flags()}), _signals_after():
+        flags = os.environ.get("XLA_FLAGS", "")
+        if _ONE_THREAD_FLAG not in flags:
+            flags = f"{flags} {_ONE_THREAD_FLAG}".strip()
+        with environment(_ONE_CORE | {"XLA_FLAGS": flags}), _signals_after():
             super().start()
 
 
@@ -84,11 +84,6 @@ def _signals_after() -> Iterator[None]:
 
 class _OneCoreContext(SpawnContext):
     Process = _OneCoreProcess
-
-
-def _one_thread_flags() -> str:
-    flags = os.environ.get("XLA_FLAGS", "")
-    return flags if _ONE_THREAD_FLAG in flags else f"{flags} {_ONE_THREAD_FLAG}".strip()
 
 
 @contextmanager
@@ -159,10 +154,6 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
 
     - `workers`: the number of local processes; ignored if `scheduler` is given.
     - `scheduler`: the address of a Dask scheduler, for example `tcp://host:8786`; None for local processes.
-
-    **Yields:** An executor for `run_tasks`.
-
-    **Raises:** `InputError` if Dask is not installed, or if no scheduler responds at the address.
     """
     if scheduler is None:
         with Workers(workers) as executor:
@@ -192,12 +183,9 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
 def run_tasks(
     function: Callable[[Task], Result], tasks: Mapping[str, Task], executor: Executor
 ) -> Iterator[tuple[str, Result | BaseException]]:
-    """Call a function with every task in the workers of an executor.
+    """Yield the name of each task, and its result or the exception that it raised, as soon as it ends.
 
-    The function and the tasks must be picklable. Warnings that a task issues in a process of `Workers` are
-    issued again in the calling process.
-
-    **Yields:** The name of each task, and its result or the exception that it raised, as soon as it ends.
+    The function and the tasks must be picklable. Warnings of local workers are issued in this process.
     """
     futures = {executor.submit(_run_in_worker, function, task): name for name, task in tasks.items()}
     for future in as_completed(futures):

@@ -11,6 +11,7 @@ from jaxtyping import Float64, Int64, Shaped
 from scipy.sparse import csr_array
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.arrays import ratio
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, Skin, Texture
@@ -54,18 +55,16 @@ def transfer_attributes(
       vectors are interpolated without a rotation.
     - Integers, such as labels, are never averaged. The value with the most votes is chosen. For a vertex,
       each corner of the nearest face votes with its barycentric weight. For a face, each of the four points
-      votes. A row of several integers is one label. Labels are not smoothed, so a region that is thinner
-      than a face of Y may break up into single faces.
+      votes. A row of several integers is one label. Labels are not smoothed, so a region that is thinner than
+      a face of Y may break up into single faces.
     - Texture coordinates jump at the seams of X. All corners of a face of Y therefore receive coordinates
-      from the same side of a seam: the side on which the face's centroid lies. Along seams, vertices of Y
-      have several texture vertices. If the nearest face of X has no texture, the face of Y has no texture
-      either.
+      from the same side of a seam: the side on which the face's centroid lies. If the nearest face of X has
+      no texture, the face of Y has no texture either.
     - Skin weights are interpolated. Let k be the largest number of joints at a vertex of X. Each vertex of Y
       keeps only the k largest weights. The weights of a vertex sum to 1, unless all weights of the nearest
       face are 0.
-    - Blend shapes are displacements of the vertices of X. Each displacement is first rotated and scaled in
-      the same way as the neighbourhood of its vertex (`RegisteredMesh.similarities`). The results are then
-      interpolated.
+    - Blend shapes are displacements of the vertices of X. They are first rotated and scaled in the same way
+      as the neighbourhoods of the vertices (`RegisteredMesh.similarities`), and then interpolated.
     - Normals describe the shape of X, so they are not transferred.
 
     Data of Y are kept if X has no data of the same name. Face data of X also replace vertex data of Y with
@@ -75,13 +74,11 @@ def transfer_attributes(
 
     - `data`: the `MeshData` of X. Its `mesh` is `registered.mesh_x`.
     - `registered`: the `RegisteredMesh` of X on Y.
-    - `target`: the mesh `registered.mesh_y`, or a `MeshData` that contains `registered.mesh_y`. None (the
-      default) has the same effect as `registered.mesh_y`.
+    - `target`: `registered.mesh_y` (the default), or a `MeshData` that contains it.
 
     **Returns:** The `MeshData` of Y with the vertices and faces of `target`, in the unit of Y. The notes in
-    `mesh.notes` name the data of Y that were replaced. The notes also count the vertices of Y whose distance
-    to the registered mesh is above 3 % of the square root of Y's area. These vertices receive values in the
-    same way as all other vertices.
+    `mesh.notes` name the data of Y that were replaced. They also count the vertices of Y whose distance to
+    the registered mesh is above 3 % of the square root of Y's area.
 
     **Raises:** `InputError` if `data` or `target` do not belong to the registered meshes.
     """
@@ -118,20 +115,11 @@ def transfer_attributes(
 
 
 def registered_data(data: MeshData, registered: RegisteredMesh) -> MeshData:
-    """Return the data of X at the positions of the registered mesh.
+    """Return the `MeshData` of X at the positions of the registered mesh, in the unit of Y.
 
-    The vertices, the faces, the texture, the skin, the labels and all other data keep their order and values.
-    Two kinds of vectors follow the neighbourhood of their vertex (`RegisteredMesh.similarities`): the
-    displacements of blend shapes are rotated and scaled, and normals are rotated. Some vertices are used by
-    faces of the file, but not by faces of the mesh. Examples are welded duplicates and the vertices of small
-    components. These vertices move with the nearest vertex of the mesh.
-
-    **Arguments:**
-
-    - `data`: the `MeshData` of X. Its `mesh` is `registered.mesh_x`.
-    - `registered`: the `RegisteredMesh` of X on Y.
-
-    **Returns:** A `MeshData` with m vertices in the unit of Y.
+    All data keep their order and values, but two kinds of vectors follow the neighbourhood of their vertex
+    (`RegisteredMesh.similarities`): the displacements of blend shapes are rotated and scaled, and normals are
+    rotated.
 
     **Raises:** `InputError` if `data` does not belong to the registered mesh.
     """
@@ -215,7 +203,7 @@ def _interpolated(values: Shaped[np.ndarray, "n ..."], corners: _Corners) -> Flo
     if finite.all():
         return matrix @ values
     total, share = matrix @ np.where(finite, values, 0), matrix @ finite.astype(np.float64)
-    means = np.divide(total, share, out=np.zeros_like(total), where=share > 0)
+    means = ratio(total, share)
     heaviest = values[corners.rows[np.arange(len(corners.rows)), corners.weights.argmax(axis=1)]]
     return np.where(np.isfinite(heaviest), means, heaviest)
 
@@ -230,7 +218,7 @@ def _mixed_skin(skin: Skin, matrix: csr_array) -> Skin:
         omitted = np.argsort(-weights, axis=1, kind="stable")[:, most:]
         np.put_along_axis(weights, omitted, 0, axis=1)
     totals = weights.sum(axis=1, keepdims=True)
-    return Skin(skin.joints, np.divide(weights, totals, out=np.zeros_like(weights), where=totals > 0))
+    return Skin(skin.joints, ratio(weights, totals))
 
 
 def _without(values: Mapping[str, _Value], names: Collection[str]) -> dict[str, _Value]:

@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float64
 from scipy.sparse import csr_array, diags_array
 from scipy.spatial import KDTree
 
-from jaxsmw.geometry.mesh import Mesh, first_equal_rows
+from jaxsmw.geometry.arrays import first_equal_rows, sides_of, unit_vectors
+from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 
 # A vertex of the target is uncovered if its distance from the source is between `_UNCOVERED` and `_MISSING`.
@@ -29,11 +30,9 @@ class Attraction(NamedTuple):
     positions: Float64[np.ndarray, "c 3"]
 
     def matrix(self) -> csr_array:
-        """The quadratic term (m, m) of the weighted squared distances."""
         return csr_array(self.interpolation.T @ (diags_array(self.weights) @ self.interpolation))
 
     def right_side(self) -> Float64[np.ndarray, "m 3"]:
-        """The linear term of the weighted squared distances."""
         return self.interpolation.T @ (self.weights[:, None] * self.positions)
 
 
@@ -47,10 +46,8 @@ class UncoveredVertices:
     def __init__(self, mesh_x: Mesh, mesh_y: Mesh) -> None:
         self._mesh = mesh_x
         self._root = np.sqrt(mesh_y.area)
-        used = mesh_y.referenced_vertices
+        used = mesh_y.used_vertices
         self._positions, self._areas = mesh_y.vertices[used], mesh_y.vertex_areas[used]
-        self._on_boundary = np.zeros(len(mesh_x.vertices), bool)
-        self._on_boundary[mesh_x.boundary_edges] = True
         self._first = True
 
     def attraction(
@@ -65,7 +62,7 @@ class UncoveredVertices:
             points, distances, self._first = points[near], distances[near], False
         corners = self._mesh.faces[points.faces]
         rows = (distances > _UNCOVERED * self._root) & (distances < _MISSING * self._root)
-        rows &= ~self._on_boundary[corners].any(axis=1)
+        rows &= ~self._mesh.boundary_vertices[corners].any(axis=1)
         if not rows.any():
             return None
         corners, weights = corners[rows], points.weights[rows]
@@ -84,14 +81,14 @@ def at_slits(mesh: Mesh, width: float) -> Bool[np.ndarray, " n"]:
     other's boundary, and their normals agree. Seams of duplicated vertices are not slits.
     """
     n = len(mesh.vertices)
-    tails, heads, thirds = (np.roll(mesh.faces, -shift, axis=1).ravel() for shift in range(3))
+    tails, heads, thirds = sides_of(mesh.faces)
     numbers = np.minimum(tails, heads) * n + np.maximum(tails, heads)
     at_boundary = np.isin(numbers, mesh.boundary_edges @ [n, 1])
     tails, heads, thirds = tails[at_boundary], heads[at_boundary], thirds[at_boundary]
     # The outward direction of a boundary edge is perpendicular to the edge, in the plane of its face.
     along, inward = (mesh.vertices[ends] - mesh.vertices[tails] for ends in (heads, thirds))
-    along = _unit(along)
-    outward = _unit(along * (along * inward).sum(axis=1, keepdims=True) - inward)
+    along = unit_vectors(along)
+    outward = unit_vectors(along * (along * inward).sum(axis=1, keepdims=True) - inward)
     sums = np.zeros((n, 3))
     np.add.at(sums, tails, outward)
     np.add.at(sums, heads, outward)
@@ -117,8 +114,3 @@ def at_slits(mesh: Mesh, width: float) -> Bool[np.ndarray, " n"]:
     found = np.zeros(n, bool)
     found[np.concatenate([first[facing], second[facing]])] = True
     return found
-
-
-def _unit(vectors: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)

@@ -21,12 +21,12 @@ class TransferredLandmarks:
 
     **Attributes:**
 
-    - `landmarks`: the `Landmarks` on the surface of Y, with the names of the source's landmarks, in the unit
-      of Y.
+    - `landmarks`: the `Landmarks` on the surface of Y, in the unit of Y. The names of the coordinate system
+      and of the unit are those of the given landmarks. They are correct only if X and Y have the same ones.
     - `source_distances`: the distance from each landmark on X to the surface of X (l,), in the unit of X.
     - `expected_errors`: the expected error of each landmark on Y (l,), in the unit of Y; None if no expected
       errors were given.
-    - `notes`: a tuple with a sentence for each landmark that was far from the surface of X.
+    - `notes`: a sentence for each landmark that was far from the surface of X.
     """
 
     landmarks: Landmarks
@@ -43,26 +43,18 @@ def transfer_landmarks(
 ) -> TransferredLandmarks:
     """Move landmarks from X to the surface of Y.
 
-    Each landmark is projected onto X, moves with its triangle to the registered mesh, and is projected
-    onto Y.
+    Each landmark is projected onto X, moves with its triangle to the registered mesh, and is projected onto
+    Y.
 
     **Arguments:**
 
     - `landmarks`: `Landmarks` with l landmarks on X, in the unit and the coordinate system of X.
     - `registered`: the `RegisteredMesh` of X on Y.
     - `expected_error`: the expected error of each vertex of X (m,), divided by the square root of Y's area;
-      see `Correspondence.expected_error`. If given, the result contains the expected error of each landmark
-      (`expected_errors`). The positions do not depend on this argument.
+      see `Correspondence.expected_error`. The positions do not depend on this argument.
 
-    **Returns:** `TransferredLandmarks`. Its attribute `landmarks` contains the positions (l, 3) on Y. The
-    names of the coordinate system and of the unit are copied from the given landmarks. The copied names are
-    correct only if X and Y have the same coordinate system and the same unit. The attribute
-    `source_distances` (l,) contains the distances of the landmarks to X, in the unit of X. The attribute
-    `expected_errors` (l,) is in the unit of Y; it is None if `expected_error` is None.
-
-    **Raises:** `InputError` if `expected_error` does not contain one number for each vertex of X.
-    `InputError` is also raised if `jaxsmw.io.check_frame` finds that the landmarks are too far from the
-    surface of X.
+    **Raises:** `InputError` if `expected_error` does not contain one number for each vertex of X, or if
+    `jaxsmw.io.check_frame` finds that the landmarks are too far from the surface of X.
     """
     mesh_x, mesh_y = registered.mesh_x, registered.mesh_y
     if expected_error is not None and expected_error.shape != (len(mesh_x.vertices),):
@@ -88,19 +80,14 @@ def landmark_vertices(
 ) -> Int64[np.ndarray, "l 2"]:
     """Convert landmarks with equal names to pairs of vertices, which `match` accepts as the initial map.
 
-    **Arguments:**
+    Both `Landmarks` have the same l names in the same order. Each landmark is projected onto the nearest
+    face. Its vertex is the corner of this face that is nearest to the projection. The function issues a
+    `UserWarning` for each landmark that is far from its surface.
 
-    - `landmarks_x`, `landmarks_y`: the `Landmarks` on X and on Y, with the same l names in the same order.
-    - `mesh_x`, `mesh_y`: the source X and the target Y.
+    **Returns:** An array (l, 2) with one vertex of X and one vertex of Y for each landmark, 0-based.
 
-    **Returns:** An array (l, 2) with one vertex of X and one vertex of Y for each landmark, 0-based. Each
-    landmark is projected onto the nearest face. The vertex is the corner of this face that is nearest to the
-    projection.
-
-    The function issues a `UserWarning` for each landmark that is far from its surface.
-
-    **Raises:** `InputError` if `jaxsmw.io.check_frame` finds that the landmarks are too far from a surface.
-    `InputError` is also raised if two landmarks have the same vertex of X, but different vertices of Y.
+    **Raises:** `InputError` if `jaxsmw.io.check_frame` finds that the landmarks are too far from a surface,
+    or if two landmarks have the same vertex of X, but different vertices of Y.
     """
     pairs = []
     for landmarks, mesh in ((landmarks_x, mesh_x), (landmarks_y, mesh_y)):

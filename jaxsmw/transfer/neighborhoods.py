@@ -12,6 +12,7 @@ from jaxtyping import Float64, Int64
 from scipy.sparse import csr_array, diags_array
 
 from jaxsmw.geometry.alignment import nearest_rotations
+from jaxsmw.geometry.arrays import ratio
 from jaxsmw.geometry.mesh import Mesh
 
 # Values at vertices are averaged over neighbouring vertices _AVERAGINGS times. More averagings enlarge the
@@ -48,13 +49,7 @@ class Similarities(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Neighborhoods:
-    """The edges of a mesh that is scaled by the factor `size`. The edges have positive weights.
-
-    **Attributes:**
-
-    - `mesh`: the mesh, with n vertices and e edges.
-    - `size`: the factor by which lengths of the mesh are multiplied.
-    """
+    """The edges of a mesh (n vertices, e edges), with its lengths multiplied by the factor `size`."""
 
     mesh: Mesh
     size: float = 1.0
@@ -66,7 +61,7 @@ class Neighborhoods:
 
     @cached_property
     def vectors(self) -> Float64[np.ndarray, "e 3"]:
-        """The vector of each edge of the scaled mesh, from the edge's second vertex to its first vertex."""
+        """The vector of each edge of the scaled mesh, from its second vertex to its first vertex."""
         return self.size * self.differences(self.mesh.vertices)
 
     @cached_property
@@ -112,8 +107,8 @@ class Neighborhoods:
     def averaging(self) -> csr_array:
         """The matrix (n, n) that averages each vertex with its weighted neighbours."""
         totals = self.laplacian.diagonal()
-        inverse = np.divide(1, totals, out=np.zeros_like(totals), where=totals > 0)
-        return csr_array(diags_array(np.ones(len(totals))) - 0.5 * diags_array(inverse) @ self.laplacian)
+        inverse = diags_array(ratio(1, totals))
+        return csr_array(diags_array(np.ones(len(totals))) - 0.5 * inverse @ self.laplacian)
 
     def _averaged(self, values: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n ..."]:
         """Average the values at each vertex with those of its neighbourhood."""
@@ -137,8 +132,7 @@ class Neighborhoods:
         largest = ((moments**2).sum(axis=(1, 2)) ** 1.5).sum()
         hand = -1.0 if determinants.sum() < -_FLAT * largest else 1.0
         rotations, traces = nearest_rotations(hand * moments)
-        lengths = self.squared_lengths
-        scales = np.divide(traces, lengths, out=np.ones(len(lengths)), where=lengths > 0)
+        scales = ratio(traces, self.squared_lengths, otherwise=1.0)
         return Similarities(hand * rotations, np.clip(scales, 1 / _SCALE_RANGE, _SCALE_RANGE))
 
     def divergence(self, similarities: Similarities) -> Float64[np.ndarray, "n 3"]:

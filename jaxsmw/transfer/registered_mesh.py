@@ -14,9 +14,10 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import cg
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.geodesics import SurfacePoints, check_indices, check_surface_points
+from jaxsmw.geometry.arrays import ratio
 from jaxsmw.geometry.mesh import Mesh, connected_components
 from jaxsmw.geometry.surface_distance import SurfaceTree, nearest_facing_points, nearest_surface_points
+from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, check_surface_points
 from jaxsmw.runtime.threads import one_blas_thread
 from jaxsmw.transfer.coverage import Attraction, UncoveredVertices, at_slits
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
@@ -34,15 +35,13 @@ _STIFFNESS_OF_MAPS = 0.01
 
 
 class _Round(NamedTuple):
-    """A sequence of deformations. After each deformation, weights are reduced where faces are flipped."""
+    """A sequence of deformations. After each one, weights are reduced where faces are flipped."""
 
     deformations: int  # at most; a round that neither pulls nor covers ends as soon as no face is flipped
     factor: float  # multiplies the weights at flipped faces and at their neighbours
     neighbors: int  # the largest distance to these neighbours, in edges
-    pull: float = (
-        0.0  # the first weight of goals on the target for vertices of reduced weight, in vertex areas
-    )
-    cover: float = 0.0  # the first weight of vertices of the target that are not reached, in vertex areas
+    pull: float = 0.0  # the first weight of goals on Y for vertices of reduced weight, in vertex areas
+    cover: float = 0.0  # the first weight of vertices of Y that are not reached, in vertex areas
 
 
 # The first rounds remove folds, in small and then in larger regions. Then these regions are pulled to the
@@ -78,20 +77,18 @@ _KEPT = 0.03
 class RegisteredMesh:
     """A deformed source mesh that lies on the target: the result of `register_mesh`.
 
-    **Attributes:**
-
-    - `mesh_x`, `mesh_y`: the source X (m vertices, f faces) and the target Y, each a `Mesh`.
-    - `vertices`: the positions of X's vertices on Y (m, 3), in Y's unit of length. Together with the faces of
-      X, they form the registered mesh.
-    - `similarities`: the rotation and the scale of each vertex's neighbourhood, as `Similarities` with
-      rotations (m, 3, 3) and scales (m,). These transformations take X to the registered mesh. The scales
-      include the change from X's unit of length to Y's.
-    - `bridged`: the share of X's area that is matched to the lips of thin slits of Y, and moved with its
-      surroundings instead.
-
     A small component of X moves rigidly with its surroundings, to its counterpart on Y if there is one; see
     `follow_surroundings`. Any other unreferenced vertex moves with the nearest vertex. Vertices that welding
     merges keep exactly the same position.
+
+    **Attributes:**
+
+    - `mesh_x`, `mesh_y`: the source X (m vertices, f faces) and the target Y (n vertices), each a `Mesh`.
+    - `vertices`: the positions of X's vertices on Y (m, 3), in Y's unit of length.
+    - `similarities`: the `Similarities` (m) that take the neighbourhoods of X to the registered mesh. The
+      scales include the change from X's unit of length to Y's.
+    - `bridged`: the share of X's area that is matched to the lips of thin slits of Y, and moved with its
+      surroundings instead.
     """
 
     mesh_x: Mesh
@@ -110,7 +107,7 @@ class RegisteredMesh:
 
     @cached_property
     def surface_points(self) -> SurfacePoints:
-        """The nearest point of Y that faces each vertex (`nearest_facing_points`), m `SurfacePoints`."""
+        """The nearest point of Y that faces each vertex: m `SurfacePoints`."""
         return nearest_facing_points(self.vertices, self._normals, self._nearest[0], self.mesh_y)
 
     @cached_property
@@ -125,7 +122,7 @@ class RegisteredMesh:
 
     @cached_property
     def distances(self) -> Float64[np.ndarray, " m"]:
-        """The distance from each vertex of the registered mesh to Y, in Y's unit of length (m,)."""
+        """The distance from each vertex to Y, in Y's unit of length (m,)."""
         return self._nearest[1]
 
     @cached_property
@@ -136,8 +133,8 @@ class RegisteredMesh:
     def flipped_faces(self) -> Bool[np.ndarray, " f"]:
         """A mask (f,), True for faces that are turned over relative to their neighbourhoods.
 
-        The face's normal on X is first rotated with the face's neighbourhood. The face is turned over if the
-        angle between this rotated normal and the normal of the registered face is above 90 degrees.
+        The angle between the face's normal on X, rotated with its neighbourhood, and the normal of the
+        registered face is then above 90 degrees.
         """
         normals = _normals(self.mesh_x.vertices, self.mesh_x)
         return _flipped_faces(self.mesh_x, normals, self.vertices, self.similarities)
@@ -146,44 +143,29 @@ class RegisteredMesh:
     def area_ratios(self) -> Float64[np.ndarray, " f"]:
         """The area of each registered face divided by its area on X (f,), with both meshes scaled to area 1.
 
-        The ratio is 1 where the map preserves area up to a common factor. If a face has no area on X, its
-        ratio is 1.
+        If a face has no area on X, its ratio is 1.
         """
         own = self.mesh_x.face_areas / self.mesh_x.area
-        return np.divide(self.mesh.face_areas / self.mesh.area, own, out=np.ones(len(own)), where=own > 0)
+        return ratio(self.mesh.face_areas / self.mesh.area, own, otherwise=1.0)
 
     @cached_property
     def angle_distortions(self) -> Float64[np.ndarray, " f"]:
         """The mean change of each face's angles from X to the registered mesh, in degrees (f,)."""
-        changes = _angles(self.mesh.vertices[self.mesh.faces]) - _angles(
-            self.mesh_x.vertices[self.mesh_x.faces]
-        )
-        return np.degrees(np.abs(changes).mean(axis=1))
+        before, after = (_angles(mesh.vertices[mesh.faces]) for mesh in (self.mesh_x, self.mesh))
+        return np.degrees(np.abs(after - before).mean(axis=1))
 
     def carry(self, points: SurfacePoints) -> Float64[np.ndarray, "p 3"]:
-        """Move points on X to the registered mesh.
-
-        **Arguments:**
-
-        - `points`: `SurfacePoints` on X with p entries.
-
-        **Returns:** The positions (p, 3) of the points on the registered mesh, in Y's unit of length.
+        """Move `SurfacePoints` on X to the registered mesh. Return their positions (p, 3), in Y's unit.
 
         **Raises:** `InputError` if a point is not on X.
         """
         return check_surface_points(points, self.mesh_x, "points").positions(self.mesh)
 
     def project(self, points: SurfacePoints) -> SurfacePoints:
-        """Map points on X to points on Y.
+        """Map `SurfacePoints` on X to `SurfacePoints` on Y.
 
         Each point moves with its triangle to the registered mesh, and then to the nearest point of Y.
-        Triangles of Y that face away are left out, as in `surface_points`.
-
-        **Arguments:**
-
-        - `points`: `SurfacePoints` on X with p entries.
-
-        **Returns:** `SurfacePoints` on Y with p entries.
+        Triangles of Y that face away are left out.
 
         **Raises:** `InputError` if a point is not on X.
         """
@@ -193,16 +175,10 @@ class RegisteredMesh:
         return nearest_facing_points(positions, normals, nearest, self.mesh_y)
 
     def project_back(self, points: SurfacePoints) -> SurfacePoints:
-        """Map points on Y to points on X.
+        """Map `SurfacePoints` on Y to `SurfacePoints` on X.
 
         Each point moves to the nearest point of the registered mesh, whose triangles are those of X.
-        Triangles that face away are left out, as in `surface_points`.
-
-        **Arguments:**
-
-        - `points`: `SurfacePoints` on Y with p entries.
-
-        **Returns:** `SurfacePoints` on X with p entries.
+        Triangles that face away are left out.
 
         **Raises:** `InputError` if a point is not on Y.
         """
@@ -213,10 +189,7 @@ class RegisteredMesh:
 
     @cached_property
     def points_of_target(self) -> SurfacePoints:
-        """The point of X for each vertex of Y, a map Y -> X: `SurfacePoints` on X with n entries.
-
-        Each vertex of Y is projected onto the registered mesh, as by `project_back`.
-        """
+        """The point of X for each vertex of Y, as by `project_back`: n `SurfacePoints`."""
         normals = self._hand * self.mesh_y.vertex_normals
         return nearest_facing_points(self.mesh_y.vertices, normals, self._nearest_of_target[0], self.mesh)
 
@@ -276,14 +249,12 @@ def register_mesh(
     **Arguments:**
 
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y, each a `Mesh`.
-    - `points`: the map X -> Y, as `SurfacePoints` on Y with m entries; see `Correspondence.surface_points`.
-    - `stiffness`: a positive length in units of the square root of Y's area. Noise of the map is smoothed if
-      its wavelength is shorter than the stiffness. The default is 0.005. A stiffness of 0.03 makes the
-      registered mesh of a noisy map smooth, but moves it farther away from the target.
+    - `points`: the map X -> Y, as m `SurfacePoints` on Y; see `Correspondence.surface_points`.
+    - `stiffness`: a positive length in units of the square root of Y's area, by default 0.005. Noise of the
+      map is smoothed if its wavelength is shorter. A stiffness of 0.03 makes the registered mesh of a noisy
+      map smooth, but moves it farther away from the target.
     - `scale`: the factor by which X is first scaled. With None (the default), X is scaled to the area of Y.
       Give 1 for a partial shape and a full shape in the same unit of length.
-
-    **Returns:** A `RegisteredMesh` with positions `vertices` (m, 3) in the unit of Y.
 
     **Raises:** `InputError` if the points do not fit the meshes, or the stiffness is not positive or too
     large. `ArithmeticError` if the deformation does not converge.
@@ -301,8 +272,7 @@ def register_mesh(
         )
     root = np.sqrt(mesh_y.area)
     # Positions are relative to the middle of Y, because large coordinates would lose digits.
-    middle = mesh_y.vertices[mesh_y.referenced_vertices].mean(axis=0)
-    target = replace(mesh_y, vertices=mesh_y.vertices - middle)
+    target = replace(mesh_y, vertices=mesh_y.vertices - mesh_y.middle)
     mapped = points.positions(target)
     around = Neighborhoods(mesh_x, root / np.sqrt(mesh_x.area) if scale is None else scale)
     areas = around.size**2 * mesh_x.vertex_areas
@@ -314,14 +284,37 @@ def register_mesh(
         guides = np.where(unguided, np.where(bridging, _BRIDGING * areas, 0), areas)
         moved = _moved_along(around, target, guides, mapped, stiffness * root)
         mapped = np.where(unguided[:, None], moved, mapped)
-    targets, positions, similarities = mapped.copy(), mapped, around.similarities(mapped)
-    weights, number = areas.copy(), 0
-    normals = _normals(mesh_x.vertices, mesh_x)
     # A partial shape X cannot cover all of Y.
-    part = scale is not None and around.size**2 * mesh_x.area < mesh_y.area
+    covers = scale is None or around.size**2 * mesh_x.area >= mesh_y.area
+    positions, similarities = _deformed(around, target, mapped, areas, stiffness * root, covers)
+    similarities = Similarities(similarities.rotations, around.size * similarities.scales)
+    positions, similarities, *_ = follow_surroundings(mesh_x, mesh_y, positions + mesh_y.middle, similarities)
+    bridged = float(mesh_x.average(bridging))
+    if bridged > _MUCH_BRIDGED:
+        warnings.warn(
+            f"{mesh_y.name}: thin slits cut the target. {bridged:.0%} of the area of {mesh_x.name} lies at "
+            "slits and moves with its surroundings, but the map is less accurate there: fill the slits.",
+            stacklevel=2,
+        )
+    return RegisteredMesh(mesh_x, mesh_y, positions, similarities, bridged)
+
+
+def _deformed(
+    around: Neighborhoods,
+    target: Mesh,
+    mapped: Float64[np.ndarray, "m 3"],
+    areas: Float64[np.ndarray, " m"],
+    stiffness: float,
+    covers: bool,
+) -> tuple[Float64[np.ndarray, "m 3"], Similarities]:
+    """Deform X in `_ROUNDS`. Return its positions, and the similarities that take the scaled X to them."""
+    mesh_x = around.mesh
+    targets, positions, similarities = mapped.copy(), mapped, around.similarities(mapped)
+    weights, is_first = areas.copy(), True
+    normals = _normals(mesh_x.vertices, mesh_x)
     for of_round in _ROUNDS:
         loose = weights < areas
-        if part if of_round.cover else number and not loose.any():
+        if not (covers if of_round.cover else is_first or loose.any()):
             continue
         if of_round.pull:
             weights = np.where(loose, of_round.pull * areas, weights)
@@ -335,37 +328,25 @@ def register_mesh(
                 targets[loose] = _halfway(nearest, mapped[loose], target)
             if of_round.cover and step % 2 == 0:  # the search is slow
                 attraction = uncovered.attraction(positions, of_round.cover * weights / before)
-            positions = _follow(
-                around, similarities, weights, targets, stiffness * root, positions, attraction
-            )
+            positions = _follow(around, similarities, weights, targets, stiffness, positions, attraction)
             similarities = around.similarities(positions)
-            number += 1
             flipped = _flipped_faces(mesh_x, normals, positions, similarities)
             # The first deformation uses transformations that are fitted to the map itself, which is noisy.
-            if not (of_round.pull or attraction or flipped.any()) and number > 1:
+            if not (of_round.pull or attraction or flipped.any() or is_first):
                 break
+            is_first = False
             near = np.zeros(len(weights))
             near[mesh_x.faces[flipped]] = 1
             for _ in range(of_round.neighbors):
                 near = around.averaging @ near
             weights = np.where(near > 0, of_round.factor * weights, weights)
-    similarities = Similarities(similarities.rotations, around.size * similarities.scales)
-    positions, similarities, *_ = follow_surroundings(mesh_x, mesh_y, positions + middle, similarities)
-    bridged = float(mesh_x.average(bridging))
-    if bridged > _MUCH_BRIDGED:
-        warnings.warn(
-            f"{mesh_y.name}: thin slits cut the target. {bridged:.0%} of the area of {mesh_x.name} lies at "
-            "slits and moves with its surroundings, but the map is less accurate there: fill the slits.",
-            stacklevel=2,
-        )
-    return RegisteredMesh(mesh_x, mesh_y, positions, similarities, bridged)
+    return positions, similarities
 
 
 def _bridging(mesh_x: Mesh, mesh_y: Mesh, points: SurfacePoints, width: float) -> Bool[np.ndarray, " m"]:
     """Return a mask of the vertices of X that are matched to lips of slits which X does not have."""
     at_lips = at_slits(mesh_y, width)[mesh_y.faces[points.faces]].any(axis=1)
-    own = np.zeros(len(at_lips), bool)
-    own[mesh_x.boundary_edges] = True
+    own = mesh_x.boundary_vertices.copy()
     own[mesh_x.faces[own[mesh_x.faces].any(axis=1)]] = True
     return at_lips & ~own
 
@@ -400,22 +381,14 @@ def _moved_along(
 def points_of_map(
     mesh_x: Mesh, mesh_y: Mesh, pointwise_map: ArrayLike, *, scale: float | None = None
 ) -> SurfacePoints:
-    """Convert a map to vertices into a map to points between the vertices.
+    """Convert a map to vertices T (m,) into a map to points between the vertices, for `register_mesh`.
 
-    X is first registered with a stiffness of 0.01 in units of the square root of Y's area. The matches
-    of a map to vertices jump from vertex to vertex, and the registration smooths these jumps.
-
-    **Arguments:**
-
-    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
-    - `pointwise_map`: T: X -> Y (m,), as 0-based vertices of Y.
-    - `scale`: see `register_mesh`.
-
-    **Returns:** `SurfacePoints` on Y with m entries, for `register_mesh`.
+    The matches of a map to vertices jump from vertex to vertex. A first registration with a stiffness of 0.01
+    smooths these jumps. `scale` is that of `register_mesh`.
 
     **Raises:** `InputError` if the map does not fit the meshes.
     """
-    vertices = check_indices(pointwise_map, len(mesh_y.vertices), f"map to {mesh_y.name}: vertex")
+    vertices = check_pointwise_map(pointwise_map, mesh_x, mesh_y)
     # An unreferenced vertex of Y is replaced by the nearest point of the surface.
     points, _ = nearest_surface_points(mesh_y.vertices[vertices], mesh_y)
     smooth = register_mesh(mesh_x, mesh_y, points, stiffness=_STIFFNESS_OF_MAPS, scale=scale)
@@ -474,7 +447,7 @@ def _halfway(
     offsets = mapped - positions
     along = (offsets * normals).sum(axis=1, keepdims=True)
     # A triangle without area has no normal, so the offsets of its points are not projected.
-    offsets -= normals * np.divide(along, squares, out=np.zeros_like(along), where=squares > 0)
+    offsets -= normals * ratio(along, squares)
     return positions + 0.5 * offsets
 
 

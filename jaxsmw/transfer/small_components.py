@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 from scipy.spatial import KDTree
 
 from jaxsmw.geometry.alignment import nearest_rotations
-from jaxsmw.geometry.mesh import Mesh, connected_components, extend_from
+from jaxsmw.geometry.mesh import Mesh, components_of_faces, extend_from
 from jaxsmw.transfer.neighborhoods import Neighborhoods, Similarities
 
 # A component of Y can be the counterpart of a moved component of X if they differ by at most the diameter of
@@ -28,7 +28,7 @@ class _Components:
     def __init__(self, mesh: Mesh) -> None:
         faces, n = mesh.small_faces, len(mesh.vertices)
         self.rows = np.unique(faces)
-        labels = connected_components(np.concatenate([faces[:, :2], faces[:, 1:]]), n)[1][self.rows]
+        labels = components_of_faces(faces, n)[1][self.rows]
         numbers, self.of_row = np.unique(labels, return_inverse=True)
         of_corners = np.repeat(Mesh(mesh.vertices, faces).face_areas / 3, 3)
         areas = np.bincount(faces.ravel(), of_corners, n)[self.rows].astype(np.float64)
@@ -63,11 +63,7 @@ def follow_surroundings(
     counterpart, and its vertices are matched to the nearest vertices of the counterpart. The vertices of
     other components are matched to the nearest vertices of Y that have faces.
 
-    **Arguments:**
-
-    - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y.
-    - `positions`: the positions of the vertices of X on Y (m, 3), in the unit of Y.
-    - `similarities`: the transformations of the vertices that take X to these positions.
+    `positions` (m, 3) are those of the vertices of X on Y, in the unit of Y, to which `similarities` take X.
 
     **Returns:** The positions (m, 3) and the transformations of all vertices, where vertices that have faces
     keep theirs; the matches (m,) of the vertices of small components, as vertices of Y, and -1 for all
@@ -95,9 +91,8 @@ def follow_surroundings(
     of_rows = Similarities(rotations[of_row], scales[of_row])
     positions[rows] = centers[of_row] + of_rows.of_vectors(mesh_x.vertices[rows] - parts.centers[of_row])
     similarities.rotations[rows], similarities.scales[rows] = of_rows
-    body = np.flatnonzero(mesh_y.referenced_vertices)
     alone = ~paired[of_row]
-    matches[rows[alone]] = _nearest(mesh_y, body, positions[rows[alone]])
+    matches[rows[alone]] = _nearest(mesh_y, mesh_y.used_vertices, positions[rows[alone]])
     for number in np.flatnonzero(paired):
         own, candidates = rows[of_row == number], others.rows[others.of_row == counterparts[number]]
         matches[own] = _nearest(mesh_y, candidates, positions[own])
@@ -120,13 +115,12 @@ def match_small_components(
     - `scale`: the factor from lengths on X to lengths on Y.
 
     **Returns:** The map (m,), in which only the vertices without faces have new matches, and the share of X's
-    area that has no counterpart. Without small components, the map is returned unchanged.
+    area that has no counterpart.
     """
     if not len(mesh_x.small_faces):
         return pointwise_map, 0.0
     # Positions are relative to the middle of Y, because large coordinates would lose digits.
-    middle = mesh_y.vertices[mesh_y.referenced_vertices].mean(axis=0)
-    target = replace(mesh_y, vertices=mesh_y.vertices - middle)
+    target = replace(mesh_y, vertices=mesh_y.vertices - mesh_y.middle)
     mapped = target.vertices[pointwise_map]
     similarities = Neighborhoods(mesh_x, scale).similarities(mapped)
     similarities = Similarities(similarities.rotations, scale * similarities.scales)

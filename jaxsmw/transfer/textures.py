@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
-from jaxsmw.geometry.mesh import connected_components
+from jaxsmw.geometry.arrays import ranges
+from jaxsmw.geometry.mesh import components_of_faces, connected_components
 from jaxsmw.geometry.surface_distance import nearest_points_of_triangles, nearest_surface_points
 from jaxsmw.io.mesh_data import Texture, texture_at_corners, texture_of_corners
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
@@ -49,9 +50,8 @@ def transfer_texture(
     if not shown.any():
         return Texture(np.empty((0, 2)), corners)
     rows = np.where(textured, np.cumsum(textured) - 1, -1)
-    middle = mesh.vertices[mesh.referenced_vertices].mean(axis=0)
-    surface = _CutSurface(mesh.vertices[mesh.faces[textured]] - middle, cut[textured])
-    positions, start = (vertices - middle)[faces[shown]], rows[nearest[shown]]
+    surface = _CutSurface(mesh.vertices[mesh.faces[textured]] - mesh.middle, cut[textured])
+    positions, start = (vertices - mesh.middle)[faces[shown]], rows[nearest[shown]]
     near = _near_seams(registered, cut, faces[shown])
 
     points = registered.points_of_target[faces[shown].ravel()]
@@ -115,8 +115,7 @@ class _CutSurface:
     @cached_property
     def charts(self) -> Int32[np.ndarray, " f"]:
         """The connected component of each triangle."""
-        edges = np.concatenate([self.faces[:, :2], self.faces[:, 1:]])
-        return connected_components(edges, int(self.faces.max()) + 1)[1][self.faces[:, 0]]
+        return components_of_faces(self.faces, int(self.faces.max()) + 1)[1][self.faces[:, 0]]
 
     @cached_property
     def neighbors(self) -> csr_array:
@@ -150,11 +149,10 @@ class _CutSurface:
         """Return the nearest neighbour of each goal's triangle, its nearest point and the distance."""
         indptr = self.neighbors.indptr.astype(np.int64)
         first, counts = indptr[triangles], indptr[triangles + 1] - indptr[triangles]
-        begin = np.cumsum(counts) - counts
-        owner = np.repeat(np.arange(len(triangles)), counts)
-        other = self.neighbors.indices[np.arange(len(owner)) + (first - begin)[owner]].astype(np.int64)
+        owner, position = ranges(first, counts)
+        other = self.neighbors.indices[position].astype(np.int64)
         weights, lengths = nearest_points_of_triangles(goals[owner], self.triangles[other])
-        best = np.lexsort((other, lengths, owner))[begin]
+        best = np.lexsort((other, lengths, owner))[np.cumsum(counts) - counts]
         return other[best], weights[best], lengths[best]
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from benchmark_speed import medians
+from common import medians
 from jaxtyping import Array, Float, Float64, Int, Int32, Int64
 
 from frame_study.variants import (

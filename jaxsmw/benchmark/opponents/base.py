@@ -1,6 +1,6 @@
-"""The interface of the compared methods: their input and their output.
+"""The interface of the compared methods, which all receive the same prepared pair (`MethodInput`).
 
-All methods receive the same prepared pair, with the same spectra, the same initial map and the same samples.
+Methods that run in NumPy derive from `HostMethod`, which hands them shapes without unreferenced vertices.
 """
 
 from __future__ import annotations
@@ -9,17 +9,18 @@ import abc
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import numpy as np
-from jaxtyping import Array, Int, Int64
+from jaxtyping import Array, Float, Float64, Int, Int64
 
 from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MATCH_INIT
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced, make_mesh
 from jaxsmw.matching.executor import SpectralPair, padded_map
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
@@ -27,11 +28,7 @@ from jaxsmw.matching.stages import Sizes
 from jaxsmw.matching.starts import make_start
 
 MOST_SAMPLES = 1000
-"""The number of samples of each shape in a prepared pair. No method uses more samples.
-
-If a shape has fewer referenced vertices, both shapes have the same smaller number of samples. This is the
-number of referenced vertices of the shape with the fewest.
-"""
+"""The largest number of samples that a method uses. Both shapes have fewer if one has fewer vertices."""
 
 PointwiseMap = Int[Array, " m"] | Int[np.ndarray, " m"]
 
@@ -43,8 +40,7 @@ class MethodInput:
     **Attributes:**
 
     - `spectra`: the spectra and samples of X and Y, with at least as many eigenvectors as any method uses.
-      The spectra of a partial pair are comparable only in their common range of eigenvalues, to which
-      `SpectralPair.seen_by` cuts them. Spectra and maps may be padded.
+      Spectra and maps may be padded. `SpectralPair.seen_by` makes the spectra of a partial pair comparable.
     - `initial_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `meshes`: the meshes of X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
@@ -69,14 +65,7 @@ class MethodInput:
     ) -> MethodInput:
         """Compute the input that all methods share: spectra, descriptors, the initial map and samples.
 
-        **Arguments:**
-
-        - `pair`: the source X (m vertices) and the target Y (n vertices).
-        - `names`, `init`: the attributes of the same names. With `"auto"`, the initial map is `"shot"`.
-        - `number_of_eigenvectors`: the number of eigenvectors of each shape, at least 1.
-        - `number_of_descriptors`: the number of principal components of SHOT; 0 for no descriptors.
-
-        **Returns:** A `MethodInput`, padded like the arrays of `jaxsmw.match`.
+        With `"auto"`, the initial map is `"shot"`. The descriptors are principal components of SHOT.
 
         **Raises:** `InputError` if a spectrum, a descriptor or the initial map cannot be computed;
         `ArithmeticError` if the computation of the initial map fails numerically.
@@ -92,9 +81,6 @@ class MethodInput:
 
 class Method(abc.ABC):
     """The base class of all compared methods. A method computes a pointwise map from a prepared pair.
-
-    A subclass must define `__call__`, `reference` and `number_of_eigenvectors`. `METHODS` in
-    `jaxsmw.benchmark.opponents.registry` contains the available methods.
 
     **Attributes:**
 
@@ -119,27 +105,16 @@ class Method(abc.ABC):
         """
 
     def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
-        """Return the map of `__call__`, and the seconds from the initial map to this map.
-
-        The seconds are NaN if the map was computed elsewhere.
-        """
+        """Return the map, and the seconds from the initial map to it; NaN if it was computed elsewhere."""
         began = time.perf_counter()
-        found = jax.block_until_ready(self(pair))
-        return found, time.perf_counter() - began
+        pointwise_map = jax.block_until_ready(self(pair))
+        return pointwise_map, time.perf_counter() - began
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """Check that the method can match all pairs. A benchmark calls `check` before it matches any pair.
-
-        **Raises:** `InputError` if the method cannot match a pair.
-        """
-        if self.full_only and any(pair.partial for pair in pairs):
-            raise InputError(
-                f"{self.reference}: cannot match partial shapes: remove this method from --methods."
-            )
-        if self.partial_only and not all(pair.partial for pair in pairs):
-            raise InputError(
-                f"{self.reference}: matches partial shapes only: remove this method from --methods."
-            )
+        """Raise `InputError` if the method cannot match a pair. A benchmark checks all pairs at first."""
+        if not self.suits(pairs):
+            fault = "cannot match partial shapes" if self.full_only else "matches partial shapes only"
+            raise InputError(f"{self.reference}: {fault}: remove this method from --methods.")
 
     def suits(self, pairs: Sequence[DataPair]) -> bool:
         """Return whether the method can match all pairs. Unlike `check`, `suits` does not look for files."""
@@ -154,14 +129,74 @@ def successful(pointwise_map: Int[Array, " m"], result: RESULTS) -> Int[Array, "
     return pointwise_map
 
 
-def check_spectrum(mesh: Mesh, spectrum: Spectrum) -> None:
-    """Check that a spectrum, padded or not, has a row for every vertex of a mesh.
+@dataclass(frozen=True, eq=False)
+class HostShape:
+    """A shape without unreferenced vertices and without padding, in NumPy float64.
 
-    **Raises:** `InputError` if the spectrum has fewer rows than the mesh has vertices.
+    **Attributes:**
+
+    - `mesh`: the mesh with its u referenced vertices.
+    - `vertices`: the number of each referenced vertex in the given mesh (u,).
+    - `spectrum`: the spectrum of the given mesh, padded or not.
     """
-    rows, n = spectrum.mask.shape[0], len(mesh.vertices)
-    if rows < n:
-        raise InputError(
-            f"{mesh.name}: has {n} vertices, but its spectrum has {rows} rows: give the spectrum of this "
-            "mesh."
-        )
+
+    mesh: Mesh
+    vertices: Int64[np.ndarray, " u"]
+    spectrum: Spectrum
+
+    @classmethod
+    def of(cls, mesh: Mesh, spectrum: Spectrum) -> HostShape:
+        """Return a mesh and its spectrum without unreferenced vertices."""
+        used = mesh.referenced_vertices
+        if not used.all():
+            faces = (np.cumsum(used) - 1)[mesh.faces]
+            mesh = make_mesh(mesh.vertices[used], faces, name=mesh.name)
+        return cls(mesh, np.flatnonzero(used), spectrum)
+
+    @property
+    def eigenvalues(self) -> Float64[np.ndarray, " k"]:
+        """The eigenvalues (k,)."""
+        return np.asarray(self.spectrum.eigenvalues, np.float64)
+
+    @cached_property
+    def eigenvectors(self) -> Float64[np.ndarray, "u k"]:
+        """The eigenvectors at the referenced vertices (u, k)."""
+        return self._rows(self.spectrum.eigenvectors)
+
+    @property
+    def vertex_areas(self) -> Float64[np.ndarray, " u"]:
+        """The vertex areas (u,)."""
+        return self._rows(self.spectrum.vertex_areas)
+
+    @property
+    def descriptors(self) -> Float64[np.ndarray, "u d"]:
+        """The descriptors (u, d)."""
+        assert self.spectrum.descriptors is not None
+        return self._rows(self.spectrum.descriptors)
+
+    def _rows(self, array: Float[Array, "n ..."]) -> Float64[np.ndarray, "u ..."]:
+        return np.asarray(array, np.float64)[self.vertices]
+
+
+class HostMethod(Method):
+    """The base class of methods in NumPy that match full shapes without unreferenced vertices.
+
+    An unreferenced vertex receives the match of the nearest referenced vertex.
+    """
+
+    full_only = True
+
+    def __call__(self, pair: MethodInput) -> PointwiseMap:
+        assert pair.meshes is not None
+        mesh_x, _ = pair.meshes
+        x, y = (HostShape.of(mesh, s) for mesh, s in zip(pair.meshes, pair.spectra.both, strict=True))
+        initial_map = np.searchsorted(y.vertices, np.asarray(pair.initial_map)[x.vertices])
+        images = np.zeros(len(mesh_x.vertices), np.int64)
+        images[x.vertices] = y.vertices[self.match(initial_map, x, y)]
+        return extend_to_unreferenced(mesh_x, images)
+
+    @abc.abstractmethod
+    def match(
+        self, initial_map: Int64[np.ndarray, " u"], x: HostShape, y: HostShape
+    ) -> Int64[np.ndarray, " u"]:
+        """Return the map X -> Y (u,) between the referenced vertices, which are counted from 0."""

@@ -31,7 +31,7 @@ from jaxsmw.benchmark.opponents.base import MOST_SAMPLES, Method, MethodInput, P
 from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
-from jaxsmw.core.refinement import refine
+from jaxsmw.core.refinement import RefineSettings, refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import Filtering, NearestOrthogonal
@@ -60,21 +60,14 @@ class Unrefined(Method):
 
 @dataclass(frozen=True)
 class PublishedMaps(Method):
-    """A method that reads the map of each pair from a directory; see `read_published_map`.
-
-    **Attributes:**
-
-    - `directory`: the directory that contains the files `X_Y.map`.
-    - `number_of_eigenvectors`: 1, the smallest number that a benchmark can compute. The method itself uses
-      no eigenvectors.
-    """
+    """A method that reads the map of each pair from a directory; see `read_published_map`."""
 
     directory: Path
-    number_of_eigenvectors: int = 1
+    number_of_eigenvectors: int = 1  # the smallest number that a benchmark can compute
 
     @property
     def reference(self) -> str:  # type: ignore[override]
-        """The text that is printed with the results. It contains the name of the directory."""
+        """The text that is printed with the results, with the name of the directory."""
         return f"maps in {self.directory.name}, computed elsewhere"
 
     def __call__(self, pair: MethodInput) -> PointwiseMap:
@@ -85,10 +78,7 @@ class PublishedMaps(Method):
         return self(pair), np.nan
 
     def check(self, pairs: Sequence[DataPair]) -> None:
-        """Check that the directory has a map for each pair.
-
-        **Raises:** `InputError` if a map is missing.
-        """
+        """Raise `InputError` if the directory has no map for a pair."""
         missing = [pair for pair in pairs if not _published_file(self.directory, pair.names).is_file()]
         if missing:
             raise InputError(
@@ -101,15 +91,7 @@ class PublishedMaps(Method):
 def read_published_map(
     directory: Path, names: tuple[str, str], meshes: tuple[Mesh, Mesh]
 ) -> Int64[np.ndarray, " m"]:
-    """Read the map X -> Y from `X_Y.map`, which contains one vertex of Y per line, counted from 1.
-
-    **Arguments:**
-
-    - `directory`: the directory that contains the file.
-    - `names`: the names of X and Y, which form the file name.
-    - `meshes`: the meshes of X, with m vertices, and of Y.
-
-    **Returns:** The map (m,), 0-based vertices of Y.
+    """Read the map X -> Y (m,) from `X_Y.map`, which contains one vertex of Y per line, counted from 1.
 
     **Raises:** `InputError` if the file is missing or does not fit the meshes.
     """
@@ -122,10 +104,7 @@ def _published_file(directory: Path, names: tuple[str, str]) -> Path:
 
 @dataclass(frozen=True)
 class Refined(Method):
-    """A method that refines the initial map with one refiner and a fixed number of eigenvectors.
-
-    **Attributes:** those of `Method`, and the attributes of `Stage` with the same names.
-    """
+    """A method that refines the initial map in one `Stage`, whose attributes have the same names."""
 
     reference: str
     refiner: Refiner = field(default_factory=WaveletPreservation)
@@ -141,24 +120,17 @@ class Refined(Method):
             number_of_samples=self.number_of_samples,
         )
         seen, start = pair.spectra.seen_by(stage), pair.initial_map
-        options = {"samples": seen.samples, "partial": seen.partial, **stage.settings}
-        found = compiled(refine)(*seen.both, start, **options)
-        return successful(found.pointwise_map, found.result)
+        settings: RefineSettings = {**stage.settings, "partial": seen.partial}
+        refinement = compiled(refine)(*seen.both, start, samples=seen.samples, **settings)
+        return successful(refinement.pointwise_map, refinement.result)
 
 
 @dataclass(frozen=True)
 class Matched(Method):
     """A method that calls `jaxsmw.match` with a preset, on the meshes and the argument `init` of the pair.
 
-    `match` prepares the pair itself. The seconds leave out the steps whose results all methods share:
-    eigenbases, the initial map, descriptors and samples. All other steps count, such as the mirror test,
-    crease eigenvectors, and the spectra of trimmed shapes. Nothing is read from the cache, so all steps take
-    as long as for shapes that were never matched before.
-
-    **Attributes:**
-
-    - `reference`: the publication and the settings, as text; see `Method`.
-    - `preset`: the name of the preset.
+    `match` prepares the pair itself. The seconds leave out the steps whose results all methods share
+    (`_SHARED_STEPS`). Nothing is read from the cache, so all steps take as long as for new shapes.
     """
 
     reference: str
@@ -174,8 +146,9 @@ class Matched(Method):
 
     def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
         with recomputing():
-            found = self._match(pair)
-        return found.pointwise_map, sum(t for step, t in found.seconds.items() if step not in _SHARED_STEPS)
+            result = self._match(pair)
+        own_steps = (t for step, t in result.seconds.items() if step not in _SHARED_STEPS)
+        return result.pointwise_map, sum(own_steps)
 
     def _match(self, pair: MethodInput) -> Correspondence:
         assert pair.meshes is not None
@@ -198,13 +171,7 @@ class ZoomOut(Method):
     With samples (section 4.3 of the paper), each iteration computes the functional map and the pointwise map
     from the samples only. After the last iteration, one search finds the matches of all vertices.
 
-    **Attributes:**
-
-    - `reference`: the publication and the settings, as text; see `Method`.
-    - `first`: the size k of the functional map in the first iteration.
-    - `step`: the increase of k after each iteration.
-    - `number_of_eigenvectors`: the largest size k.
-    - `number_of_samples`: the number of samples of each shape; None for all vertices.
+    The size k of the functional map grows from `first` to `number_of_eigenvectors` in steps of `step`.
     """
 
     reference: str

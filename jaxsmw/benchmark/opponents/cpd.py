@@ -4,17 +4,15 @@ This module implements the methods of two papers: Rodolà, Moeller, Cremers, *Po
 refinement from functional correspondence*, VMV 2015, arXiv 1506.05603; and Myronenko, Song, *Point set
 registration: Coherent Point Drift*, IEEE TPAMI 32 (2010).
 
-A search for nearest neighbours recovers a good pointwise map if the functional map is nearly a rotation of
-one spectral embedding onto the other. For non-isometric shapes the functional map is not a rotation. For such
-shapes, Rodolà et al. recover the pointwise map by a non-rigid registration of two point sets in k dimensions.
-The embedding of Y (`Phi_Y C^T`, the "centroids") moves smoothly, and the embedding of X (`Phi_X`, the "data")
-stays fixed.
+For non-isometric shapes, the functional map is not a rotation of one spectral embedding onto the other, so a
+search for nearest neighbours recovers no good pointwise map. Rodolà et al. recover it by a non-rigid
+registration of two point sets in k dimensions. The embedding of Y (`Phi_Y C^T`, the "centroids") moves
+smoothly, and the embedding of X (`Phi_X`, the "data") stays fixed.
 
-In the statistical model, a data point is uniform noise with probability w. Otherwise the data point is drawn
-from a mixture of isotropic Gaussians around the centroids. All Gaussians have the same variance s. Vertex
-areas are ignored, so all vertices have equal weight. The displacement of the centroids is a linear
-combination of Gaussian kernels at the initial centroids `Y`. `G` (n, n) is the kernel matrix, and `W` (n, d)
-contains the coefficients of the linear combination. The moved centroids are `T = Y + G W`.
+In the statistical model, a data point is uniform noise with probability w. Otherwise it is drawn from a
+mixture of isotropic Gaussians of variance s around the centroids. All vertices have equal weight. The moved
+centroids are `T = Y + G W`, with the initial centroids `Y`, the matrix `G` (n, n) of Gaussian kernels at
+them, and the coefficients `W` (n, d).
 
 Expectation maximisation (EM) alternates between two steps. The E-step computes the probability `P_ji` that
 data point i was drawn from the Gaussian around centroid j:
@@ -102,15 +100,11 @@ def coherent_point_drift(
 ) -> Drift:
     """Move centroids smoothly until they fit the data (Coherent Point Drift, Myronenko and Song 2010).
 
-    Each point set is first shifted to zero mean and scaled to unit variance: the mean squared distance of its
-    points from their mean is then 1. The docstring of this module contains the equations. The default values
-    are those of Myronenko's program, except for the rank. Myronenko's program uses the exact kernel matrix by
-    default, and optionally an approximation of rank sqrt(n). The mean geodesic errors on a real pair with
-    5000 vertices show the effect of the rank:
-
-    - With 30 eigenvectors, the error is 22.4 x 10^-3 at rank 70, and 20.8 x 10^-3 at the ranks 300 and 1200.
-    - With 100 eigenvectors, the error is 17.2 x 10^-3 at rank 150, 11.4 x 10^-3 at rank 600, and 11.3 x 10^-3
-      at rank 1200.
+    Each point set is first shifted to zero mean and scaled to unit variance. The docstring of this module
+    contains the equations. The default values are those of Myronenko's program, except for the rank: that
+    program uses the exact kernel matrix, or an approximation of rank sqrt(n). On a real pair with 5000
+    vertices and 30 eigenvectors, the mean geodesic error is 22.4 x 10^-3 at rank 70, and 20.8 x 10^-3 at the
+    ranks 300 and 1200. With 100 eigenvectors, it is 17.2 x 10^-3 at rank 150 and 11.4 x 10^-3 at rank 600.
 
     **Arguments:**
 
@@ -149,18 +143,8 @@ def kernel_factor(
 
     Entry (i, j) of the kernel matrix is `exp(-||p_i - p_j||^2 / 2 width^2)`. L is computed by a pivoted
     Cholesky factorisation that stops at the given rank. Each step selects the point whose diagonal entry is
-    approximated worst. The selected points are spread over the whole set, and their selection is
-    deterministic. `L L^T` is the Nyström approximation from the selected points. The factorisation computes
-    `rank` rows of the kernel matrix, and needs about `n rank^2` operations.
-
-    **Arguments:**
-
-    - `points`: points in d dimensions, (n, d).
-    - `mask`: a mask (n,), False for points that are ignored.
-    - `width`: the standard deviation of the kernel, in the unit of the points.
-    - `rank`: the number of columns of L.
-
-    **Returns:** L (n, rank). Columns beyond the numerical rank and rows of masked points are zero.
+    approximated worst, so `L L^T` is a Nyström approximation. It needs about `n rank^2` operations. Columns
+    beyond the numerical rank and rows of masked points are zero.
     """
     n = points.shape[0]
     rounding = 32 * jnp.finfo(points.dtype).eps
@@ -191,26 +175,12 @@ def recover_by_drift(
     rank: int = 300,
     iterations: int = 50,
 ) -> Int32[Array, " m"]:
-    """Recover a pointwise map from a functional map by Coherent Point Drift, as an alternative to `decode`.
+    """Recover a pointwise map X -> Y (m,) from a functional map by Coherent Point Drift, instead of `decode`.
 
     Coherent Point Drift moves the embedding of Y onto the embedding of X. Each vertex of X is then matched
-    with the nearest unmasked vertex of Y.
-
-    The default of 50 iterations is taken from a published run of the method on FAUST (`exp_teaser` of
-    github.com/daviddao/GPU-Programming-TUM). This run used 30 eigenvectors and a functional map from spectral
-    ICP. After 50 iterations the centroids hardly move. All settings except `rank` and `iterations` have the
-    defaults of `coherent_point_drift`.
-
-    **Arguments:**
-
-    - `functional_map`: C (k_X, k_Y) in the pullback convention, `Phi_X^+ P Phi_Y`; C need not be orthogonal.
-    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, padded or not.
-    - `rank`, `iterations`: the rank of the kernel matrix and the largest number of EM iterations, each at
-      least 1; see `coherent_point_drift`.
-
-    **Returns:** The pointwise map X -> Y (m,), 0-based vertices of Y.
-
-    **Raises:** `ValueError` if `rank` or `iterations` is less than 1.
+    with the nearest unmasked vertex of Y. The functional map has the pullback convention, and need not be
+    orthogonal. The default of 50 iterations is taken from a published run of the method on FAUST
+    (`exp_teaser` of github.com/daviddao/GPU-Programming-TUM) with 30 eigenvectors.
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y)
     drift = coherent_point_drift(
@@ -227,18 +197,14 @@ def recover_by_drift(
 class DriftRecovery(WaveletPreservation):
     """A refiner for `jaxsmw.refine` that recovers pointwise maps by Coherent Point Drift.
 
-    Without a filter (the default), the functional map is the least-squares solution `Phi_X^+ P Phi_Y`, which
-    is not orthogonal. A single iteration performs the recovery of Rodolà, Moeller and Cremers (2015). Several
-    iterations perform the refinement of the same paper: they update the functional map and the pointwise map
-    alternately. The paper's formula for the functional map was not available to us, so least squares is our
-    choice.
+    One iteration is the recovery of Rodolà, Moeller and Cremers (2015), and several iterations are the
+    refinement of the same paper. The paper's formula for the functional map was not available to us, so the
+    least-squares solution `Phi_X^+ P Phi_Y` is our choice.
 
-    **Arguments:** the arguments of `WaveletPreservation`, and the following arguments.
+    **Arguments:** those of `WaveletPreservation`, and `rank` and `drift_iterations`, the arguments `rank` and
+    `iterations` of `recover_by_drift`.
 
-    - `rank`, `drift_iterations`: the arguments `rank` and `iterations` of `recover_by_drift`.
-
-    **Raises:** `ValueError` if `convention` is `"pushforward"`. The other errors are those of
-    `WaveletPreservation`.
+    **Raises:** `ValueError` if `convention` is `"pushforward"`.
     """
 
     bank: FilterBank = Identity()
@@ -253,7 +219,7 @@ class DriftRecovery(WaveletPreservation):
             )
 
     def recover(self, prepared: PreparedWavelets, state: State) -> Int32[Array, " m"]:
-        """Recover the pointwise map X -> Y (m,) from the state's functional map; see `recover_by_drift`."""
+        """Recover the pointwise map by `recover_by_drift`."""
         return recover_by_drift(
             state.functional_map,
             prepared.spectrum_x,

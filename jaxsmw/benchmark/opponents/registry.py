@@ -63,25 +63,20 @@ PEERS: Methods[Peer] = Methods({"pyfm-zoomout": "peers:PYFM", "geomfum-zoomout":
 
 
 def known_methods() -> dict[str, Method]:
-    """Return `METHODS` and the methods of other installed libraries, as a dictionary from name to method."""
+    """Return `METHODS` and the methods of other installed libraries."""
     return {**METHODS, **{name: peer for name, peer in PEERS.items() if find_spec(peer.package)}}
 
 
 def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
-    """Return the known methods that can match all pairs, as a dictionary from name to method."""
+    """Return the known methods that can match all pairs."""
     return {name: method for name, method in known_methods().items() if method.suits(pairs)}
 
 
 def find_methods(names: Iterable[str]) -> dict[str, Method]:
     """Return methods by name.
 
-    **Arguments:**
-
-    - `names`: names of known methods, or paths of directories with maps of other programs (files named
-      `X_Y.map`). Duplicate names are ignored.
-
-    **Returns:** A dictionary from the name of each method to the method. For a directory with maps, the name
-    of the method is the name of the directory.
+    A name can also be the path of a directory with maps `X_Y.map` of another program. The name of the method
+    is then the name of the directory. Duplicate names are ignored.
 
     **Raises:** `InputError` if a name is neither a known method nor a directory, or if two methods would have
     the same name.

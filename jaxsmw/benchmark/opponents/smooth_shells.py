@@ -48,17 +48,17 @@ import scipy.sparse as sp
 from jaxtyping import Float, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from jaxsmw.benchmark.opponents.base import Method, MethodInput, PointwiseMap
+from jaxsmw.benchmark.opponents.base import HostMethod, HostShape
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.alignment import nearest_rotations
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.laplacian import assemble_laplacian
-from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced, make_mesh
+from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
+from jaxsmw.runtime.batches import pad_rows
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.padding import pad_rows
 
 # The slope of the sigmoid, and the largest filter value that counts as zero.
 _SLOPE, _NEGLIGIBLE = 0.2, 1e-3
@@ -80,7 +80,7 @@ _RIDGE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class _UnitSurface:
-    """A shape of area 1 without unreferenced vertices. Its center is the origin."""
+    """A shape of area 1, whose center is the origin."""
 
     mesh: Mesh
     positions: Float64[np.ndarray, "n 3"]
@@ -95,7 +95,6 @@ class _UnitSurface:
     def of(
         cls, mesh: Mesh, descriptors: Float[np.ndarray, "n c"], number_of_eigenvectors: int
     ) -> _UnitSurface:
-        """Compute the `_UnitSurface` of a mesh in which all vertices are referenced."""
         spectrum = compute_spectrum(mesh, number_of_eigenvectors)
         areas = np.asarray(spectrum.vertex_areas, np.float64)
         eigenvectors = np.asarray(spectrum.eigenvectors, np.float64)
@@ -118,7 +117,6 @@ class _UnitSurface:
         )
 
     def shell(self, level: int) -> _Shell:
-        """Return the smooth shell of a level."""
         numbers = np.arange(1, len(self.eigenvalues) + 1)
         filters = 1 / (1 + np.exp(np.minimum(_SLOPE * (numbers - level), 50)))
         used = filters > _NEGLIGIBLE
@@ -248,11 +246,9 @@ def smooth_shells(
 ) -> Int64[np.ndarray, " m"]:
     """Match two shapes with SmoothShells (Eisenberger, Lähner, Cremers 2020).
 
-    The same seed gives the same map.
-
     **Arguments:**
 
-    - `mesh_x`, `mesh_y`: the meshes of X, with m vertices, and of Y, with n vertices.
+    - `mesh_x`, `mesh_y`: the meshes of X (m vertices) and of Y (n vertices), without unreferenced vertices.
     - `descriptors_x`, `descriptors_y`: comparable descriptors of X (m, c) and of Y (n, c), each with mean
       square 1, such as principal components of SHOT.
     - `number_of_eigenvectors`: the last level, at least 1. Meshes with fewer vertices have fewer levels.
@@ -260,8 +256,7 @@ def smooth_shells(
       poses are uniformly random rotations (our choice; the paper draws a Markov chain of deformations).
     - `seed`: the seed of the random rotations.
 
-    **Returns:** The map X -> Y (m,), 0-based vertices of Y. An unreferenced vertex receives the match of the
-    nearest referenced vertex.
+    **Returns:** The map X -> Y (m,), 0-based vertices of Y.
 
     **Raises:** `InputError` if `number_of_eigenvectors` or `proposals` is less than 1, or if a mesh has too
     few vertices.
@@ -271,25 +266,10 @@ def smooth_shells(
             f"SmoothShells was called with {number_of_eigenvectors} eigenvectors and {proposals} initial "
             "poses: give at least 1 of each."
         )
-    used_x, used_y = (np.flatnonzero(mesh.referenced_vertices) for mesh in (mesh_x, mesh_y))
-    count = min(number_of_eigenvectors, len(used_x) - 1, len(used_y) - 1)
-    surfaces = (
-        _UnitSurface.of(_without_unreferenced(mesh_x), descriptors_x[used_x], count),
-        _UnitSurface.of(_without_unreferenced(mesh_y), descriptors_y[used_y], count),
-    )
+    count = min(number_of_eigenvectors, len(mesh_x.vertices) - 1, len(mesh_y.vertices) - 1)
+    surfaces = _UnitSurface.of(mesh_x, descriptors_x, count), _UnitSurface.of(mesh_y, descriptors_y, count)
     first = min(_INITIAL, count)
-    matches = _refined(surfaces, first, count, _best_matches(surfaces, first, proposals, seed))
-    images = np.zeros(len(mesh_x.vertices), np.int64)
-    images[used_x] = used_y[matches.forward]
-    return extend_to_unreferenced(mesh_x, images)
-
-
-def _without_unreferenced(mesh: Mesh) -> Mesh:
-    """Return the mesh without its unreferenced vertices."""
-    if mesh.referenced_vertices.all():
-        return mesh
-    number = np.cumsum(mesh.referenced_vertices) - 1
-    return make_mesh(mesh.vertices[mesh.referenced_vertices], number[mesh.faces], name=mesh.name)
+    return _refined(surfaces, first, count, _best_matches(surfaces, first, proposals, seed)).forward
 
 
 def _levels(first: int, last: int, growth: float) -> Iterator[int]:
@@ -329,7 +309,7 @@ def _best_matches(
     ]
     random = Rotation.random(proposals - 1, rng=seed).as_matrix() if proposals > 1 else []
     poses = [_aligned(sampled, rotation) for rotation in (np.eye(3), *random)]
-    best = min(poses, key=lambda pose: pose.energy).matches
+    best, _ = min(poses, key=lambda pose: pose[1])
     shells, few = (x.shell(last), y.shell(last)), sampled[-1]
     return _Matches(
         _extended(*shells, *few, best.forward), _extended(*shells[::-1], *few[::-1], best.backward)
@@ -346,15 +326,10 @@ def _extended(
     )
 
 
-class _Pose(NamedTuple):
-    """The matches of the samples after alignment from an initial pose, and their energy."""
-
-    energy: float
-    matches: _Matches
-
-
-def _aligned(sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndarray, "3 3"]) -> _Pose:
-    """Align the shells of the samples, level by level, after a rotation of X."""
+def _aligned(
+    sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndarray, "3 3"]
+) -> tuple[_Matches, float]:
+    """Align the shells of the samples after a rotation of X. Return the matches and their energy."""
 
     # The rotation of X is known, so the deformation need not estimate rotations (our choice). The deformation
     # is near to the rotated shell in the same Dirichlet energy as in `_refined`.
@@ -385,7 +360,7 @@ def _aligned(sampled: Sequence[tuple[_Shell, _Shell]], rotation: Float64[np.ndar
             (x, y), moved(x, y, matches.forward, rotation), moved(y, x, matches.backward, rotation.T)
         )
         matches = space.matches()
-    return _Pose(space.energy(matches), matches)
+    return matches, space.energy(matches)
 
 
 def _refined(
@@ -425,31 +400,24 @@ def _as_rigid_as_possible(
 
 
 @dataclass(frozen=True)
-class SmoothShells(Method):
+class SmoothShells(HostMethod):
     """A method that ignores the initial map, and matches both shapes with `smooth_shells`.
 
-    The time of the method includes the computation of its eigenbases, which no other method uses.
-
-    **Attributes:** those of `Method`. `last_level` is the number of eigenvectors of the last level.
-    Descriptors are principal components of SHOT.
+    The time of the method includes the computation of its `last_level` eigenvectors, which no other method
+    uses.
     """
 
     reference: str
     number_of_eigenvectors: int = 1
     number_of_descriptors: int = 15
-    full_only: bool = True
     last_level: int = 500
 
-    def __call__(self, pair: MethodInput) -> PointwiseMap:
-        assert pair.meshes is not None
-        descriptors = []
-        for mesh, spectrum in zip(pair.meshes, pair.spectra.both, strict=True):
-            assert spectrum.descriptors is not None
-            descriptors.append(
-                np.asarray(spectrum.descriptors)[: len(mesh.vertices), : self.number_of_descriptors]
-            )
+    def match(
+        self, initial_map: Int64[np.ndarray, " u"], x: HostShape, y: HostShape
+    ) -> Int64[np.ndarray, " u"]:
+        descriptors = (shape.descriptors[:, : self.number_of_descriptors] for shape in (x, y))
         with recomputing():
-            return smooth_shells(*pair.meshes, *descriptors, number_of_eigenvectors=self.last_level)
+            return smooth_shells(x.mesh, y.mesh, *descriptors, number_of_eigenvectors=self.last_level)
 
 
 SMOOTH_SHELLS = SmoothShells(

@@ -13,10 +13,18 @@ eigenvalues.
 
 from jaxsmw.core.banks.base import FilterBank
 from jaxsmw.core.banks.dilates import CubicSpline, Heat, MexicanHat
-from jaxsmw.core.banks.frames import FrameBounds, frame_bounds, frame_function, tighten
-from jaxsmw.core.banks.learned import SoftmaxFrame
-from jaxsmw.core.banks.single import ExponentialWindow, Identity, LowPass
-from jaxsmw.core.banks.transitions import Held, Meyer, Papadakis, Regular, Simoncelli, SimpleTight
+from jaxsmw.core.banks.frames import FrameBounds, SoftmaxFrame, frame_bounds, frame_function, tighten
+from jaxsmw.core.banks.transitions import (
+    ExponentialWindow,
+    Held,
+    Identity,
+    LowPass,
+    Meyer,
+    Papadakis,
+    Regular,
+    Simoncelli,
+    SimpleTight,
+)
 from jaxsmw.core.banks.translates import Gabor, HalfCosine, Itersine
 from jaxsmw.core.banks.warps import Logarithm, Power, SpectralDistribution, Warp, Warped
 

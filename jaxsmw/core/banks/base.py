@@ -9,44 +9,39 @@ from jaxtyping import Array, Float
 
 from jaxsmw.core.checks import check_integer
 
+Points = Float[Array, " p"]
+Eigenvalues = Float[Array, " k"]
+Responses = Float[Array, "filters p"]
+
 
 class FilterBank(eqx.Module):
     """The base class of filter banks (a scaling function g_0 and wavelet filters g_1 … g_L).
 
     `jaxsmw.banks` contains ready subclasses, such as `Meyer` (the default of `WaveletPreservation`) and
-    `CubicSpline`.
+    `CubicSpline`. A subclass must define `__call__(points, eigenvalues)`. A bank is an Equinox module, and
+    therefore a pytree. The continuous parameters of a bank are arrays, which JAX can trace and differentiate.
+    The sizes of a bank, such as the number of filters, are static fields.
 
-    A subclass must define `__call__(points, eigenvalues)`. A bank is an Equinox module, and therefore a
-    pytree. The continuous parameters of a bank are arrays, which JAX can trace and differentiate. The sizes
-    of a bank, such as the number of filters, are static fields.
+    **Raises:** The constructor of a ready bank raises `TypeError` if a size is not an integer, and
+    `ValueError` if a parameter is not a single finite number within its limits.
     """
 
     @abc.abstractmethod
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         """Return the responses of all filters at the given points of the eigenvalue axis.
-
-        `bank(eigenvalues, eigenvalues)` returns the responses (filters, k) at the eigenvalues of a shape.
 
         **Arguments:**
 
         - `points`: (p,), points in [0, lambda_max], in any order.
-        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same (arbitrary) unit as the
-          points. The last eigenvalue is lambda_max. Most banks use only lambda_max and ignore all other
-          eigenvalues.
+        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the unit of the points. The last
+          eigenvalue is lambda_max. Most banks ignore all other eigenvalues.
 
-        **Returns:** The responses (filters, p), which are dimensionless. By convention, row 0 is the scaling
-        function.
+        **Returns:** The responses (filters, p), without unit. By convention, row 0 is the scaling function.
         """
 
 
-def sample_bank(
-    bank: FilterBank, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-) -> Float[Array, "filters p"]:
-    """Return the responses (filters, p) of a bank, and check their shape.
-
-    The check is necessary because users can define their own banks.
+def sample_bank(bank: FilterBank, points: Points, eigenvalues: Eigenvalues) -> Responses:
+    """Return the responses (filters, p) of a bank, which can be a user's.
 
     **Raises:** `ValueError` if the responses are not of shape (filters, p).
     """
@@ -60,11 +55,7 @@ def sample_bank(
 
 
 def check_number_of_filters(bank: FilterBank, filters: int, least: int) -> None:
-    """Check the number of filters of a bank.
-
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below the minimum
-    `least`.
-    """
+    """Raise `TypeError` if the number of filters is no integer, or `ValueError` if it is below `least`."""
     check_integer(f"the number of filters of {type(bank).__name__}", filters)
     if filters < least:
         raise ValueError(f"{type(bank).__name__} needs at least {least} filters, not {filters}")

@@ -9,15 +9,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmw.core.banks.base import FilterBank, check_number_of_filters
+from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, check_number_of_filters
 from jaxsmw.core.checks import as_parameter, check_between
 
 
 class _LogSpacedDilates(FilterBank):
-    """A bank of a scaling function and one wavelet at several log-spaced scales.
-
-    The scaling function passes the eigenvalues below `lambda_max / ratio`.
-    """
+    """A scaling function below `lambda_max / ratio`, and one wavelet at several log-spaced scales."""
 
     filters: int = eqx.field(static=True, default=6)
     ratio: Float[Array, ""] = eqx.field(converter=as_parameter, default=20.0)
@@ -35,9 +32,7 @@ class _LogSpacedDilates(FilterBank):
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
         """Return the scaling function at `scaled`, which is `ratio * lambda / lambda_max`."""
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         relative, ratio = points / eigenvalues[-1], jnp.asarray(self.ratio, points.dtype)
         # The scales are in units of 1 / lambda_max.
         scales = (2 * ratio) ** jnp.linspace(1, 0, self.filters - 1, dtype=points.dtype)
@@ -61,14 +56,11 @@ class CubicSpline(_LogSpacedDilates):
 
     **Arguments:**
 
-    - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: the wavelets cover the eigenvalues from `lambda_max / ratio` to lambda_max. The value is a
-      single number above 1, or an array of shape (). The default is 20.
-    - `normalize`: whether each wavelet is multiplied by the square root of its scale. This scale is in units
-      of 1 / lambda_max. The default is False.
-
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
-    `ratio` is not a single finite number above 1.
+    - `filters`: the number of filters including the scaling function, at least 2, by default 6.
+    - `ratio`: the wavelets cover the eigenvalues from `lambda_max / ratio` to lambda_max. The ratio is above
+      1, by default 20.
+    - `normalize`: whether each wavelet is multiplied by the square root of its scale in units of 1 /
+      lambda_max. The default is False.
     """
 
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -87,23 +79,9 @@ class MexicanHat(_LogSpacedDilates):
     """A filter bank of the Mexican-hat wavelet `y exp(-y)` at several scales. The bank is not tight.
 
     Here y is the scale times the eigenvalue lambda. In space, this wavelet corresponds to the second
-    derivative of a Gaussian. The `filters - 1` scales are log-spaced from `2 ratio / lambda_max` to
-    `1 / lambda_max`. The scaling function passes the eigenvalues below `lambda_max / ratio`.
-
-    The wavelet is that of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs", 2014. The
-    scales are those of Hammond, Vandergheynst and Gribonval 2011. With the default parameters, the frame
-    bounds over [0, lambda_max] are 0.177 and 0.270.
-
-    **Arguments:**
-
-    - `filters`: the number of filters including the scaling function, at least 2. The default is 6.
-    - `ratio`: the wavelets cover the eigenvalues from `lambda_max / ratio` to lambda_max. The value is a
-      single number above 1, or an array of shape (). The default is 20.
-    - `normalize`: whether each wavelet is multiplied by the square root of its scale. This scale is in units
-      of 1 / lambda_max. The default is False.
-
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
-    `ratio` is not a single finite number above 1.
+    derivative of a Gaussian. The wavelet is that of Perraudin et al., "GSPBOX: A toolbox for signal
+    processing on graphs", 2014. The scales and the arguments are those of `CubicSpline`. With the default
+    parameters, the frame bounds over [0, lambda_max] are 0.177 and 0.270.
     """
 
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
@@ -116,17 +94,12 @@ class MexicanHat(_LogSpacedDilates):
 class Heat(FilterBank):
     """A filter bank of heat kernels `exp(-t lambda / lambda_max)`, with several diffusion times t.
 
-    The bank is not tight. All filters of this bank are low-pass filters.
-
-    The kernels are those of Sun, Ovsjanikov and Guibas, "A concise and provably informative multi-scale
-    signature based on heat diffusion", 2009.
+    The bank is not tight, and all its filters are low-pass filters. The kernels are those of Sun, Ovsjanikov
+    and Guibas, "A concise and provably informative multi-scale signature based on heat diffusion", 2009.
 
     **Arguments:**
 
-    - `times`: (filters,), a list or an array of one or more positive diffusion times t, in units of 1 /
-      lambda_max. A single number is not accepted.
-
-    **Raises:** `ValueError` if the times are not a list of one or more positive, finite numbers.
+    - `times`: (filters,), one or more positive diffusion times t, in units of 1 / lambda_max.
     """
 
     times: Float[Array, " filters"] = eqx.field(converter=as_parameter)
@@ -136,8 +109,6 @@ class Heat(FilterBank):
         if not self.times.size:
             raise ValueError("the times of Heat must be a list of at least one time")
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         relative = points / eigenvalues[-1]
         return jnp.exp(-jnp.asarray(self.times, points.dtype)[:, None] * relative[None, :])

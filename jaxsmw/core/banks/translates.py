@@ -9,15 +9,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmw.core.banks.base import FilterBank, check_number_of_filters
+from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, check_number_of_filters
 from jaxsmw.core.checks import as_parameter, check_between, check_integer
 
 
 class _UniformTranslates(FilterBank):
-    """A bank of evenly spaced translates of one window.
-
-    Each point of [0, lambda_max] is covered by `overlap` windows.
-    """
+    """Evenly spaced translates of one window, of which `overlap` cover each point of [0, lambda_max]."""
 
     filters: int = eqx.field(static=True, default=6)
     overlap: int = eqx.field(static=True, default=2)
@@ -27,12 +24,10 @@ class _UniformTranslates(FilterBank):
         check_number_of_filters(self, self.filters, self.overlap)
 
     @abc.abstractmethod
-    def window(self, position: Float[Array, "filters p"]) -> Float[Array, "filters p"]:
+    def window(self, position: Float[Array, "filters p"]) -> Responses:
         """Return the window at positions in (-1/2, 1/2), which are in units of the window's width."""
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         steps = points / eigenvalues[-1] * (self.filters - self.overlap + 1)
         centres = jnp.arange(self.filters, dtype=points.dtype) + (1 - self.overlap / 2)
         position = (steps[None, :] - centres[:, None]) / self.overlap
@@ -44,45 +39,35 @@ class Itersine(_UniformTranslates):
 
     Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
     width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
-
-    The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on
-    graphs", 2014. The squared windows sum to a constant because `overlap` is even.
+    The window is the iterated sine of Perraudin et al., "GSPBOX: A toolbox for signal processing on graphs",
+    2014. The squared windows sum to a constant because `overlap` is even.
 
     **Arguments:**
 
-    - `filters`: the number of filters, at least `overlap`. The default is 6.
-    - `overlap`: the number of windows that overlap at each eigenvalue, an even number of at least 2. The
-      default is 2.
-
-    **Raises:** `TypeError` if `filters` or `overlap` is not an integer; `ValueError` if `filters` is below
-    `overlap`, or if `overlap` is odd or below 2.
+    - `filters`: the number of filters, at least `overlap`, by default 6.
+    - `overlap`: the number of windows that overlap at each eigenvalue, an even number of at least 2, by
+      default 2.
     """
 
     def __check_init__(self) -> None:
         if self.overlap < 2 or self.overlap % 2:
             raise ValueError(f"the overlap of Itersine must be even and positive, not {self.overlap}")
 
-    def window(self, position: Float[Array, "filters p"]) -> Float[Array, "filters p"]:
+    def window(self, position: Float[Array, "filters p"]) -> Responses:
         return math.sqrt(2 / self.overlap) * jnp.sin(jnp.pi / 2 * jnp.cos(jnp.pi * position) ** 2)
 
 
 class HalfCosine(_UniformTranslates):
-    """A Parseval frame of evenly spaced translates of the Hann window `cos²(pi u)`.
-
-    Here u is the difference between the eigenvalue and the centre of the window, in units of the window's
-    width. The windows are zero for u below -1/2 or above 1/2. The first window passes the lowest eigenvalues.
+    """A Parseval frame of evenly spaced translates of the Hann window `cos²(pi u)`, with u as in `Itersine`.
 
     The filters are the uniform translates of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted
-    tight graph wavelet and vertex-frequency frames", 2015. The squared filters of that paper sum to
-    `3 overlap / 8`. Here the filters are scaled so that their squares sum to one.
+    tight graph wavelet and vertex-frequency frames", 2015. The squared filters of that paper sum to `3
+    overlap / 8`. Here the filters are scaled so that their squares sum to one.
 
     **Arguments:**
 
-    - `filters`: the number of filters, at least `overlap`. The default is 6.
-    - `overlap`: the number of windows that overlap at each eigenvalue, at least 3. The default is 3.
-
-    **Raises:** `TypeError` if `filters` or `overlap` is not an integer; `ValueError` if `filters` is below
-    `overlap`, or if `overlap` is below 3.
+    - `filters`: the number of filters, at least `overlap`, by default 6.
+    - `overlap`: the number of windows that overlap at each eigenvalue, at least 3, by default 3.
     """
 
     overlap: int = eqx.field(static=True, default=3)
@@ -91,7 +76,7 @@ class HalfCosine(_UniformTranslates):
         if self.overlap < 3:
             raise ValueError(f"the overlap of HalfCosine must be at least 3, not {self.overlap}")
 
-    def window(self, position: Float[Array, "filters p"]) -> Float[Array, "filters p"]:
+    def window(self, position: Float[Array, "filters p"]) -> Responses:
         return math.sqrt(8 / (3 * self.overlap)) * jnp.cos(jnp.pi * position) ** 2
 
 
@@ -104,12 +89,9 @@ class Gabor(FilterBank):
 
     **Arguments:**
 
-    - `filters`: the number of filters, at least 2. The default is 6.
-    - `width`: the standard deviation of the Gaussians, in units of the spacing between their centres. The
-      value is a single positive number, or an array of shape (). The default is 0.5.
-
-    **Raises:** `TypeError` if `filters` is not an integer; `ValueError` if `filters` is below 2, or if
-    `width` is not a single positive, finite number.
+    - `filters`: the number of filters, at least 2, by default 6.
+    - `width`: the standard deviation of the Gaussians, in units of the spacing between their centres,
+      positive, by default 0.5.
     """
 
     filters: int = eqx.field(static=True, default=6)
@@ -119,9 +101,7 @@ class Gabor(FilterBank):
         check_number_of_filters(self, self.filters, 2)
         check_between(self, "width", self.width)
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         steps = points / eigenvalues[-1] * (self.filters - 1)
         centres = jnp.arange(self.filters, dtype=points.dtype)
         offsets = (steps[None, :] - centres[:, None]) / jnp.asarray(self.width, points.dtype)

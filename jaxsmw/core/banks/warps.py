@@ -8,32 +8,22 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsmw.core.banks.base import FilterBank
+from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses
 from jaxsmw.core.checks import as_parameter, check_between
 
 
 class Warp(eqx.Module):
     """The base class of warps: monotone maps of the eigenvalue axis, for use in `Warped(bank, warp)`.
 
-    A `Warped` bank evaluates another filter bank on the warped eigenvalue axis. Ready subclasses of `Warp`
-    are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
+    Ready subclasses are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
     `__call__(points, eigenvalues)`. The warped points must be non-negative and increase with the points, but
-    these conditions are not checked.
-
-    A constant factor in a warp has no effect on the banks of `jaxsmw.banks`, because these banks depend only
-    on ratios of eigenvalues.
+    these conditions are not checked. A constant factor in a warp has no effect on the banks of
+    `jaxsmw.banks`, because these banks depend only on ratios of eigenvalues.
     """
 
     @abc.abstractmethod
-    def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
-        """Return the warped points (p,), in any unit.
-
-        **Arguments:**
-
-        - `points`: (p,), points in [0, lambda_max], in any order.
-        - `eigenvalues`: (k,), the eigenvalues of the shape, ascending, in the same unit as the points. The
-          last eigenvalue is lambda_max.
-        """
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
+        """Return the warped points (p,), in any unit; `FilterBank` describes the arguments."""
 
 
 class Warped(FilterBank):
@@ -46,17 +36,14 @@ class Warped(FilterBank):
     **Arguments:**
 
     - `bank`: any `FilterBank` with filters g_l.
-    - `warp`: a `Warp`, such as `Logarithm()`, `Power()` or `SpectralDistribution()`. `Logarithm` widens the
-      bands of `Itersine` and `HalfCosine` at higher eigenvalues, as in a bank of wavelets.
-      `SpectralDistribution` gives these bands equal numbers of eigenvalues.
+    - `warp`: a `Warp`. `Logarithm` widens the bands of `Itersine` and `HalfCosine` at higher eigenvalues, as
+      in a bank of wavelets. `SpectralDistribution` gives these bands equal numbers of eigenvalues.
     """
 
     bank: FilterBank
     warp: Warp
 
-    def __call__(
-        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
-    ) -> Float[Array, "filters p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
         return self.bank(self.warp(points, eigenvalues), self.warp(eigenvalues, eigenvalues))
 
 
@@ -64,13 +51,7 @@ class Logarithm(Warp):
     """The warp `log(1 + strength lambda / lambda_max)` of the eigenvalues lambda, for `Warped`.
 
     The warp is nearly linear for eigenvalues below `lambda_max / strength` and nearly logarithmic for larger
-    eigenvalues.
-
-    **Arguments:**
-
-    - `strength`: a single positive number, or an array of shape (). The default is 10.
-
-    **Raises:** `ValueError` if the strength is not a single positive, finite number.
+    eigenvalues. The `strength` is a positive number, by default 10; others raise `ValueError`.
     """
 
     strength: Float[Array, ""] = eqx.field(converter=as_parameter, default=10.0)
@@ -78,19 +59,15 @@ class Logarithm(Warp):
     def __check_init__(self) -> None:
         check_between(self, "strength", self.strength)
 
-    def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
         return jnp.log1p(jnp.asarray(self.strength, points.dtype) * (points / eigenvalues[-1]))
 
 
 class Power(Warp):
-    """The warp `(lambda / lambda_max)^exponent` of the eigenvalue axis, for use in `Warped(bank, Power())`.
+    """The warp `(lambda / lambda_max)^exponent` of the eigenvalues lambda, for `Warped`.
 
-    **Arguments:**
-
-    - `exponent`: a single positive number, or an array of shape (). The default is 0.5: the square root turns
-      eigenvalues into frequencies.
-
-    **Raises:** `ValueError` if the exponent is not a single positive, finite number.
+    The `exponent` is a positive number; others raise `ValueError`. With the default of 0.5, the square root
+    turns eigenvalues into frequencies.
     """
 
     exponent: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.5)
@@ -98,7 +75,7 @@ class Power(Warp):
     def __check_init__(self) -> None:
         check_between(self, "exponent", self.exponent)
 
-    def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
         relative = points / eigenvalues[-1]
         # For exponents below 1 the slope at the eigenvalue 0 is infinite, so gradients use the slope 0 there.
         positive = jnp.where(relative > 0, relative, 1)
@@ -109,17 +86,16 @@ class SpectralDistribution(Warp):
     """The warp that maps each eigenvalue to its index in the spectrum, for `Warped`.
 
     Between eigenvalues, the warp is linear. With this warp, the windows of `Itersine` and `HalfCosine` pass
-    equal numbers of eigenvalues. Only the windows at both ends of the spectrum pass fewer eigenvalues. The
-    warp is that of Shuman, Wiesmeyr, Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and
-    vertex-frequency frames", 2015. It has no parameters.
+    equal numbers of eigenvalues, except at both ends of the spectrum. The warp is that of Shuman, Wiesmeyr,
+    Holighaus and Vandergheynst, "Spectrum-adapted tight graph wavelet and vertex-frequency frames", 2015. The
+    eigenvalues of a surface grow nearly linearly with their index (Weyl's law), so this warp has little
+    effect on surfaces.
 
-    An eigenvalue that occurs once is mapped to its index, counted from 0. A repeated eigenvalue is mapped to
-    the mean of its indices, so a bank treats all functions of an eigenspace equally. If no eigenvalue is
-    repeated, the responses at the eigenvalues depend only on the eigenvalues' indices. The eigenvalues of a
-    surface grow nearly linearly with their index (Weyl's law), so this warp has little effect on surfaces.
+    A repeated eigenvalue is mapped to the mean of its indices, so a bank treats all functions of an
+    eigenspace equally.
     """
 
-    def __call__(self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]) -> Float[Array, " p"]:
+    def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
         # Eigensolvers return repeated eigenvalues as nearly equal numbers, so eigenvalues are compared with a
         # tolerance.
         tolerance = 1e-6 * eigenvalues[-1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable
-from typing import Generic, get_args
+from typing import Generic, TypeVar, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int32
 
 from jaxsmw.choices import Search
 from jaxsmw.core.checks import check_option
-from jaxsmw.core.refiner import PreparedT, Refiner, State, StateT
+from jaxsmw.core.refiner import PreparedT, Refiner, State
 from jaxsmw.core.spectrum import Spectrum
 
 
@@ -30,33 +30,31 @@ class CoarseToFineState(State):
     **Attributes:**
 
     - `iteration`: the number of the iteration, counted from 0.
-    - `reverse_map`: the reverse map Y -> X, for each vertex of Y to be matched, as `recover_both` computes
-      it; else None.
+    - `reverse_map`: the map Y -> X, for each vertex of Y to be matched, if `recover_both` has added it.
     """
 
     iteration: Int32[Array, ""]
     reverse_map: Int32[Array, " n"] | None = eqx.field(default=None, kw_only=True)
 
 
-class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
+CoarseStateT = TypeVar("CoarseStateT", bound=CoarseToFineState)
+
+
+class CoarseToFine(Refiner[PreparedT, CoarseStateT], Generic[PreparedT, CoarseStateT]):
     """The abstract base class of refiners that use more eigenvectors in later iterations.
 
     The number of eigenvectors increases as in ZoomOut (Melzi et al. 2019). Ready subclasses are
-    `FeatureRegression` and `Registration`. A subclass defines the abstract methods of `Refiner`, and its
-    states are subclasses of `CoarseToFineState`.
+    `FeatureRegression` and `Registration`. The states of a subclass are subclasses of `CoarseToFineState`.
 
     **Arguments:**
 
-    - `levels`: the number of eigenvectors (the level) of each iteration. Any iterable of integers of at least
-      1, such as a tuple, a list or a range, is accepted and stored as a tuple. If a level exceeds the number
-      of available eigenvectors, the iteration uses all eigenvectors. If X and Y have different numbers of
-      eigenvectors, a level applies to the shape with more eigenvectors, and the other shape uses a
-      proportional number. Iterations after the last level use all eigenvectors. If `levels` is empty (the
-      default), all iterations use all eigenvectors.
-    - `search`: the nearest-neighbour search that matches all vertices. `"exhaustive"` compares all vertices
-      of X with all vertices of Y. `"patches"` skips patches of Y that are too far away. `"auto"` chooses
-      `"patches"` on CPUs if the geometric mean of the numbers of vertices is at least 15 000, and
-      `"exhaustive"` otherwise.
+    - `levels`: the number of eigenvectors (the level) of each iteration, as an iterable of integers of at
+      least 1. If a level exceeds the number of available eigenvectors, the iteration uses all of them. If X
+      and Y have different numbers of eigenvectors, a level applies to the shape with more eigenvectors, and
+      the other shape uses a proportional number. Iterations after the last level use all eigenvectors, as do
+      all iterations if `levels` is empty (the default).
+    - `search`: the nearest-neighbour search that matches all vertices; see `WaveletPreservation`. Samples are
+      always matched by exhaustive search.
 
     **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
     `search` is unknown.
@@ -72,11 +70,11 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
 
     @property
     def matches_samples_with_all(self) -> bool:
-        """Always True, because `recover` matches samples of X with all vertices of Y."""
+        """Always True."""
         return True
 
-    def with_traced_levels(self) -> CoarseToFine[PreparedT, StateT]:
-        """Return the refiner with an array of levels, which `jaxsmw.runtime.compilation.compiled` traces.
+    def with_traced_levels(self) -> CoarseToFine[PreparedT, CoarseStateT]:
+        """Return the refiner with an array of levels, which JAX traces.
 
         Refiners with the same number of levels then share a compiled program.
         """
@@ -85,13 +83,7 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
     def active_eigenvectors(
         self, prepared: PreparedT, iteration: Int32[Array, ""]
     ) -> tuple[Bool[Array, " k_x"], Bool[Array, " k_y"]]:
-        """Return masks of the eigenvectors of X (k_x,) and of Y (k_y,). Used eigenvectors are True.
-
-        **Arguments:**
-
-        - `prepared`: the result of `prepare`.
-        - `iteration`: the number of the iteration, counted from 0.
-        """
+        """Return masks of the eigenvectors of X (k_x,) and of Y (k_y,) that an iteration uses."""
         sizes = prepared.spectrum_x.eigenvalues.shape[0], prepared.spectrum_y.eigenvalues.shape[0]
         largest = max(sizes)
 
@@ -103,27 +95,13 @@ class CoarseToFine(Refiner[PreparedT, StateT], Generic[PreparedT, StateT]):
 
         return active(sizes[0]), active(sizes[1])
 
-    def reverse_map(self, prepared: PreparedT, state: StateT) -> Int32[Array, " n"]:
-        """Return the `reverse_map` (n,) of a state, and compute it if the state lacks it."""
-        completed: State = state
-        assert isinstance(completed, CoarseToFineState)
-        if completed.reverse_map is not None:
-            return completed.reverse_map
-        _, completed = self.recover_both(prepared, state)
-        assert isinstance(completed, CoarseToFineState) and completed.reverse_map is not None
-        return completed.reverse_map
-
-    def is_settled(self, state: StateT) -> Bool[Array, ""]:
+    def is_settled(self, state: CoarseStateT) -> Bool[Array, ""]:
         """Return whether this iteration and all later iterations use all eigenvectors."""
-        assert isinstance(state, CoarseToFineState)
         return state.iteration >= len(self.levels)
 
 
 def check_descriptors(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
-    """Check that two shapes have equal numbers of descriptors and of crease eigenvectors, which may be zero.
-
-    **Raises:** `ValueError` if one of the two numbers differs between the shapes.
-    """
+    """Raise `ValueError` unless two shapes have equal numbers of descriptors and of crease eigenvectors."""
     for kind in ("descriptors", "crease_eigenvectors"):
         arrays = [getattr(spectrum, kind) for spectrum in (spectrum_x, spectrum_y)]
         numbers = [0 if array is None else array.shape[1] for array in arrays]
@@ -144,17 +122,10 @@ def partial_matching_weights(
     """Reduce the weights of those vertices of the full shape that the partial shape probably lacks.
 
     The shape with the larger mean residual is treated as the full shape. For each vertex of the full shape,
-    the weight w becomes `w / (1 + (r / mean)²)`. In this formula, r is the residual of the vertex, and `mean`
-    is the weighted mean residual of the other shape. Then the weights of the full shape are scaled so that
-    they sum to 1. The weights of the other shape stay the same.
-
-    **Arguments:**
-
-    - `weights_x`, `weights_y`: the weights of the vertices of X (m,) and of Y (n,), each with sum 1.
-    - `residuals_x`, `residuals_y`: the squared distance from each vertex to its match, (m,) for X and (n,)
-      for Y. Both arrays have the same unit.
-
-    **Returns:** The new weights of the vertices of X (m,) and of Y (n,), each with sum 1.
+    the weight w becomes `w / (1 + (r / mean)²)`. In this formula, r is the residual of the vertex (the
+    squared distance to its match), and `mean` is the weighted mean residual of the other shape. Both shapes
+    use the same unit. Then the weights of the full shape are scaled so that they sum to 1, as the given
+    weights do. The weights of the other shape stay the same.
     """
     mean_x, mean_y = jnp.sum(weights_x * residuals_x), jnp.sum(weights_y * residuals_y)
 

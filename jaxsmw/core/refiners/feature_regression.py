@@ -32,38 +32,26 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     """A refiner that finds matches by linear regression between the features of both shapes.
 
     The features of a vertex are the values of the eigenvectors and, if the spectra have them, the descriptors
-    and the crease eigenvectors (`Spectrum.descriptors`, `Spectrum.crease_eigenvectors`). Each iteration
-    regresses the features of vertices of X on the features of their matches. The first iteration uses the
-    matches of the initial map. Later iterations use the matches of the map and of the reverse map.
-    Eigenvectors are regressed on eigenvectors, which gives the functional map by least squares (Ovsjanikov et
-    al. 2012). Descriptors and crease eigenvectors together are regressed on descriptors and crease
-    eigenvectors. The covariance of the residuals measures how accurately each combination of features is
-    predicted. This covariance defines a Mahalanobis distance between the features of a vertex of X and the
-    features predicted from a vertex of Y. The next match of a vertex of X is the nearest vertex of Y in this
-    distance. For the reverse map, the features of Y are regressed on the features of X in the same way. The
-    argument `levels` increases the number of eigenvectors from iteration to iteration, as in ZoomOut (Melzi
-    et al. 2019).
+    and the crease eigenvectors. Each iteration regresses the features of vertices of X on the features of
+    their matches. The first iteration uses the matches of the initial map. Later iterations use the matches
+    of the map and of the reverse map. Eigenvectors are regressed on eigenvectors, which gives the functional
+    map by least squares (Ovsjanikov et al. 2012). Descriptors and crease eigenvectors together are regressed
+    on descriptors and crease eigenvectors. The covariance of the residuals measures how accurately each
+    combination of features is predicted. This covariance defines a Mahalanobis distance between the features
+    of a vertex of X and the features predicted from a vertex of Y. The next match of a vertex of X is the
+    nearest vertex of Y in this distance. For the reverse map, the features of Y are regressed on the features
+    of X in the same way.
 
     The method does not assume isometry. If the initial map is as accurate as a map from
-    `WaveletPreservation`, refinement makes the map more accurate. docs/accuracy.md contains the measurements.
+    `WaveletPreservation`, refinement makes the map more accurate (docs/accuracy.md). On partial pairs,
+    vertices of the full shape with large residuals receive smaller weights (`partial_matching_weights`).
 
-    If `jaxsmw.refine` is called with `partial=True`, vertices of the full shape with large residuals receive
-    smaller weights (`partial_matching_weights`). A residual is the squared Mahalanobis distance from a vertex
-    to its match.
-
-    **Arguments:**
-
-    - `levels`: the number of eigenvectors of each iteration, which `CoarseToFine` describes.
-    - `search`: the nearest-neighbour search that matches all vertices, which `CoarseToFine` describes. The
-      search in patches compares only eigenvectors and ignores descriptors, so its matches can differ from
-      those of `"exhaustive"`.
-
-    **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
-    `search` is unknown.
+    **Arguments:** `levels` and `search`, which `CoarseToFine` describes. The search in patches compares only
+    eigenvectors and ignores descriptors, so its matches can differ from those of `"exhaustive"`.
     """
 
     def prepare(self, problem: Problem) -> PreparedFeatures:
-        """Collect the features of all vertices. If there are samples, also collect their features.
+        """Collect the features of all vertices and of the samples.
 
         **Raises:** `ValueError` if the shapes have different numbers of descriptors or of crease
         eigenvectors.
@@ -81,17 +69,15 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def update(
         self, prepared: PreparedFeatures, pointwise_map: Int[Array, " m"], previous: Regression | None
     ) -> tuple[Regression, RESULTS]:
-        """Compute both regressions from matched features. Return the next state and `RESULTS.successful`.
-
-        If there is a previous state, the regressions also use the matches of the reverse map.
-        """
+        """Compute both regressions from matched features. Return the next state and `RESULTS.successful`."""
         x, y, all_x, all_y = prepared.x, prepared.y, prepared.all_x, prepared.all_y
         iteration = jnp.asarray(0, jnp.int32)
         if previous is None:
             moments = _Moments.along(x.values, all_y.values[pointwise_map], x.weights)
         else:
             iteration = previous.iteration + 1
-            reverse_map = self.reverse_map(prepared, previous)
+            assert previous.reverse_map is not None  # `recover_both` adds it
+            reverse_map = previous.reverse_map
             weights_x, weights_y = x.weights, y.weights
             if prepared.partial:
                 residuals_x = previous.forward.residuals(x, all_y, pointwise_map)
@@ -110,10 +96,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
     def recover(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " m"]:
         """Return, for each vertex of X, the nearest vertex of Y in the Mahalanobis distance, (m,)."""
-        if prepared.patches is None:
-            return nearest_vertices(*state.forward.search(prepared.x, prepared.all_y), None)
-        queries, database = self._eigenvector_embeddings(prepared, state)
-        return nearest_vertices(queries, database, prepared.spectrum_y.mask, prepared.patches)
+        return nearest_vertices(*self._forward_search(prepared, state))
 
     def recover_both(
         self, prepared: PreparedFeatures, state: Regression
@@ -123,23 +106,14 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         Distances of the reverse map are computed by the prediction of the features of Y.
         """
         backward = state.backward.search(prepared.y, prepared.all_x)
-        if prepared.patches is None:
-            forward = state.forward.search(prepared.x, prepared.all_y)
-            found, reverse_map = nearest_in_both(forward, backward)
-        else:
-            found = self.recover(prepared, state)
-            reverse_map = nearest_vertices(*backward, None)
-        return found, replace(state, reverse_map=reverse_map)
+        pointwise_map, reverse_map = nearest_in_both(self._forward_search(prepared, state), backward)
+        return pointwise_map, replace(state, reverse_map=reverse_map)
 
     def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
-        """Return, for each vertex of Y, the nearest vertex of X, (n,).
-
-        Distances are computed between the points of `embeddings`.
-        """
+        """Return, for each vertex of Y, the nearest vertex of X in the `embeddings`, (n,)."""
         patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
-        embed = self.embeddings if patches is None else self._eigenvector_embeddings
-        database, queries = embed(prepared, state)
-        return nearest_vertices(queries, database, prepared.spectrum_x.mask, patches)
+        database, queries = self._searched(prepared, state, patches)
+        return nearest_vertices(queries, database, prepared.all_x.mask, patches)
 
     def energy(
         self, prepared: PreparedFeatures, state: Regression, pointwise_map: Int[Array, " m"]
@@ -150,20 +124,25 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     def embeddings(
         self, prepared: PreparedFeatures, state: Regression
     ) -> tuple[Float[Array, "m d_x"], Float[Array, "n d_x"]]:
-        """Return dimensionless points (m, d_x) for X and (n, d_x) for Y.
+        """Return dimensionless points (m, d_x) for X and (n, d_x) for Y, with d_x features of X.
 
-        The dimension d_x is the number of features of X. The distance between a point of X and a point of Y
-        is the Mahalanobis distance between the features of the vertex of X and the features predicted from
-        the vertex of Y.
+        Their distance is the Mahalanobis distance between the features of a vertex of X and the features
+        predicted from a vertex of Y.
         """
         return state.forward.embeddings(prepared.x, prepared.all_y)
 
-    def _eigenvector_embeddings(
-        self, prepared: PreparedFeatures, state: Regression
-    ) -> tuple[Float[Array, "m k_x"], Float[Array, "n k_x"]]:
-        """Return the first k_x coordinates, in which the vertices of a patch are close together."""
-        k = prepared.spectrum_x.eigenvalues.shape[0]
+    def _forward_search(self, prepared: PreparedFeatures, state: Regression) -> SearchProblem:
+        points = self._searched(prepared, state, prepared.patches)
+        return SearchProblem(*points, prepared.all_y.mask, prepared.patches)
+
+    def _searched(
+        self, prepared: PreparedFeatures, state: Regression, patches: tuple[Patches, Patches] | None
+    ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+        """Return the `embeddings`. With patches, only eigenvectors count, because they define patches."""
         queries, database = self.embeddings(prepared, state)
+        if patches is None:
+            return queries, database
+        k = prepared.spectrum_x.eigenvalues.shape[0]
         return queries[:, :k], database[:, :k]
 
 
@@ -189,9 +168,8 @@ class PreparedFeatures(Prepared):
 
     **Attributes:**
 
-    - `x`, `y`: the features of the vertices to be matched, which are the samples or all vertices, with one
-      row per vertex.
-    - `all_x`, `all_y`: the features of all vertices, with one row per vertex.
+    - `x`, `y`: the features of the vertices to be matched, which are the samples or all vertices.
+    - `all_x`, `all_y`: the features of all vertices.
     - `patches`: the `Patches` of X and of Y, or None if the search uses no patches.
     - `partial`: whether one shape is a part of the other.
     """
@@ -205,19 +183,14 @@ class PreparedFeatures(Prepared):
 
 
 class Prediction(NamedTuple):
-    """A linear prediction of features, for use in a nearest-neighbour search.
-
-    The distance between a query point and a target point is the Mahalanobis distance between the features of
-    the query vertex and the features predicted from the target vertex.
+    """A linear prediction of features, for a nearest-neighbour search in the Mahalanobis distance.
 
     **Attributes:**
 
-    - `queries`: the matrix (d_out, d_out) for query vertices. The product of the features of a query vertex
-      and this matrix is the query point in the nearest-neighbour search.
-    - `database`: the matrix (d_in, d_out) for target vertices. The product of the features of a target vertex
-      and this matrix is the target point in the nearest-neighbour search.
-    - `uncertainty`: half the log-determinant of the covariance of the residuals, a scalar array without unit.
-      Eigenvectors that the iteration does not use are left out.
+    - `queries`, `database`: the matrices (d_out, d_out) and (d_in, d_out) that take the features of query
+      vertices and of target vertices to the points of the search.
+    - `uncertainty`: half the log-determinant of the covariance of the residuals, without unit. Eigenvectors
+      that the iteration does not use are left out.
     """
 
     queries: Float[Array, "d_out d_out"]
@@ -227,17 +200,15 @@ class Prediction(NamedTuple):
     def embeddings(
         self, queries: _Features, targets: _Features
     ) -> tuple[Float[Array, "m d_out"], Float[Array, "n d_out"]]:
-        """Return the points of the query vertices (m, d_out) and of the target vertices (n, d_out)."""
         return product(queries.values, self.queries), product(targets.values, self.database)
 
     def search(self, queries: _Features, targets: _Features) -> SearchProblem:
-        """Return the search of the nearest target vertex for each query vertex."""
         return SearchProblem(*self.embeddings(queries, targets), targets.mask)
 
     def residuals(
         self, queries: _Features, targets: _Features, matches: Int[Array, " m"]
     ) -> Float[Array, " m"]:
-        """Return the squared distance from each query vertex to its match, (m,), dimensionless."""
+        """Return the squared distance from each query vertex to its match, (m,), without unit."""
         points, database = self.embeddings(queries, targets)
         return jnp.sum((points - database[matches]) ** 2, axis=1)
 
@@ -247,8 +218,7 @@ class Regression(CoarseToFineState):
 
     **Attributes:**
 
-    - `forward`: the `Prediction` of the features of X from the features of Y.
-    - `backward`: the `Prediction` of the features of Y from the features of X.
+    - `forward`, `backward`: the `Prediction` of the features of X from Y, and of Y from X.
     """
 
     forward: Prediction

@@ -50,44 +50,27 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     """A refiner that deforms X onto Y, and Y onto X, from low to high frequencies.
 
     In each iteration, the positions of the matches are projected onto the first eigenvectors. The projected
-    positions form the smooth part of the deformed surface. The argument `levels` increases the number of
-    eigenvectors from iteration to iteration, as in smooth shells (Eisenberger, Lähner, Cremers 2020). The
-    details of the original surface are rotated and added to the smooth part. Each vertex has its own
-    rotation, as in as-rigid-as-possible deformation (Sorkine, Alexa 2007). Heat flow averages over the
-    neighbourhood of each vertex, and the best rotation is computed from these averages. On samples and on
-    partial shapes, eigenvectors are not orthonormal, so coefficients are computed by least squares. On full
-    shapes without samples, no linear system is solved.
+    positions form the smooth part of the deformed surface. The number of eigenvectors increases as in smooth
+    shells (Eisenberger, Lähner, Cremers 2020). The details of the original surface are rotated and added to
+    the smooth part. Each vertex has its own rotation, as in as-rigid-as-possible deformation (Sorkine, Alexa
+    2007). Heat flow averages over the neighbourhood of each vertex, and the best rotation is computed from
+    these averages. If one shape is a mirror image of the other, all rotations include a reflection. On
+    samples and on partial shapes, eigenvectors are not orthonormal, so coefficients are computed by least
+    squares. On full shapes without samples, no linear system is solved.
 
     The next matches are the nearest vertices in a joint space of both surfaces. The coordinates of this space
-    are positions, normals, the first eigenfunctions, and descriptors (`Spectrum.descriptors`) if the spectra
-    have descriptors. The weight of the descriptors decreases as the number of eigenvectors increases. If one
-    shape is a mirror image of the other, all rotations include a reflection.
+    are positions, normals, the first eigenfunctions, and descriptors if the spectra have them. The weight of
+    the descriptors decreases as the number of eigenvectors increases.
 
     The initial map must be nearly correct. From a nearly correct map, `Registration` gives a more accurate
-    map than refiners that use only eigenfunctions. docs/accuracy.md contains the measurements. Both spectra
-    must contain positions and normals, which `jaxsmw.compute_spectrum` computes. `Spectrum.with_positions`
-    adds positions and normals to a spectrum.
+    map than refiners that use only eigenfunctions (docs/accuracy.md). Both spectra must contain positions and
+    normals, which `jaxsmw.compute_spectrum` computes and `Spectrum.with_positions` adds.
 
-    Both shapes are scaled to area 1. If `jaxsmw.refine` is called with `partial=True`, both shapes are scaled
-    by the same factor instead. Vertices of the full shape with large residuals then receive smaller weights
-    (`partial_matching_weights`). A residual is the squared distance from a vertex to its match in the joint
-    space, without descriptors.
+    Both shapes are scaled to area 1. Partial pairs are scaled by a common factor instead, and vertices of the
+    full shape with large residuals receive smaller weights (`partial_matching_weights`). A residual is the
+    squared distance from a vertex to its match in the joint space, without descriptors.
 
-    **Arguments:**
-
-    - `levels`: the number of eigenvectors (the level) of each iteration. Any iterable of integers of at least
-      1, such as a tuple, a list or a range, is accepted and stored as a tuple. If a level exceeds the number
-      of available eigenvectors, the iteration uses all eigenvectors. If X and Y have different numbers of
-      eigenvectors, a level applies to the shape with more eigenvectors, and the other shape uses a
-      proportional number. Iterations after the last level use all eigenvectors. If `levels` is empty (the
-      default), all iterations use all eigenvectors.
-    - `search`: the nearest-neighbour search that matches all vertices. Samples are always matched by
-      exhaustive search. `"exhaustive"` compares all vertices of X with all vertices of Y. `"patches"` finds
-      the same matches but skips patches that are too far away. `"auto"` chooses `"patches"` on CPUs if the
-      geometric mean of the numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
-
-    **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
-    `search` is unknown.
+    **Arguments:** `levels` and `search`, which `CoarseToFine` describes.
     """
 
     def prepare(self, problem: Problem) -> PreparedSurfaces:
@@ -139,7 +122,8 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
             reverse_map = nearest_vertices(y.points, _deformed((forward, all_x))[0], all_x.mask, patches)
             (backward,) = _deformations(_Matched(y, all_x, reverse_map, active_y))
         else:
-            reverse_map = self.reverse_map(prepared, previous)
+            assert previous.reverse_map is not None  # `recover_both` adds it
+            reverse_map = previous.reverse_map
             if prepared.partial:
                 x, y = _without_missing_parts(prepared, previous, pointwise_map, reverse_map)
             forward, backward = _deformations(
@@ -164,15 +148,11 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
             queries_x, queries_y = (
                 points[rows] for points, rows in zip((points_x, points_y), prepared.samples, strict=True)
             )
-        mask_x, mask_y = prepared.all_x.mask, prepared.all_y.mask
-        if prepared.patches is None:
-            found, reverse_map = nearest_in_both(
-                SearchProblem(queries_x, points_y, mask_y), SearchProblem(queries_y, points_x, mask_x)
-            )
-        else:
-            found = nearest_vertices(queries_x, points_y, mask_y, prepared.patches)
-            reverse_map = nearest_vertices(queries_y, points_x, mask_x, prepared.reverse_patches)
-        return found, replace(state, reverse_map=reverse_map)
+        pointwise_map, reverse_map = nearest_in_both(
+            SearchProblem(queries_x, points_y, prepared.all_y.mask, prepared.patches),
+            SearchProblem(queries_y, points_x, prepared.all_x.mask, prepared.reverse_patches),
+        )
+        return pointwise_map, replace(state, reverse_map=reverse_map)
 
     def recover_reverse(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " n"]:
         """Return, for each vertex of Y, the nearest vertex of X in the `embeddings`, (n,)."""
@@ -191,15 +171,15 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         """Return points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
 
         Each point contains the weighted position, normal and eigenfunctions of a vertex twice, after
-        deformation and without deformation. The weighted descriptors of the vertex follow. In the first
-        array, the coordinates after deformation of X onto Y come first. In the second array, the coordinates
-        after deformation of Y onto X come second. Positions are in units of the square root of the area.
+        deformation and without deformation. The weighted descriptors of the vertex follow. The deformation of
+        X is in the first coordinates, and that of Y in the second. Positions are in units of the square root
+        of the area.
         """
         return _product_space(prepared.x, prepared.all_y, state, state.descriptor_weight)
 
 
 class _Surface(NamedTuple):
-    """The data of a shape's vertices, either of all vertices or only of the samples.
+    """The data of all vertices of a shape, or only of the samples.
 
     Positions are in units of the square root of the area. `points` contains the positions, normals and
     eigenfunctions, multiplied by their weights.
@@ -248,7 +228,7 @@ class _Surface(NamedTuple):
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
-        """Return the data of the given vertices (s,). `spectrum` must be the spectrum of these vertices."""
+        """Return the data of the given vertices (s,), of which `spectrum` is the spectrum."""
         dual = dual_eigenvectors(spectrum, "least_squares")
         weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
@@ -272,10 +252,8 @@ class PreparedSurfaces(Prepared):
     - `x`, `y`: the vertices to be matched, which are the samples or all vertices.
     - `all_x`, `all_y`: all vertices. Positions are in units of the square root of the area.
     - `samples`: the samples of X and of Y; None if all vertices are matched.
-    - `patches`: the pair of `Patches` for searches among the vertices of Y; None if these searches are
-      exhaustive.
-    - `reverse_patches`: the pair of `Patches` for searches among the vertices of X; None if these searches
-      are exhaustive.
+    - `patches`, `reverse_patches`: the pairs of `Patches` for searches among the vertices of Y and of X; None
+      if these searches are exhaustive.
     - `partial`: whether one shape is a part of the other.
     """
 
@@ -292,17 +270,16 @@ class PreparedSurfaces(Prepared):
 class Deformation(NamedTuple):
     """A deformation of one surface onto another, as coefficients in the eigenvectors of the first surface.
 
-    Positions are in units of the square root of the area.
+    The coefficients of inactive eigenvectors in `own` and `matched` are zero. Positions are in units of the
+    square root of the area.
 
     **Attributes:**
 
-    - `own`: the coefficients (k_x, 3) of the surface's positions. Inactive eigenvectors have coefficients of
-      zero.
+    - `own`: the coefficients (k_x, 3) of the surface's positions.
     - `matched`: the coefficients (k_x, d) of the positions, normals and eigenfunctions of the matches.
-      Inactive eigenvectors have coefficients of zero.
-    - `moments`: the coefficients (k_x, 24) of 24 functions that heat flow has smoothed. The functions are
-      positions, matched positions, the products of positions with matched positions, and the products of
-      normals with matched normals.
+    - `moments`: the coefficients (k_x, 24) of 24 functions that heat flow has smoothed: positions, matched
+      positions, the products of positions with matched positions, and the products of normals with matched
+      normals.
     """
 
     own: Float[Array, "k_x 3"]
@@ -311,11 +288,7 @@ class Deformation(NamedTuple):
 
 
 class _Matched(NamedTuple):
-    """A surface, all vertices of the other surface, and the matches from which a deformation follows.
-
-    `matches` contains one 0-based vertex of `other` for each vertex of `surface` (s,). The Boolean array
-    `active` (k,) is True for the eigenvectors that the iteration uses.
-    """
+    """A surface, all vertices of the other surface, and the matches from which a deformation follows."""
 
     surface: _Surface
     other: _Surface
@@ -360,7 +333,7 @@ class Registered(CoarseToFineState):
 
     **Attributes:**
 
-    - `forward`, `backward`: the deformations of X onto Y and of Y onto X, each a `Deformation`.
+    - `forward`, `backward`: the `Deformation` of X onto Y, and of Y onto X.
     - `descriptor_weight`: the weight of descriptors relative to positions, a scalar array.
     """
 
@@ -372,7 +345,7 @@ class Registered(CoarseToFineState):
 def _product_space(
     x: _Surface, y: _Surface, state: Registered, weight: Float[Array, ""]
 ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    """Return points in the joint space of both surfaces, (m, d) for X and (n, d) for Y.
+    """Return points in the joint space of both surfaces; see `Registration.embeddings`.
 
     The points of two vertices x and y are close together if the deformed x is close to y on Y, and the
     deformed y is close to x on X.
@@ -387,8 +360,7 @@ def _product_space(
 def _deformed(*given: tuple[Deformation, _Surface]) -> list[Float[Array, "_ d"]]:
     """Return the weighted positions, normals and eigenfunctions (s, d) of the vertices after deformation.
 
-    The list has one entry for each deformation and its surface. Most rows of all surfaces form one array, as
-    in `_deformations`.
+    Most rows of all surfaces form one array, as in `_deformations`.
     """
     surfaces = [surface for _, surface in given]
     low = [product(surface.eigenvectors, jnp.concatenate(deformed, axis=1)) for deformed, surface in given]
@@ -415,11 +387,7 @@ def _without_missing_parts(
     pointwise_map: Int[Array, " s"],
     reverse_map: Int[Array, " t"],
 ) -> tuple[_Surface, _Surface]:
-    """Return both surfaces, with the vertex weights of `partial_matching_weights`.
-
-    The residuals are the squared distances between matched points of the joint space. Descriptors do not
-    contribute to these distances.
-    """
+    """Return both surfaces, with the vertex weights of `partial_matching_weights`."""
     x, y = prepared.x, prepared.y
     no_descriptors = jnp.zeros_like(state.descriptor_weight)
     targets, queries = _product_space(prepared.all_x, y, state, no_descriptors)
@@ -433,8 +401,7 @@ def _without_missing_parts(
 def _rotations(moments: Float[Array, "r 24"], surfaces: Sequence[_Surface]) -> Float[Array, "r 3 3"]:
     """Return the rotations that best align the neighbourhoods of vertices with those of their matches.
 
-    If one surface is a mirror image of the other, all rotations include a reflection. `moments` contains the
-    rows of all surfaces, one surface after the other.
+    If one surface is a mirror image of the other, all rotations include a reflection.
     """
     own, matched = moments[:, :3], moments[:, 3:6]
     products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
@@ -479,11 +446,7 @@ def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 
 
 @cache
 def _rotations_of_quaternions() -> Float64[np.ndarray, "9 16"]:
-    """Return the matrix of the linear map that takes quaternion products to a rotation matrix.
-
-    The 16 inputs are the products of any two components of a quaternion. The 9 outputs are the entries of the
-    rotation matrix of this quaternion.
-    """
+    """Return the linear map from products of two components of a quaternion to its rotation matrix."""
     signs = np.array([[1, 1, 1, 1], [1, -1, 1, -1], [1, -1, -1, 1], [1, 1, -1, -1]])
     units = np.arange(4)
     # The product of two of the quaternion units 1, i, j and k is again one of these units, or its negative.

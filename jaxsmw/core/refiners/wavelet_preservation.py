@@ -27,7 +27,7 @@ class PreparedWavelets(Prepared):
 
     **Attributes:**
 
-    - `wavelets`: a `WaveletProblem`, which contains both spectra and the responses of the filter bank.
+    - `wavelets`: a `WaveletProblem`.
     - `solution`: the values that `Solution.prepare` returns.
     - `patches`: the `Patches` of X and of Y, or None if the search uses no patches.
     """
@@ -42,28 +42,26 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
 
     In each iteration, the refiner computes a functional map that preserves the wavelets of all scales. A
     nearest-neighbour search in the `spectral_embeddings` of this functional map then gives the pointwise map.
-    Pass the refiner to `jaxsmw.refine`, `refine_pairs`, `refine_softly` or a `Stage`.
 
     **Arguments:**
 
-    - `bank`: the filter bank, a `FilterBank`. The default is `Meyer()`, the Parseval frame of the MWP paper.
+    - `bank`: the `FilterBank`. The default is `Meyer()`, the Parseval frame of the MWP paper.
     - `solution`: the `Solution` that computes the functional map from a pointwise map. `Filtering()` (the
       default) computes C by equation (8) of the MWP paper and is meant for Parseval frames. `LeastSquares()`
       computes the exact minimiser of the energy for every frame. `RegularizedLeastSquares()` minimises a sum
       of the energy and other terms, such as orthogonality. `NearestOrthogonal()` makes the functional map of
       another solution orthogonal.
-    - `convention`: the direction of the functional map C. A `"pullback"` (k_X, k_Y) takes functions on Y to
-      functions on X. A `"pushforward"` (k_Y, k_X) takes functions on X to functions on Y, as in the notation
-      of the MWP paper. The pushforward is meant for study only, because it fails on real pairs (see
+    - `convention`: the direction of the functional map C; see `encode`. The `"pushforward"` of the MWP paper
+      is meant for study only, because it fails on real pairs (see
       `jaxsmw.core.pointwise_map.spectral_embeddings`).
     - `lambda_max`: the eigenvalue at which the filter bank ends. With `"own"` (the default), the bank ends at
-      each shape's own largest eigenvalue. Scaling a shape then has no effect. With `"common"`, the bank ends
-      at the same eigenvalue on both shapes: the larger of the two shapes' largest eigenvalues.
+      each shape's own largest eigenvalue, so scaling a shape has no effect. With `"common"`, the bank ends at
+      the larger of the two shapes' largest eigenvalues on both shapes.
     - `search`: the method of nearest-neighbour search. `"exhaustive"` compares all vertices of X with all
       vertices of Y. `"patches"` finds the same neighbours but skips patches of Y that are too far away. For
-      large shapes on a CPU, the search in patches is several times as fast as exhaustive search, but takes
-      some seconds longer to compile. `"auto"` chooses `"patches"` on CPUs if the geometric mean of the
-      numbers of vertices is at least 15 000, and `"exhaustive"` otherwise.
+      large shapes on a CPU, the search in patches is several times as fast, but takes some seconds longer to
+      compile. `"auto"` (the default) chooses `"patches"` on CPUs if the geometric mean of the numbers of
+      vertices is at least 15 000, and `"exhaustive"` otherwise.
 
     **Raises:** `TypeError` if `bank` is not a `FilterBank` or `solution` is not a `Solution`; `ValueError` if
     `convention`, `lambda_max` or `search` is unknown.
@@ -83,12 +81,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         check_option("search", self.search, get_args(Search))
 
     def problem(self, spectrum_x: Spectrum, spectrum_y: Spectrum, *, sampled: bool = False) -> WaveletProblem:
-        """Return a `WaveletProblem`: both shapes, and the responses of the filter bank at their eigenvalues.
-
-        **Arguments:**
-
-        - `spectrum_x`, `spectrum_y`: the spectra of the source X and the target Y.
-        - `sampled`: whether the spectra contain samples only.
+        """Return the `WaveletProblem` of two shapes, of which the spectra can be `sampled`.
 
         **Raises:** `ValueError` if the responses of the bank do not have shape (filters, eigenvalues).
         """
@@ -115,10 +108,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     def update(
         self, prepared: PreparedWavelets, pointwise_map: PointwiseMap, previous: State | None
     ) -> tuple[State, RESULTS]:
-        """Compute the functional map with `solution`. Return the next state and a status code.
-
-        The status code is a member of `RESULTS`.
-        """
+        """Compute the functional map with `solution`."""
         before = None if previous is None else previous.functional_map
         found, result = self.solution.solve(prepared.wavelets, prepared.solution, pointwise_map, before)
         return State(found), result

@@ -6,8 +6,13 @@ and other terms.
 """
 
 from jaxsmw.core.functional_map import WaveletProblem
-from jaxsmw.core.solutions.base import Solution
-from jaxsmw.core.solutions.closed_form import Filtering, LeastSquares, NearestOrthogonal, PreparedFiltering
+from jaxsmw.core.solutions.closed_form import (
+    Filtering,
+    LeastSquares,
+    NearestOrthogonal,
+    PreparedFiltering,
+    Solution,
+)
 from jaxsmw.core.solutions.descriptors import DescriptorPair, ProjectedDescriptors
 from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 

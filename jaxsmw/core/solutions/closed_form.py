@@ -1,8 +1,9 @@
-"""Solutions in closed form: filtering, the exact minimiser, and the nearest orthogonal matrix."""
+"""The interface of solutions, and solutions in closed form."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, get_args
+import abc
+from typing import Generic, NamedTuple, TypeVar, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,16 +12,59 @@ from jaxtyping import Array, Float
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import check_option
 from jaxsmw.core.functional_map import (
+    FunctionalMap,
     Norm,
     PseudoInverse,
     WaveletProblem,
     dual_eigenvectors,
+    encode_by,
     multiscale_kernel,
 )
 from jaxsmw.core.linear_algebra import nearest_orthogonal
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap
-from jaxsmw.core.solutions.base import PreparedT, Solution
+
+PreparedT = TypeVar("PreparedT")
+
+
+class Solution(eqx.Module, Generic[PreparedT]):
+    """The base class of solutions: methods that compute a functional map C from a pointwise map T.
+
+    The refiner `WaveletPreservation` takes a solution as its argument `solution`. Ready subclasses are
+    `Filtering` (the default), `LeastSquares`, `RegularizedLeastSquares` and `NearestOrthogonal`. A subclass
+    must define `solve`, and may define `prepare`. If the prepared values have the type `Values`, the subclass
+    derives from `Solution[Values]`. C maps functions on the shape "in" to functions on the shape "out", which
+    are Y and X in the pullback convention (the default).
+    """
+
+    def prepare(self, problem: WaveletProblem) -> PreparedT:
+        """Return the values that `solve` needs and that do not depend on the pointwise map, by default None.
+
+        A refinement calls `prepare` only once, before the first iteration.
+        """
+        return None  # type: ignore[return-value]
+
+    @abc.abstractmethod
+    def solve(
+        self,
+        problem: WaveletProblem,
+        prepared: PreparedT,
+        pointwise_map: PointwiseMap,
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
+        """Compute the functional map C that corresponds to a pointwise map T.
+
+        **Arguments:**
+
+        - `problem`: the `WaveletProblem`: both spectra, the responses of the filter bank, and the convention
+          of C.
+        - `prepared`: the values that `prepare` returned for this problem.
+        - `pointwise_map`: the map T, as in `encode`.
+        - `previous`: the functional map of the previous iteration, or None in the first iteration. An
+          iterative solver can start from this map.
+
+        **Returns:** C (k_out, k_in), without unit, and a status code, which is a member of `RESULTS`.
+        """
 
 
 class PreparedFiltering(NamedTuple):
@@ -40,10 +84,9 @@ class Filtering(Solution[PreparedFiltering]):
     """A solution that filters the functional map C_0 of a pointwise map T. It is meant for Parseval frames.
 
     The result is `C = sum_l g_l(Lambda_out) C_0 g_l(Lambda_in)` (equation (8) of the MWP paper), where g_l
-    are the filters of the bank. The diagonal matrix Lambda_out contains the eigenvalues of the shape that C
-    maps to. The diagonal matrix Lambda_in contains the eigenvalues of the shape that C maps from. The sum
-    equals the elementwise product of C_0 and the `multiscale_kernel` of the bank, so no linear system is
-    solved.
+    are the filters of the bank, and the diagonal matrices Lambda_out and Lambda_in contain the eigenvalues of
+    the shapes "out" and "in". The sum equals the elementwise product of C_0 and the `multiscale_kernel` of
+    the bank, so no linear system is solved.
 
     If the bank is a Parseval frame, C minimises the wavelet-preservation energy in the area norm. In the
     default pullback convention, C is the exact minimiser only if T preserves area; otherwise C is only close
@@ -51,10 +94,8 @@ class Filtering(Solution[PreparedFiltering]):
 
     **Arguments:**
 
-    - `pseudo_inverse`: the form of the pseudo-inverse `Phi^+`. The columns of Phi are the eigenvectors of the
-      shape that C maps to. `"area"` (the default) is `Phi^T A`, where the diagonal matrix A contains the
-      vertex areas. `"least_squares"` is `(Phi^T Phi)^-1 Phi^T`, in which all vertices have the same weight.
-      When a refiner iterates on samples, `Filtering` always uses `"least_squares"`.
+    - `pseudo_inverse`: the form of the pseudo-inverse of the eigenvectors on the shape "out", `"area"` (the
+      default) or `"least_squares"`; see `encode`. On samples, `Filtering` always uses `"least_squares"`.
 
     **Raises:** `ValueError` if `pseudo_inverse` is unknown.
     """
@@ -65,7 +106,6 @@ class Filtering(Solution[PreparedFiltering]):
         check_option("pseudo_inverse", self.pseudo_inverse, get_args(PseudoInverse))
 
     def prepare(self, problem: WaveletProblem) -> PreparedFiltering:
-        """Return the multiscale kernel, and the dual eigenvectors of the shape that C maps to."""
         spectrum_out, _ = problem.spectra
         pseudo_inverse: PseudoInverse = "least_squares" if problem.sampled else self.pseudo_inverse
         return PreparedFiltering(
@@ -77,30 +117,30 @@ class Filtering(Solution[PreparedFiltering]):
         problem: WaveletProblem,
         prepared: PreparedFiltering,
         pointwise_map: PointwiseMap,
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Return the filtered map C (k_out, k_in), and `RESULTS.successful`; see `Filtering`."""
-        unfiltered = problem.encode(pointwise_map, prepared.dual_out)
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
+        _, spectrum_in = problem.spectra
+        eigenvectors_in, convention = spectrum_in.eigenvectors, problem.convention
+        unfiltered = encode_by(prepared.dual_out, pointwise_map, eigenvectors_in, convention)
         return unfiltered * prepared.kernel, RESULTS.successful  # type: ignore[return-value]
 
 
 class NearestOrthogonal(Solution[PreparedT]):
     """A solution that replaces the functional map of another solution by the nearest orthogonal matrix.
 
-    The new map (k_out, k_in) has no unit. It has orthonormal columns, or orthonormal rows if k_out is below
-    k_in. With `solution=Filtering()` and the bank `Identity()`, this solution is the update of spectral ICP
-    (Ovsjanikov et al. 2012). The status code is that of the other solution. If the other solution's map
-    contains NaN, all entries of the new map are NaN.
+    The new map (k_out, k_in) has orthonormal columns, or orthonormal rows if k_out is below k_in. With
+    `solution=Filtering()` and the bank `Identity()`, this solution is the update of spectral ICP (Ovsjanikov
+    et al. 2012). The status code is that of the other solution. If the other solution's map contains NaN, all
+    entries of the new map are NaN.
 
     **Arguments:**
 
-    - `solution`: the `Solution` whose functional map is replaced. The default is `Filtering()`.
+    - `solution`: the other `Solution`. The default is `Filtering()`.
     """
 
     solution: Solution[PreparedT] = Filtering()  # type: ignore[assignment]
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:
-        """Return the values that the other solution prepares."""
         return self.solution.prepare(problem)
 
     def solve(
@@ -108,9 +148,8 @@ class NearestOrthogonal(Solution[PreparedT]):
         problem: WaveletProblem,
         prepared: PreparedT,
         pointwise_map: PointwiseMap,
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Return the polar factor (k_out, k_in) of the other solution's map, and the status code."""
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
         return nearest_orthogonal(functional_map), result
 
@@ -119,16 +158,14 @@ class LeastSquares(Solution[None]):
     """The solution that minimises the wavelet-preservation energy exactly, for any frame.
 
     Equation (5) of the MWP paper defines the energy. One Cholesky factorisation of the energy's gram matrix
-    (k_in, k_in) gives the minimiser C (k_out, k_in).
-
-    The status code is `RESULTS.successful`, `RESULTS.undetermined_functional_map` or
-    `RESULTS.singular_system`. The functional map is undetermined if all filters are zero at an eigenvalue of
-    the shape that C maps from. The system is singular if the gram matrix is singular to working precision.
+    (k_in, k_in) gives the minimiser C (k_out, k_in). The status code is `RESULTS.undetermined_functional_map`
+    if all filters are zero at an eigenvalue of the shape "in", and `RESULTS.singular_system` if the gram
+    matrix is singular to working precision.
 
     **Arguments:**
 
-    - `norm`: the weights of the vertices of X in the energy. `"area"` (the default) weights each vertex by
-      its area. `"frobenius"` gives all vertices the same weight, as in equation (5) of the MWP paper.
+    - `norm`: the weights of the vertices of X in the energy, `"area"` (the default) or `"frobenius"`; see
+      `WaveletProblem.energy`.
 
     **Raises:** `ValueError` if `norm` is unknown.
     """
@@ -143,9 +180,8 @@ class LeastSquares(Solution[None]):
         problem: WaveletProblem,
         prepared: None,
         pointwise_map: PointwiseMap,
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Return the minimiser C (k_out, k_in) of the energy, and a status code; see `LeastSquares`."""
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
         energy = problem.energy(pointwise_map, norm=self.norm)
         _, responses_in = problem.responses
         frame = frame_function(responses_in)

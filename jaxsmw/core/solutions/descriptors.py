@@ -18,9 +18,9 @@ class ProjectedDescriptors(eqx.Module):
 
     **Attributes:**
 
-    - `coefficients`: (k, d), the coefficients `Phi^+ f` of each function f, with the pseudo-inverse `Phi^+`.
+    - `coefficients`: (k, d), the coefficients `Phi^+ f` of each function f, in the unit of f times length.
     - `operators`: (d, k, k), one matrix `Phi^+ diag(f) Phi` per function f. This matrix multiplies other
-      functions by f (Nogneng and Ovsjanikov 2017). The attribute is None if no operators were computed.
+      functions by f (Nogneng and Ovsjanikov 2017). None if no operators were computed.
     """
 
     coefficients: Float[Array, "k d"]
@@ -35,10 +35,7 @@ class ProjectedDescriptors(eqx.Module):
         operators: bool,
         pseudo_inverse: PseudoInverse,
     ) -> ProjectedDescriptors:
-        """Project the values (n, d) of d functions at the vertices of one shape onto its eigenbasis.
-
-        The arguments are those of `DescriptorPair.project`, which also checks the shapes of the arrays.
-        """
+        """Project d functions on one shape (n, d); see `DescriptorPair.project`."""
         dual = dual_eigenvectors(spectrum, pseudo_inverse)
 
         def multiply(f: Float[Array, " n"]) -> Float[Array, "k k"]:
@@ -58,16 +55,7 @@ class DescriptorPair(eqx.Module):
 
     **Attributes:**
 
-    - `x`, `y`: d functions on X and the corresponding d functions on Y, expressed in the eigenbases. The
-      shapes are (k_x, d) for `x.coefficients` and (k_y, d) for `y.coefficients`. Column j contains the
-      coefficients of function j, in the unit of the function times length. The shapes are (d, k_x, k_x) for
-      `x.operators` and (d, k_y, k_y) for `y.operators`. Matrix j multiplies other functions by function j, in
-      the eigenbasis, and has the unit of the function. The attribute `operators` is None if no operators were
-      computed.
-
-    The term for descriptor commutativity needs the operators of both shapes. `RegularizedLeastSquares` raises
-    `ValueError` if this term has a weight but the operators of a shape are None. `DescriptorPair.project`
-    computes the operators of both shapes or of neither shape.
+    - `x`, `y`: the coefficients (k, d) of d functions on each shape, and their operators (d, k, k) or None.
 
     **Raises:** `ValueError` if `coefficients` does not have two dimensions on each shape, or if X and Y have
     different numbers of functions.
@@ -103,11 +91,9 @@ class DescriptorPair(eqx.Module):
           functions on Y (n, d), in any unit.
         - `spectrum_x`, `spectrum_y`: the `Spectrum` of source X (m vertices) and of target Y (n vertices), in
           the same unit of length.
-        - `operators`: whether to compute the multiplication operators of both shapes as well. Each shape has
-          d operators, which are matrices of size k x k. Descriptor commutativity needs these operators. The
-          default is False.
-        - `pseudo_inverse`: the form of the pseudo-inverse `Phi^+`; see `jaxsmw.functional_maps.encode`. Use
-          `"least_squares"` for spectra of samples, whose eigenvectors are not orthonormal.
+        - `operators`: whether to compute the multiplication operators of both shapes, which the term of
+          descriptor commutativity needs. The default is False.
+        - `pseudo_inverse`: the form of the pseudo-inverse; see `encode`.
 
         **Raises:** `ValueError` if the pseudo-inverse is unknown, if the values do not have one row per
         vertex and one column per function, or if X and Y have different numbers of functions.

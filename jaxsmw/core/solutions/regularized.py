@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import as_parameter, check_between, check_option
-from jaxsmw.core.functional_map import Norm, QuadraticEnergy, WaveletProblem
+from jaxsmw.core.functional_map import FunctionalMap, Norm, QuadraticEnergy, WaveletProblem
 from jaxsmw.core.linear_algebra import cholesky, product, rounding, solve_lower
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.soft_maps import PointwiseMap
-from jaxsmw.core.solutions.base import Solution
-from jaxsmw.core.solutions.descriptors import DescriptorPair, ProjectedDescriptors
+from jaxsmw.core.solutions.closed_form import Solution
+from jaxsmw.core.solutions.descriptors import DescriptorPair
 
 Weight = Float[Array, ""] | None
 
@@ -42,53 +42,41 @@ class RegularizedLeastSquares(Solution[None]):
 
     The functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
-    - Wavelet preservation is the energy of equation (5) of the MWP paper.
-    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrix Lambda_out contains
-      the eigenvalues of the shape that C maps to. The diagonal matrix Lambda_in contains the eigenvalues of
-      the shape that C maps from. Both matrices are divided by the same number, the largest eigenvalue in the
-      two matrices.
+    - Wavelet preservation is the energy of equation (5) of the MWP paper, divided by the mean of the frame
+      function.
+    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrices Lambda_out and
+      Lambda_in contain the eigenvalues of the shapes "out" and "in", divided by the largest eigenvalue of
+      both.
     - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This is the
       only term that is not quadratic in C.
     - Descriptor preservation is `||C F_in - F_out||²`, where F_in and F_out contain the coefficients of the
-      descriptors on both shapes (Ovsjanikov et al. 2012).
+      descriptors (Ovsjanikov et al. 2012), scaled so that the squared norm of `F_out` is k_out.
     - Descriptor commutativity is `sum_d ||C D_in - D_out C||²`, where the operators D_in and D_out multiply a
-      function by descriptor d (Nogneng and Ovsjanikov 2017).
+      function by descriptor d (Nogneng and Ovsjanikov 2017). They are scaled so that the squared norms of the
+      operators `D_out` sum to k_out.
 
-    The terms are scaled to similar sizes, so their weights are comparable for all banks and all units of
-    descriptors. The wavelet term is divided by the mean of the frame function, which is one for a Parseval
-    frame. `F_out` and `F_in` are scaled by a common factor so that the squared norm of `F_out` is k_out. All
-    operators are scaled by a common factor so that the squared norms of the operators `D_out` sum to k_out.
-
-    The terms for wavelet preservation and descriptor preservation are sums over thousands of columns. First,
-    these columns are replaced by k_in equivalent columns. Then `optimistix.least_squares` takes Gauss–Newton
-    steps. The linear system of each step is solved by conjugate gradients, without a matrix of size k² x k².
-    The solver starts from the functional map of the previous iteration; in the first iteration, it starts
-    from an estimate. C is differentiable: its derivatives are computed by implicit differentiation at the
-    minimum.
-
-    The status code is one of `RESULTS.successful`, `RESULTS.undetermined_functional_map`,
-    `RESULTS.singular_system`, `RESULTS.nonfinite_functional_map` and `RESULTS.solver_not_converged`.
+    The scales make the weights comparable for all banks and all units of descriptors. The sums over thousands
+    of columns in the quadratic terms are replaced by sums over k_in equivalent columns. Then
+    `optimistix.least_squares` takes Gauss–Newton steps, whose linear systems conjugate gradients solve. The
+    solver starts from the previous functional map, or from an estimate. The derivatives of C are computed by
+    implicit differentiation at the minimum.
 
     **Arguments:**
 
     - `wavelet_preservation`, `laplacian_commutativity`, `orthogonality`, `descriptor_preservation`,
-      `descriptor_commutativity`: the weights of the five terms. Each weight is a single positive number or an
-      array of shape (), or None to omit the term. The defaults are 1, 1, 0.1, None and None, in this order.
-    - `descriptors`: a `DescriptorPair`, which the two descriptor terms need; None (the default) if neither
-      term has a weight. Descriptor commutativity needs the result of
-      `DescriptorPair.project(..., operators=True)`.
-    - `norm`: the weights of the vertices of X in the wavelet term. `"area"` (the default) weights each vertex
-      by its area. `"frobenius"` gives all vertices the same weight.
-    - `tolerance`: a positive number, by default 1e-3. This number is both the relative and the absolute
-      tolerance of `optimistix.GaussNewton`.
+      `descriptor_commutativity`: the weights of the five terms. Each weight is a positive number, or None to
+      omit the term. The defaults are 1, 1, 0.1, None and None.
+    - `descriptors`: a `DescriptorPair`, which the two descriptor terms need. Descriptor commutativity needs
+      the result of `DescriptorPair.project(..., operators=True)`.
+    - `norm`: the weights of the vertices of X in the wavelet term, `"area"` (the default) or `"frobenius"`;
+      see `WaveletProblem.energy`.
+    - `tolerance`: the relative and absolute tolerance of `optimistix.GaussNewton`, positive, by default 1e-3.
     - `max_steps`: the maximum number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
-      reach the tolerance, `solve` returns the status code `RESULTS.solver_not_converged`.
+      reach the tolerance, the status code is `RESULTS.solver_not_converged`.
 
-    **Raises:** `ValueError` if a weight is not a single positive number, the tolerance is not positive,
-    `max_steps` is below 1, or `norm` is unknown. `ValueError` if neither `wavelet_preservation` nor
-    `descriptor_preservation` has a weight. `ValueError` if `descriptors` is given but neither descriptor term
-    has a weight, or if a descriptor term has a weight but `descriptors` is None. `ValueError` if
-    `descriptor_commutativity` has a weight, but the descriptors on X or Y have no operators.
+    **Raises:** `ValueError` if an argument is out of its range, if neither `wavelet_preservation` nor
+    `descriptor_preservation` has a weight, or if the descriptors or their operators do not fit the weights of
+    the descriptor terms.
     """
 
     wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
@@ -137,11 +125,9 @@ class RegularizedLeastSquares(Solution[None]):
         problem: WaveletProblem,
         prepared: None,
         pointwise_map: PointwiseMap,
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
         """Return the minimiser C (k_out, k_in) of the weighted terms, and a status code (`RESULTS`).
-
-        The solver starts from `previous`, or from an estimate if `previous` is None.
 
         **Raises:** `ValueError` if the descriptors and the functional map have different numbers of
         eigenvectors.
@@ -151,12 +137,12 @@ class RegularizedLeastSquares(Solution[None]):
             responses_out, _ = problem.responses
             height = jnp.mean(frame_function(responses_out))
             energy = (1 / height) * problem.energy(pointwise_map, norm=self.norm)
-        descriptors = None
+        oriented = self
         if self.descriptors is not None:
-            descriptors = problem.out_and_in(self.descriptors.x, self.descriptors.y)
-        spectrum_out, spectrum_in = problem.spectra
-        eigenvalues = spectrum_out.eigenvalues, spectrum_in.eigenvalues
-        return self._minimize(energy, *eigenvalues, descriptors, previous)
+            pair = DescriptorPair(*problem.out_and_in(self.descriptors.x, self.descriptors.y))
+            oriented = eqx.tree_at(lambda solution: solution.descriptors, self, pair)
+        eigenvalues = (spectrum.eigenvalues for spectrum in problem.spectra)
+        return oriented.minimize(energy, *eigenvalues, initial=previous)
 
     def minimize(
         self,
@@ -164,19 +150,17 @@ class RegularizedLeastSquares(Solution[None]):
         eigenvalues_out: Float[Array, " k_out"],
         eigenvalues_in: Float[Array, " k_in"],
         *,
-        initial: Float[Array, "k_out k_in"] | None = None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        initial: FunctionalMap | None = None,
+    ) -> tuple[FunctionalMap, RESULTS]:
         """Minimise the weighted terms, with a given energy in place of the wavelet-preservation energy.
 
         **Arguments:**
 
-        - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`. The
-          energy must be None if this weight is None. Otherwise the energy is required.
-        - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shape that C maps to (k_out,), and of
-          the shape that C maps from (k_in,), in the same unit. `descriptors.x` must belong to the shape that
-          C maps to, as in the pullback convention.
-        - `initial`: the functional map (k_out, k_in) from which the solver starts. By default, the solver
-          starts from an estimate.
+        - `energy`: any `QuadraticEnergy`, which is multiplied by the weight `wavelet_preservation`; None if
+          this weight is None.
+        - `eigenvalues_out`, `eigenvalues_in`: the eigenvalues of the shapes "out" and "in", in the same unit.
+          `descriptors.x` must belong to the shape "out", as in the pullback convention.
+        - `initial`: the functional map from which the solver starts, by default an estimate.
 
         **Returns:** The minimiser C (k_out, k_in), without unit, and a status code, which is a member of
         `RESULTS`.
@@ -184,22 +168,9 @@ class RegularizedLeastSquares(Solution[None]):
         **Raises:** `ValueError` if only one of `energy` and the weight `wavelet_preservation` is None, or if
         the descriptors and C have different numbers of eigenvectors.
         """
-        descriptors = None if self.descriptors is None else (self.descriptors.x, self.descriptors.y)
-        return self._minimize(energy, eigenvalues_out, eigenvalues_in, descriptors, initial)
-
-    def _minimize(
-        self,
-        energy: QuadraticEnergy | None,
-        eigenvalues_out: Float[Array, " k_out"],
-        eigenvalues_in: Float[Array, " k_in"],
-        descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
-        initial: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
-        """Implement `solve` and `minimize`; `descriptors` are in the order (out, in)."""
-        quadratic = self._quadratic_energy(
-            energy, descriptors, (eigenvalues_out.size, eigenvalues_in.size), eigenvalues_in.dtype
-        )
-        terms = self._terms(quadratic, eigenvalues_out, eigenvalues_in, descriptors)
+        shape, dtype = (eigenvalues_out.size, eigenvalues_in.size), eigenvalues_in.dtype
+        quadratic = self._quadratic_energy(energy, shape, dtype)
+        terms = self._terms(quadratic, eigenvalues_out, eigenvalues_in)
         curvature = functools.reduce(operator.add, (t.curvature for t in terms if t.curvature is not None))
         determined = curvature > rounding(quadratic.gram)
         finite = jnp.all(jnp.isfinite(curvature)) & jnp.all(jnp.isfinite(quadratic.cross))
@@ -219,13 +190,8 @@ class RegularizedLeastSquares(Solution[None]):
         return functional_map, where(finite, result, RESULTS.nonfinite_functional_map)
 
     def _quadratic_energy(
-        self,
-        energy: QuadraticEnergy | None,
-        descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
-        shape: tuple[int, int],
-        dtype: DTypeLike,
+        self, energy: QuadraticEnergy | None, shape: tuple[int, int], dtype: DTypeLike
     ) -> QuadraticEnergy:
-        """Return the weighted sum of the given energy and the descriptor-preservation term."""
         if (energy is None) != (self.wavelet_preservation is None):
             raise ValueError(
                 "an energy needs the weight wavelet_preservation, and the weight needs an energy: "
@@ -234,8 +200,8 @@ class RegularizedLeastSquares(Solution[None]):
         quadratic = QuadraticEnergy.zero(*shape, dtype)
         if energy is not None and self.wavelet_preservation is not None:
             quadratic += self.wavelet_preservation.astype(dtype) * energy
-        if descriptors is not None and self.descriptor_preservation is not None:
-            f_out, f_in = (side.coefficients for side in descriptors)
+        if self.descriptors is not None and self.descriptor_preservation is not None:
+            f_out, f_in = self.descriptors.x.coefficients, self.descriptors.y.coefficients
             if (f_out.shape[0], f_in.shape[0]) != shape:
                 raise ValueError(
                     f"the descriptors are expressed in {f_out.shape[0]} and {f_in.shape[0]} eigenvectors, "
@@ -252,9 +218,8 @@ class RegularizedLeastSquares(Solution[None]):
         quadratic: QuadraticEnergy,
         eigenvalues_out: Float[Array, " k_out"],
         eigenvalues_in: Float[Array, " k_in"],
-        descriptors: tuple[ProjectedDescriptors, ProjectedDescriptors] | None,
     ) -> list[_Term]:
-        """Return all terms of the objective that have a weight. The first term is the quadratic energy."""
+        """Return the terms of the objective that have a weight, the quadratic energy first."""
         dtype = eigenvalues_in.dtype
         terms = [_energy_term(quadratic)]
         if self.laplacian_commutativity is not None:
@@ -263,8 +228,9 @@ class RegularizedLeastSquares(Solution[None]):
         if self.orthogonality is not None:
             weight = self.orthogonality.astype(dtype)
             terms.append(_orthogonality_term(weight, eigenvalues_out.size, eigenvalues_in.size))
-        d_out, d_in = (None, None) if descriptors is None else (side.operators for side in descriptors)
-        if self.descriptor_commutativity is not None and d_out is not None and d_in is not None:
+        if self.descriptors is not None and self.descriptor_commutativity is not None:
+            d_out, d_in = self.descriptors.x.operators, self.descriptors.y.operators
+            assert d_out is not None and d_in is not None  # `__check_init__` requires them
             terms.append(_operator_term(self.descriptor_commutativity.astype(dtype), d_out, d_in))
         return terms
 
@@ -272,9 +238,9 @@ class RegularizedLeastSquares(Solution[None]):
         self,
         terms: Sequence[_Term],
         unit: Float[Array, "k_out k_in"],
-        initial: Float[Array, "k_out k_in"],
+        initial: FunctionalMap,
         solvable: Bool[Array, ""],
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+    ) -> tuple[FunctionalMap, RESULTS]:
         """Minimise over `C / unit`. Unless `solvable`, all residuals are zero and the solver stops."""
         # The imports are inside the method because importing both packages takes as long as computing an
         # eigenbasis.
@@ -305,7 +271,7 @@ class _Term(NamedTuple):
     `curvature` is half the second derivative with respect to each entry of C, or None if it is not constant.
     """
 
-    residual: Callable[[Float[Array, "k_out k_in"]], Array]
+    residual: Callable[[FunctionalMap], Array]
     curvature: Float[Array, "k_out k_in"] | None
 
 
@@ -323,7 +289,6 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
 def _laplacian_term(
     weight: Float[Array, ""], eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"]
 ) -> _Term:
-    """Return the weighted term of Laplacian commutativity."""
     largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
     gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
     gaps = gaps * jnp.sqrt(weight)
@@ -331,7 +296,6 @@ def _laplacian_term(
 
 
 def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Term:
-    """Return the weighted term of orthogonality."""
     root, identity = jnp.sqrt(weight), jnp.eye(min(k_out, k_in), dtype=weight.dtype)
     return _Term(lambda c: root * ((product(c.T, c) if k_in <= k_out else product(c, c.T)) - identity), None)
 
@@ -339,7 +303,6 @@ def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Ter
 def _operator_term(
     weight: Float[Array, ""], d_out: Float[Array, "d k_out k_out"], d_in: Float[Array, "d k_in k_in"]
 ) -> _Term:
-    """Return the weighted term of descriptor commutativity."""
     scale = jnp.sqrt(weight * d_out.shape[1] / jnp.sum(d_out**2))
     diagonal_out, diagonal_in = (jnp.diagonal(d, axis1=1, axis2=2) for d in (d_out, d_in))
     squares = jnp.sum(d_out**2, axis=(0, 1))[:, None] + jnp.sum(d_in**2, axis=(0, 2))[None, :]

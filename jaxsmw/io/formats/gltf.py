@@ -16,7 +16,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import first_equal_rows
+from jaxsmw.geometry.arrays import first_equal_rows
 from jaxsmw.io.formats.polygons import Polygons, unique_name, unique_names
 from jaxsmw.io.formats.text import damaged, excerpt, export_again
 from jaxsmw.io.mesh_data import COLORS, Skin

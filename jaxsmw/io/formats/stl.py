@@ -6,7 +6,8 @@ import re
 
 import numpy as np
 
-from jaxsmw.geometry.mesh import coincident_vertices, first_equal_rows
+from jaxsmw.geometry.arrays import first_equal_rows
+from jaxsmw.geometry.mesh import coincident_vertices
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions
 from jaxsmw.io.formats.text import export_again, numbers, text
 from jaxsmw.io.mesh_data import MeshData

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
-from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
 from jaxsmw.matching.executor import SpectralPair, Start, run
@@ -36,21 +35,11 @@ class _Candidate(NamedTuple):
 
 
 class Alternatives:
-    """Alternative maps of a pair, computed and compared on proxies.
+    """Alternative maps of a pair, computed and compared on proxies of about a thousand samples.
 
-    Each shape is reduced to about a thousand samples. A feature regression with few eigenvectors refines many
-    initial maps of these samples. Five refinements of samples take about as long as one refinement at all
-    vertices. An initial map is the result of a nearest-neighbour search in features. There are three kinds of
-    features:
-
-    - SHOT with several radii. Each choice of radii gives one map.
-    - SHOT and the distances to extremities, such as the ends of limbs. A pairing assigns extremities of X to
-      extremities of Y. Each of the most plausible pairings gives one map.
-    - SHOT and the positions along the principal axes of inertia. Four rotations align the principal axes of X
-      with those of Y, and each rotation gives one map.
-
-    For a partial pair, only the first kind is used, because the extremities and axes of a part differ from
-    those of the full shape.
+    docs/how_it_works.md lists the initial maps. A feature regression with few eigenvectors refines them. Five
+    refinements of samples take about as long as one refinement at all vertices. For a partial pair, only SHOT
+    gives initial maps, because the extremities and axes of a part differ from those of the full shape.
 
     **Arguments:**
 
@@ -267,8 +256,7 @@ class Alternatives:
         return self.y.samples.nearest[pointwise_map[self.x.samples.vertices]]
 
     def _extended(self, found: SampleMap) -> Int64[np.ndarray, " m"]:
-        everywhere = self.y.samples.vertices[found][self.x.samples.nearest]
-        return extend_to_unreferenced(self.pair.mesh_x, everywhere)
+        return self.y.samples.vertices[found][self.x.samples.nearest]
 
 
 def _within(margin: float, candidates: Sequence[_Candidate]) -> list[_Candidate]:

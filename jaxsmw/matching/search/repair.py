@@ -27,45 +27,22 @@ def refine_and_repair(
     preset: Preset,
     *,
     outcome: Outcome | None = None,
-    alternatives: Iterable[Int64[np.ndarray, " m"]] | None = None,
     history: bool = False,
 ) -> Scored:
     """Run the first and the repeated stages of a preset from a start, and repair a map that looks wrong.
 
-    If the initial map exchanges symmetric limbs, refinement does not correct this error, because both limbs
-    have the same shape. If the preset has repair, the outcome is checked for orientation reversal and
-    discontinuities (`jaxsmw.matching.judge`). If the outcome looks wrong, repair takes the following two
-    steps.
-
-    1. Alternatives: `jaxsmw.matching.search.alternatives` refines many initial maps on a thousand samples.
-      The
-       best of these maps, at most `finalists`, are then refined by the repeated stages. The outcome with the
-       best score is kept, which can also be the outcome of the original initial map. If the kept outcome
-       looks right, repair ends.
-    2. Rounds: each round runs the repeated stages again. Each round repairs one kind of fault of the previous
-       map, orientation reversal or discontinuities. The first functional map of the round is computed without
-       the vertices that have this fault. If a map has both kinds of fault, the first round repairs the
-       orientation reversal, and further rounds alternate between the two kinds. If the second-best outcome of
-       step 1 has faults, this outcome is repaired as well. The outcome with the best score is used.
-
-    If the map of two near-isometric full shapes still looks wrong, both steps run a second time. The
-    alternatives are then refined with crease eigenvectors as well (Table R45). The better outcome is kept.
-
-    Some wrong maps look right. For two full shapes with the initial map `"shot"`, alternatives are therefore
-    computed if the distortion of the outcome is at least `compared`. Only alternatives that differ from the
-    map, and precede all similar maps in the order of their scores, are then refined at all vertices.
-
-    Maps between non-isometric shapes need further passes; see `refine_further`.
+    docs/how_it_works.md explains the steps. Alternative maps are tried first, and only for the initial map
+    `"shot"`. Rounds of repair follow if the best map still looks wrong. If the map of two near-isometric full
+    shapes looks wrong after that, both steps run again with crease eigenvectors. Some wrong maps look right.
+    For two full shapes, a map whose distortion is at least `compared` is therefore compared with alternative
+    maps as well.
 
     **Arguments:**
 
     - `prepared`: the prepared pair.
     - `start`: the initial map.
     - `preset`: the stages and the repair. Without repair, the outcome is judged but not repaired.
-    - `outcome`: the outcome of the stages if they have already run, such as a result of `run` in batches.
-    - `alternatives`: alternative maps (m,), the best first, as an iterable that is consumed only if needed.
-      By default, the maps come from `jaxsmw.matching.search.alternatives` if the initial map is `"shot"`. For
-      other initial maps, there are no alternatives by default.
+    - `outcome`: the outcome of the stages if they have already run, such as a result of `run_batches`.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Raises:** `InputError` if alternative maps cannot be computed.
@@ -77,8 +54,8 @@ def refine_and_repair(
     if repair is None or not best.successful:
         return best
     repeater = _Repeater(prepared.spectra, preset.repeated, judge, history)
-    computes_alternatives = alternatives is None and start.origin == "shot" and repair.finalists > 0
-    compares = computes_alternatives and not prepared.pair.partial
+    has_alternatives = start.origin == "shot" and repair.finalists > 0
+    compares = has_alternatives and not prepared.pair.partial
     if best.suspicious:
         logger.info(
             "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
@@ -91,8 +68,8 @@ def refine_and_repair(
         logger.info("the map is compared with alternative maps (distortion %.3f)", best.distortion)
     else:
         return best
-    if not computes_alternatives:
-        return repeater.repaired([best], alternatives or ())
+    if not has_alternatives:
+        return repeater.repaired([best])
     proxies = Alternatives(prepared, repair)
     judge = replace(judge, measure_deformation=proxies.deformation)
     repeater, usual = replace(repeater, judge=judge), best.pointwise_map
@@ -110,12 +87,9 @@ def refine_and_repair(
 def refine_further(
     prepared: PreparedPair, origin: str, preset: Preset, scored: Scored, *, history: bool = False
 ) -> Scored:
-    """Refine the map between non-isometric shapes further, because such maps converge slowly.
+    """Run further passes for non-isometric shapes, because their maps converge slowly.
 
-    In each pass, the repeated stages run again. `RepairSettings` explains how many passes run, which passes
-    are coarse, and which passes use crease eigenvectors. The passes also run from the `rivals` of the map. A
-    rival replaces the map if its score after the passes is better. If the map is suspicious, the score must
-    be better by more than `rival_margin`.
+    docs/how_it_works.md explains the passes, which also run from the `rivals` of the map.
 
     **Arguments:**
 
@@ -125,9 +99,8 @@ def refine_further(
     - `scored`: a result of `refine_and_repair`.
     - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
-    **Returns:** The map after the last pass. The attribute `suspicious` is copied from the given map. The
-    given map is returned if no pass runs, if a pass fails, or if the passes make the score (without the
-    deformation) worse by more than `pass_tolerance`.
+    **Returns:** The map after the last pass, as suspicious as the given map. The given map is returned if no
+    pass runs, if a pass fails, or if the passes worsen the score by more than `pass_tolerance`.
     """
     repair = preset.repair
     if repair is None or not scored.successful:
@@ -224,7 +197,9 @@ class _Repeater:
         first = max(0, len(outcome.refinements) - len(self.stages))
         return Outcome(outcome.initial_map, outcome.refinements[:first]).followed_by(again)
 
-    def repaired(self, known: Sequence[Scored], alternatives: Iterable[Int64[np.ndarray, " m"]]) -> Scored:
+    def repaired(
+        self, known: Sequence[Scored], alternatives: Iterable[Int64[np.ndarray, " m"]] = ()
+    ) -> Scored:
         """Return the best of judged maps and alternative maps, repaired by rounds if it looks wrong."""
         settings, maps = self.judge.settings, [*known]
         for number, alternative in enumerate(islice(alternatives, settings.finalists), 1):

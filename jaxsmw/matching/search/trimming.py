@@ -83,9 +83,8 @@ def match_trimmed(
 ) -> tuple[PreparedPair, Scored] | None:
     """Trim the larger shape of a partial pair, and match the pair again by the last stage.
 
-    The eigenfunctions of a part differ from those of the full shape. After trimming, both shapes cover nearly
-    the same region of the body, so their eigenfunctions are similar. The last stage of the preset then runs
-    on the trimmed pair, with `trimmed_levels`. (Table R46)
+    After trimming, both shapes cover nearly the same region, so their eigenfunctions are similar; see
+    docs/how_it_works.md. The last stage of the preset runs with `trimmed_levels`. (Table R46)
 
     **Arguments:**
 

@@ -1,0 +1,163 @@
+"""Common code of the scripts: command lines, measurements in parts or pairs, and files of scans."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from jaxsmw.benchmark.journal import Journal
+from jaxsmw.benchmark.tables import markdown
+from jaxsmw.io import Landmarks, read_landmark_file
+from jaxsmw.report.summary import provenance
+from jaxsmw.runtime.compilation import release_programs
+from jaxsmw.runtime.files import atomic_write, make_directory
+
+Part = tuple[str, str, list[list[str]], dict[str, Any]]
+"""A tuple of a table's title, a note on the measurement, the rows of the table, and all measured numbers."""
+
+PairT = TypeVar("PairT")
+
+
+def make_parser(
+    description: str | None,
+    *,
+    parts: Collection[str] = (),
+    faust: bool = False,
+    output: str | None = None,
+    pairs: int | None = None,
+) -> argparse.ArgumentParser:
+    """Return a parser that prints the description as it is, with the options that several scripts share."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    if parts:
+        parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), metavar="PART")
+    if faust:
+        text = "the directory of the remeshed FAUST set"
+        parser.add_argument("--data", type=Path, metavar="FAUST_R", help=text)
+    if output is not None:
+        text = "directory of the results (default: %(default)s)"
+        parser.add_argument("--output", type=Path, default=Path(output), metavar="DIR", help=text)
+    if pairs is not None:
+        text = "number of pairs (default: %(default)s)"
+        parser.add_argument("--pairs", type=int, default=pairs, metavar="N", help=text)
+    return parser
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a whole text file."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, "utf-8")
+
+
+def measure_parts(
+    title: str,
+    parts: Mapping[str, Callable[[argparse.Namespace], Iterator[Part]]],
+    options: argparse.Namespace,
+    draw: Callable[[dict[str, Any], Path], object] | None = None,
+) -> None:
+    """Measure the parts named in `options.only`, and print each table when it is measured.
+
+    The tables and all numbers are written to files in `options.output`, with names made from the title. The
+    function `draw` draws the numbers to a file.
+    """
+    file = make_directory(options.output) / title.lower()
+    origin = provenance()
+    texts, numbers = [f"# {title}\n\n{json.dumps(origin)}"], {"provenance": origin}
+    print(texts[0])
+    for name in options.only:
+        numbers[name] = []
+        for heading, note, rows, measured in parts[name](options):
+            texts.append(f"## {heading}\n\n{note}\n\n{markdown(rows)}")
+            print(f"\n{texts[-1]}", flush=True)
+            numbers[name].append(measured)
+            file.with_suffix(".md").write_text("\n\n".join(texts), "utf-8")
+            file.with_suffix(".json").write_text(json.dumps(numbers, indent=1) + "\n", "utf-8")
+            if draw is not None:
+                draw(numbers, file.with_suffix(".png"))
+
+
+def medians(
+    candidates: dict[str, Callable[[], object]],
+    repeats: int,
+    clock: Callable[[], Any] = time.perf_counter,
+    *,
+    warm: bool = True,
+) -> dict[str, Any]:
+    """Run the candidates alternately, and return the median time of each candidate in seconds.
+
+    **Arguments:**
+
+    - `candidates`: the functions to time, by name.
+    - `repeats`: the number of timed runs of each candidate.
+    - `clock`: a function that returns the current time in seconds, or an array of times in seconds.
+    - `warm`: whether each candidate first runs once without timing, so that JAX compiles it.
+    """
+    seconds: dict[str, list[Any]] = {name: [] for name in candidates}
+    for turn in range(repeats + warm):
+        for name, candidate in candidates.items():
+            start = clock()
+            jax.block_until_ready(candidate())
+            if turn >= warm:
+                seconds[name].append(clock() - start)
+    return {name: np.median(times, axis=0).tolist() for name, times in seconds.items()}
+
+
+def measure_pairs(
+    file: Path,
+    pairs: Iterable[PairT],
+    names: Callable[[PairT], tuple[str, str]],
+    measure: Callable[[PairT], dict[str, Any]],
+) -> Journal:
+    """Measure the pairs that a CSV file does not contain yet, and append and print each row."""
+    make_directory(file.parent)
+    journal = Journal(file, ("source", "target"))
+    for pair in pairs:
+        source, target = names(pair)
+        if (source, target) not in journal:
+            release_programs()
+            row = {"source": source, "target": target, **measure(pair)}
+            journal.append([row])
+            print(row, flush=True)
+    return journal
+
+
+def scan_files(directory: Path) -> list[Path]:
+    """Return all mesh files of a data set below a directory."""
+    return sorted(file for file in directory.rglob("*") if file.suffix in (".off", ".ply", ".vtk"))
+
+
+def side_of(scan: Path) -> str:
+    """Return the side of a tooth that `chirality.csv` states; an empty text for scans without a side."""
+    table = scan.with_name("chirality.csv")
+    if not table.exists():
+        return ""
+    with open(table, encoding="utf-8") as rows:
+        sides = {row["name"]: row["side"] for row in csv.DictReader(rows)}
+    return sides.get(scan.stem, sides.get(scan.stem.removesuffix("_sas"), ""))
+
+
+def common_landmarks(*scans: Path) -> list[Landmarks]:
+    """Return the manual landmarks that all scans have, for each scan."""
+    landmarks = [_read_landmarks(scan) for scan in scans]
+    names = [name for name in landmarks[0].names if all(name in of_scan.names for of_scan in landmarks)]
+    return [of_scan.select(names) for of_scan in landmarks]
+
+
+def _read_landmarks(scan: Path) -> Landmarks:
+    """Read the manual landmarks of a scan from `SCAN.mrk.json`, `SCAN.csv` or `landmarks.csv`."""
+    for file in (scan.with_suffix(".mrk.json"), scan.with_suffix(".csv")):
+        if file.exists():
+            return read_landmark_file(file)
+    with open(scan.with_name("landmarks.csv"), encoding="utf-8") as rows:
+        own = [row for row in csv.DictReader(rows) if row["mesh"] == scan.name]
+    positions = np.array([[float(row[axis]) for axis in "xyz"] for row in own])
+    return Landmarks(tuple(row["landmark"] for row in own), positions, name=str(scan))
