@@ -78,16 +78,12 @@ def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
 
     directory = options.directory
     try:
-        found = sorted(
-            entry.name
-            for entry in os.scandir(directory)
-            if entry.is_file() and entry.name.lower().endswith(MESH_SUFFIXES)
-        )
+        names = sorted(entry.name for entry in os.scandir(directory) if entry.is_file())
     except OSError as error:
         raise InputError(
             f"{directory}: cannot be read as a directory ({error.strerror}): give a directory with meshes."
         ) from error
-    files = {name: Path(directory) / name for name in found}
+    files = {name: Path(directory) / name for name in names if name.lower().endswith(MESH_SUFFIXES)}
     for name in {Path(_inside(options, "exclude", file, files)).name for file in options.exclude}:
         del files[name]
     if len(files) < 2:
@@ -100,9 +96,9 @@ def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
 
 def _inside(options: argparse.Namespace, option: str, file: str, files: Mapping[str, Path]) -> str:
     """Return the path of a mesh in the directory. The user gives either the path or only the file name."""
-    for given in (file, os.path.join(options.directory, file)):
-        if Path(file).name in files and _same(given, files[Path(file).name]):
-            return given
+    for path in (file, os.path.join(options.directory, file)):
+        if Path(file).name in files and _same(path, files[Path(file).name]):
+            return path
     raise InputError(
         f"{option_of(option)}: {file} is not a mesh file in {options.directory}: give one of its files."
     )
@@ -196,14 +192,13 @@ def _note_other_files(options: argparse.Namespace) -> None:
     from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
     from jaxsmw.io.meshes import MESH_SUFFIXES
 
-    known = (*MESH_SUFFIXES, *LANDMARK_SUFFIXES, *_COMPANIONS)
+    usual = (*MESH_SUFFIXES, *LANDMARK_SUFFIXES, *_COMPANIONS)
     names = []
-    for name in sorted(os.listdir(options.directory)):
-        path = os.path.join(options.directory, name)
-        if not os.path.exists(path):
-            names.append(f"{name} (a broken link)")
-        elif os.path.isfile(path) and not name.startswith(".") and not name.lower().endswith(known):
-            names.append(name)
+    for path in sorted(Path(options.directory).iterdir()):
+        if not path.exists():
+            names.append(f"{path.name} (a broken link)")
+        elif path.is_file() and not path.name.startswith(".") and not path.name.lower().endswith(usual):
+            names.append(path.name)
     if names:
         listed = ", ".join(names[:_NAMED_FILES])
         more = f" and {len(names) - _NAMED_FILES} more" if len(names) > _NAMED_FILES else ""

@@ -26,7 +26,7 @@ from jaxsmw.cli.measurement import (
     show_match,
 )
 from jaxsmw.cli.method import add_method, check_method, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
+from jaxsmw.cli.outputs import check_outputs, report_written, write_match_report
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write, make_directory
 
@@ -133,26 +133,14 @@ def _check(options: argparse.Namespace) -> None:
     check_outputs(
         inputs,
         files=[options.output, points, options.one_to_one, expected, overlap],
-        directories=_directories(options),
+        report=options.report,
+        texture=options.texture,
     )
     from jaxsmw.io.maps import check_map_name
 
     for file in filter(None, (options.output, options.one_to_one)):
         check_map_name(file)
     import jaxsmw.matching.match  # noqa: F401 (imported here because loading is timed separately)
-
-
-def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the requested directories, each with the names of the files that the command writes to it."""
-    directories: list[tuple[str, tuple[str, ...]]] = []
-    if options.texture:
-        from jaxsmw.report.figures import check_drawable
-
-        check_drawable()
-        from jaxsmw.report.texture import TEXTURE_FILES
-
-        directories.append((options.texture, TEXTURE_FILES))
-    return directories + report_directories(options.report)
 
 
 def _write_files(

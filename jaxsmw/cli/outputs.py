@@ -32,7 +32,9 @@ def check_outputs(
     files: Iterable[str | None] = (),
     figures: Iterable[str | None] = (),
     pages: Iterable[str | None] = (),
-    directories: Sequence[tuple[str, Sequence[str]]] = (),
+    report: str | None = None,
+    texture: str | None = None,
+    directories: Iterable[tuple[str, Sequence[str]]] = (),
 ) -> None:
     """Check before a long computation that all outputs can be written.
 
@@ -40,22 +42,29 @@ def check_outputs(
     `directories` are those of the files that the command writes into the directory.
     """
     files, figures, pages = ([path for path in paths if path] for paths in (files, figures, pages))
+    directories = list(directories)
+    if figures or pages or report or texture:
+        from jaxsmw.report.figures import check_drawable, check_figure_path
+
+        check_drawable()
+    if report:
+        from jaxsmw.report.summary import REPORT_FILES
+
+        directories.append((report, REPORT_FILES))
+    if texture:
+        from jaxsmw.report.texture import TEXTURE_FILES
+
+        directories.append((texture, TEXTURE_FILES))
     written = [*files, *figures, *pages]
     written += [os.path.join(directory, name) for directory, names in directories for name in names]
     _refuse_clashes(filter(None, inputs), written, [directory for directory, _ in directories])
-
     for path in files:
         check_writable(path)
     for path in figures:
-        from jaxsmw.report.figures import check_figure_path
-
         check_figure_path(path)
     for path in pages:
-        from jaxsmw.report.figures import check_drawable
-
         if not is_page(path):
             raise InputError(f"{path}: pages are written as .html: choose a name that ends in .html.")
-        check_drawable()
         check_writable(path)
     for path, _ in directories:
         check_directory(path)
@@ -82,18 +91,6 @@ def _refuse_place(path: str, read: set[str], taken: set[str]) -> None:
         raise InputError(f"{path}: is an input and would be overwritten: choose another name.")
     if place in taken:
         raise InputError(f"{path}: two outputs have this name: choose another name for one of the outputs.")
-
-
-def report_directories(directory: str | None) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the directory of a report and the names of its files, for `check_outputs`."""
-    if directory is None:
-        return []
-    from jaxsmw.report.figures import check_drawable
-
-    check_drawable()
-    from jaxsmw.report.summary import REPORT_FILES
-
-    return [(directory, REPORT_FILES)]
 
 
 def is_page(path: str) -> bool:

@@ -6,20 +6,19 @@ say whether their indices count from 0 or from 1, so the argument `index_base` o
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
 
 from jaxsmw.choices import IndexBase
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.formats.mat import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
+from jaxsmw.io.formats.npz import read_array
 from jaxsmw.io.formats.text import is_number
 from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
 from jaxsmw.io.meshes import MESH_SUFFIXES, POINT_CLOUD_SUFFIXES
@@ -112,7 +111,7 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 
 
 def check_map_name(path: str | os.PathLike[str]) -> None:
-    """Refuse the suffixes of pictures, pages, meshes, points and landmarks as the name of a map."""
+    """Refuse the suffixes of other kinds of files, such as pictures and meshes, as the name of a map."""
     suffix = Path(path).suffix.lower()
     if suffix in _NOT_MAPS:
         raise InputError(
@@ -147,13 +146,9 @@ class Table:
 
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
         """Read an array as a matrix. A list becomes one column, and so does a row if `columns` is 1."""
-        data = io.BytesIO(read_bytes(self.path))
-        try:
-            array = np.lib.format.read_array(data, allow_pickle=False)
-        except (ValueError, EOFError, MemoryError, SyntaxError, TokenError) as error:
-            raise InputError(
-                f"{self.path}: is not an array saved by NumPy: save the array with numpy.save, or as text."
-            ) from error
+        data = read_bytes(self.path)
+        with naming(self.path):
+            array = read_array(data)
         is_list = array.ndim == 1 or (columns == 1 and array.shape[:-1] == (1,))
         table = array.reshape(-1, 1) if is_list else array
         fits = table.ndim == 2 and columns in (None, table.shape[1]) and table.size

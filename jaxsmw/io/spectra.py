@@ -77,56 +77,61 @@ def make_spectrum(
     eigenvalues are negative or not ascending, a vertex area is negative, the eigenvectors are not
     orthonormal, or an object of another library has no eigenbasis.
     """
-    if eigenvectors is None and vertex_areas is None:
-        eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues, name)
-    values, vectors = _real(eigenvalues, "eigenvalues", name), _real(eigenvectors, "eigenvectors", name)
-    areas = _real(_lumped(vertex_areas, vectors.shape, name), "vertex areas", name)
+    with naming(name):
+        if eigenvectors is None and vertex_areas is None:
+            eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues)
+        values, vectors = _real(eigenvalues, "eigenvalues"), _real(eigenvectors, "eigenvectors")
+        areas = _real(_lumped(vertex_areas, vectors.shape), "vertex areas")
+        _check_basis(values, vectors, areas)
+    total, vectors = areas.sum(), np.where(areas[:, None] > 0, vectors, 0)
+    arrays = np.maximum(values, 0) * total, vectors * np.sqrt(total), areas / total, areas > 0
+    return Spectrum(*map(jax.device_put, arrays))
+
+
+def _check_basis(values: np.ndarray, vectors: np.ndarray, areas: np.ndarray) -> None:
     k, n = values.size, areas.size
     if values.ndim != 1 or areas.ndim != 1 or vectors.shape != (n, k) or not 1 <= k <= n:
         raise InputError(
-            f"{name}: eigenvalues {values.shape}, eigenvectors {vectors.shape} and vertex areas "
-            f"{areas.shape} do not fit each other: for n vertices give shapes (k,), (n, k) and (n,)."
+            f"eigenvalues {values.shape}, eigenvectors {vectors.shape} and vertex areas {areas.shape} do not "
+            "fit each other: for n vertices give shapes (k,), (n, k) and (n,)."
         )
-    total = areas.sum()
-    if (areas < 0).any() or not total > 0:
-        raise InputError(f"{name}: some vertex areas are negative, or all are zero: correct the areas.")
-    largest = np.abs(values).max()
-    if values.min() < -_EIGENVALUE_TOLERANCE * largest:
+    if (areas < 0).any() or not areas.sum() > 0:
+        raise InputError("some vertex areas are negative, or all are zero: correct the areas.")
+    rounding = _EIGENVALUE_TOLERANCE * np.abs(values).max()
+    if values.min() < -rounding:
         raise InputError(
-            f"{name}: some eigenvalues are negative, down to {values.min():.3g}, but the Laplacian must be "
-            "positive semi-definite: change its sign."
+            f"some eigenvalues are negative, down to {values.min():.3g}, but the Laplacian must be positive "
+            "semi-definite: change its sign."
         )
-    if (np.diff(values) < -_EIGENVALUE_TOLERANCE * largest).any():
+    if (np.diff(values) < -rounding).any():
         raise InputError(
-            f"{name}: the eigenvalues do not ascend: sort them together with the columns of the eigenvectors."
+            "the eigenvalues do not ascend: sort them together with the columns of the eigenvectors."
         )
     vectors = np.where(areas[:, None] > 0, vectors, 0)
     deviation = np.abs(vectors.T @ (areas[:, None] * vectors) - np.eye(k)).max()
     if deviation > _ORTHONORMALITY_TOLERANCE:
         raise InputError(
-            f"{name}: the eigenvectors are not orthonormal with respect to the vertex areas (deviation "
+            "the eigenvectors are not orthonormal with respect to the vertex areas (deviation "
             f"{deviation:.2g}): give the lumped mass matrix with which the eigenvectors were computed, in "
             "the same unit of length."
         )
-    arrays = np.maximum(values, 0) * total, vectors * np.sqrt(total), areas / total, areas > 0
-    return Spectrum(*map(jax.device_put, arrays))
 
 
-def _parts(shape: SpectrumLike, name: str) -> tuple[Any, Any, Any]:
+def _parts(shape: SpectrumLike) -> tuple[Any, Any, Any]:
     """Return the eigenvalues, eigenvectors and vertex areas from a shape object of another library."""
     if hasattr(shape, "eigenvectors") and hasattr(shape, "vertex_areas"):
         if shape.eigenvectors is None:
-            raise InputError(f"{name}: the shape has no eigenvectors yet: call its method process first.")
+            raise InputError("the shape has no eigenvectors yet: call its method process first.")
         return shape.eigenvalues, shape.eigenvectors, shape.vertex_areas
     if hasattr(shape, "basis") and hasattr(shape, "laplacian"):
         return shape.basis.vals, shape.basis.vecs, shape.laplacian.mass_matrix
     raise InputError(
-        f"{name}: {type(shape).__name__} has no eigenbasis: give eigenvalues, eigenvectors and vertex areas, "
+        f"{type(shape).__name__} has no eigenbasis: give eigenvalues, eigenvectors and vertex areas, "
         "or a shape of pyFM or geomfum with an eigenbasis."
     )
 
 
-def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
+def _lumped(areas: Any, shape: tuple[int, ...]) -> Any:
     """Return vertex areas as a list. Those of a mass matrix (n, n) are the sums of its rows."""
     areas = to_host(areas)
     if hasattr(areas, "to_sparse_coo") and "sparse" in str(areas.layout):  # a sparse tensor of PyTorch
@@ -136,26 +141,24 @@ def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
         # The row sums of a malicious sparse matrix could fill the memory, so its shape is checked first.
         if sp.issparse(areas) and areas.shape != 2 * shape[:1]:
             raise InputError(
-                f"{name}: eigenvectors {shape} and a mass matrix {areas.shape} do not fit each "
+                f"eigenvectors {shape} and a mass matrix {areas.shape} do not fit each "
                 "other: for n vertices give an (n, n) matrix."
             )
         return np.asarray(areas.sum(axis=1)).ravel()
     return areas
 
 
-def _real(values: Any, what: str, name: str) -> np.ndarray:
+def _real(values: Any, what: str) -> np.ndarray:
     """Convert values to a float64 array of any shape, and check that all numbers are finite."""
     try:
         array = np.asarray(to_host(values))
     except (TypeError, ValueError, RuntimeError):
         array = np.asarray(None)
     if array.dtype.kind not in "iuf":
-        raise InputError(
-            f"{name}: the {what} are not an array of real numbers: convert them to an array of floats."
-        )
+        raise InputError(f"the {what} are not an array of real numbers: convert them to an array of floats.")
     array = array.astype(np.float64)
     if not np.isfinite(array).all():
-        raise InputError(f"{name}: the {what} are not all finite: compute them again.")
+        raise InputError(f"the {what} are not all finite: compute them again.")
     return array
 
 
@@ -313,7 +316,8 @@ def write_functional_map(
     **Raises:** `InputError` for another suffix, entries that are not finite real numbers, or a file that
     cannot be written.
     """
-    matrix = _real(functional_map, "entries", "functional map")
+    with naming("functional map"):
+        matrix = _real(functional_map, "entries")
     if not is_mat_file(path):
         raise InputError(f"{path}: functional maps are written as .mat: choose a name that ends in .mat.")
     write_variables(path, {FUNCTIONAL_MAP: matrix})
