@@ -350,7 +350,7 @@ def test_pairs_are_matched_as_by_match(three, one_by_one):
 
 
 @pytest.mark.parametrize(
-    "preset", ["paper", pytest.param(Preset(PRESETS["accurate"].stages[1:2]), marks=pytest.mark.slow)]
+    "preset", ["paper", pytest.param(Preset(PRESETS["accurate"].stages[1:2]), marks=pytest.mark.sampled)]
 )
 def test_batches_give_the_same_maps(three, one_by_one, preset):
     if preset != "paper":

@@ -144,8 +144,8 @@ def test_results_are_reproducible_bit_for_bit(pair):
 
 
 @pytest.mark.parametrize("samples", [None, 200])
+@pytest.mark.usefixtures("no_programs")
 def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samples):
-    jax.clear_caches()
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=samples), mirror="no")
     # jax.log_compiles applies to this thread only, so compilation in another thread is not logged.
@@ -164,19 +164,19 @@ def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samp
     ],
     ids=["accurate", "fast", "large", "stopped"],
 )
+@pytest.mark.usefixtures("no_programs")
 def test_no_program_of_a_stage_is_compiled_twice(pair, preset, programs, compilations):
     """Refinement uses the programs that `match` compiles ahead of time."""
-    jax.clear_caches()
     match(*pair[:2], preset=preset, init="shot", mirror="no")
     assert compilations.count("jit(refine)") == programs
 
 
 @pytest.mark.sampled
+@pytest.mark.usefixtures("no_programs")
 def test_coarse_passes_share_one_program(pair, compilations):
     """The levels are an argument of the program, so only their number and the largest level matter."""
     accurate = PRESETS["accurate"]
     always = replace(accurate, repair=replace(accurate.repair, non_isometric=0.0, coarse_from=0.0))
-    jax.clear_caches()
     found = match(*pair[:2], preset=always, init="shot", mirror="no")
     assert len(accurate.repair.coarse_levels) == 2
     assert compilations.count("jit(refine)") == len(found.preset.stages) + 1
