@@ -372,8 +372,8 @@ def nearest_rows(
     def padded(rows: np.ndarray) -> Array:
         return jax.device_put(pad_rows(rows, padded_size(len(rows))))
 
-    found = compiled(nearest_neighbor)(padded(queries), padded(database), database_mask=padded(mask))
-    return np.asarray(found)[: len(queries)].astype(np.int64)
+    nearest = compiled(nearest_neighbor)(padded(queries), padded(database), database_mask=padded(mask))
+    return np.asarray(nearest)[: len(queries)].astype(np.int64)
 
 
 def nearest_points(
@@ -402,6 +402,6 @@ def nearest_points(
         rows,
         candidates,
     )
-    found = compiled(nearest_point_on_candidates)(*jax.device_put(padded))
-    nearest, weights = (np.asarray(values)[: len(queries)] for values in found)
+    points = compiled(nearest_point_on_candidates)(*jax.device_put(padded))
+    nearest, weights = (np.asarray(values)[: len(queries)] for values in points)
     return nearest.astype(np.int64), weights.astype(np.float64)
