@@ -300,8 +300,8 @@ def _warning(correspondence: Correspondence, *, landmarks: bool) -> str:
         f"distortion {correspondence.distortion:.3f}, reverses the orientation of {reversed_share:.0%} of "
         f"the source's area, and separates {cut_off_share:.0%} of the source's area by discontinuities. "
         f"Correct maps between poses of one body have distortions up to {settings.suspicious}. Correct maps "
-        "can have larger distortions between non-isometric shapes, with topological noise, or if one shape is "
-        "mirrored. "
+        "can have larger distortions between non-isometric shapes, with topological noise, or if one shape "
+        "is mirrored. "
         "Look at the map with the option --report or, in Python, with jaxsmw.report.summary.write_report. If "
         f"the map is wrong, {cure}."
     )
