@@ -1,7 +1,7 @@
 """Runs stages: pads the spectra of a pair, and runs one compiled program per stage, or batches of pairs.
 
-Only this module pads shapes, so that all shapes of similar sizes share compiled programs. All maps that go in
-and come out have one entry per vertex of X.
+Shapes of similar sizes are padded to one size, so that they share compiled programs. Only this module and
+`jaxsmw.runtime.batches` pad shapes. All maps that go in and come out have one entry per vertex of X.
 """
 
 from __future__ import annotations

@@ -200,7 +200,9 @@ def match_prepared(
             refine_and_repair(prepared, start, preset, outcome=outcome)
             for start, outcome in itertools.zip_longest(starts, outcomes)
         ]
-    successful = [pair for pair in zip(starts, repaired, strict=True) if pair[1].successful]
+    successful = [
+        (start, scored) for start, scored in zip(starts, repaired, strict=True) if scored.successful
+    ]
     start, scored = successful[0] if successful else (starts[0], repaired[0])
     if len(successful) > 1 and preset.repair is not None:
         with step("expected error"):
