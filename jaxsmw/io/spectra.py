@@ -7,7 +7,6 @@ attributes and does not import these libraries.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -182,7 +181,11 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
             bases = f"{len(structs)} eigenbases ({', '.join(structs)})" if structs else "no evals and evecs"
             raise InputError(f"{path}: contains {bases}: save a single struct with evals and evecs.")
         (struct,) = structs.values()
-        return make_spectrum(struct["evals"], struct["evecs"], _areas_of(struct, name), name=name)
+        areas = [struct[field] for field in ("A", "area") if field in struct]
+        areas = [values for values in areas if sp.issparse(values) or np.ndim(values)]
+        if not areas:
+            raise InputError(f"{name}: contains evecs but no areas: save the mass matrix as A.")
+        return make_spectrum(struct["evals"], struct["evecs"], areas[0], name=name)
     if Path(path).suffix.lower() != ".npz":
         raise InputError(
             f"{path}: spectra are read from .npz and .mat files: give a file of one of these types."
@@ -194,13 +197,6 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     if missing := [field for field in fields if field not in arrays]:
         raise InputError(f"{path}: lacks {', '.join(missing)}: write the spectrum again.")
     return make_spectrum(*(arrays[field] for field in fields), name=name)
-
-
-def _areas_of(struct: Mapping[str, Any], name: str) -> Any:
-    for field in ("A", "area"):
-        if field in struct and (sp.issparse(struct[field]) or np.ndim(struct[field])):
-            return struct[field]
-    raise InputError(f"{name}: contains evecs but no areas: save the mass matrix as A.")
 
 
 def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh | None = None) -> None:
