@@ -134,10 +134,9 @@ def write_match_report(
     """Write the report of a match to a directory; its summary contains the options of the command."""
     from jaxsmw.report.summary import write_report
 
-    report_progress("report ...")
     settings = {**vars(options), "init": options.init.text, "preset": preset_name(options)}
     del settings["run"]
-    with stopwatch.step("report"):
+    with stopwatch.step("report", announced=True):
         written = write_report(
             directory,
             correspondence,
