@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Float64
 from numpy.typing import ArrayLike
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError, naming
+from jaxsmw.errors import InputError, check_suffix, naming
 from jaxsmw.geometry.mesh import Mesh, to_host
 from jaxsmw.io.formats.mat import (
     FUNCTIONAL_MAP,
@@ -29,6 +29,9 @@ from jaxsmw.io.formats.mat import (
 )
 from jaxsmw.io.formats.npz import read_arrays
 from jaxsmw.runtime.files import atomic_write, read_bytes
+
+SPECTRUM_SUFFIXES = (".npz", ".mat")
+"""The suffixes of files with a spectrum."""
 
 # The docstring of `make_spectrum` lists the accepted objects.
 SpectrumLike: TypeAlias = Any
@@ -235,8 +238,8 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
             f"{path}: the spectrum has {len(areas)} vertices, but {mesh.name} has {len(mesh.vertices)}: "
             "give the mesh of this spectrum."
         )
+    check_suffix(path, "spectra", *SPECTRUM_SUFFIXES)
     if not is_mat_file(path):
-        check_spectrum_path(path)
         with atomic_write(path) as temporary:
             np.savez(temporary, eigenvalues=values, eigenvectors=vectors, vertex_areas=areas)
         return
@@ -254,14 +257,6 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
         surface = dict(zip("XYZ", position.T, strict=True)) | {"TRIV": mesh.faces + 1.0}
         struct |= {"nf": float(len(mesh.faces)), "surface": surface}
     write_variables(path, {"S": struct})
-
-
-def check_spectrum_path(path: str | os.PathLike[str]) -> None:
-    """Refuse a file name that ends neither in `.npz` nor in `.mat`."""
-    if Path(path).suffix.lower() != ".npz" and not is_mat_file(path):
-        raise InputError(
-            f"{path}: spectra are written as .npz or .mat: choose a name that ends in one of these."
-        )
 
 
 def read_functional_map(
@@ -314,6 +309,5 @@ def write_functional_map(
     """
     with naming("functional map"):
         matrix = _real(functional_map, "entries")
-    if not is_mat_file(path):
-        raise InputError(f"{path}: functional maps are written as .mat: choose a name that ends in .mat.")
+    check_suffix(path, "functional maps", ".mat")
     write_variables(path, {FUNCTIONAL_MAP: matrix})
