@@ -236,6 +236,19 @@ def make_one_parser() -> Iterator[None]:
 def forget_programs() -> Iterator[None]:
     """Release compiled programs after each test module, because the programs of all tests take gigabytes."""
     yield
+    _release_programs()
+
+
+@pytest.fixture
+def no_programs() -> None:
+    """Release all programs before a test that counts compilations."""
+    _release_programs()
+
+
+def _release_programs() -> None:
+    from jaxsmw.runtime import compilation
+
+    compilation._compiled.cache_clear()
     jax.clear_caches()
 
 

@@ -152,6 +152,7 @@ def measure(data, task, settings):
 """
 
 
+@pytest.mark.sampled
 def test_only_missing_measurements_run_after_a_kill(tmp_path):
     log, results = tmp_path / "log", tmp_path / "results.csv"
     (tmp_path / "study.py").write_text(STUDY.format(scripts=str(SCRIPTS), here=str(tmp_path)))

@@ -30,7 +30,6 @@ from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching import preparation
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.executor import reverse_map
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import describe, paired_spectra
@@ -145,8 +144,8 @@ def test_results_are_reproducible_bit_for_bit(pair):
 
 
 @pytest.mark.parametrize("samples", [None, 200])
+@pytest.mark.usefixtures("no_programs")
 def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samples):
-    jax.clear_caches()
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=samples), mirror="no")
     # jax.log_compiles applies to this thread only, so compilation in another thread is not logged.
@@ -165,19 +164,19 @@ def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samp
     ],
     ids=["accurate", "fast", "large", "stopped"],
 )
+@pytest.mark.usefixtures("no_programs")
 def test_no_program_of_a_stage_is_compiled_twice(pair, preset, programs, compilations):
     """Refinement uses the programs that `match` compiles ahead of time."""
-    jax.clear_caches()
     match(*pair[:2], preset=preset, init="shot", mirror="no")
     assert compilations.count("jit(refine)") == programs
 
 
 @pytest.mark.sampled
+@pytest.mark.usefixtures("no_programs")
 def test_coarse_passes_share_one_program(pair, compilations):
     """The levels are an argument of the program, so only their number and the largest level matter."""
     accurate = PRESETS["accurate"]
     always = replace(accurate, repair=replace(accurate.repair, non_isometric=0.0, coarse_from=0.0))
-    jax.clear_caches()
     found = match(*pair[:2], preset=always, init="shot", mirror="no")
     assert len(accurate.repair.coarse_levels) == 2
     assert compilations.count("jit(refine)") == len(found.preset.stages) + 1
@@ -194,7 +193,7 @@ def test_the_reverse_map_of_registration_compares_all_columns():
     queries, database = (np.asarray(points) for points in found._embeddings())
     assert database.shape[1] > found.functional_map.shape[0]
     with found._precision():
-        reverse = reverse_map(found._refiner, found._spectra, found.refinement.state)
+        reverse = found._last.reverse_map()
     _, nearest = KDTree(queries[found.mesh_x.referenced_vertices]).query(database)
     expected = np.flatnonzero(found.mesh_x.referenced_vertices)[nearest]
     agree = reverse == expected
@@ -217,7 +216,7 @@ def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, search):
     points = [np.asarray(p) for p in found._embeddings()]
     # Registration also compares columns that are not eigenvectors.
     assert (points[1].shape[1] > found.functional_map.shape[0]) == (refiner is Registration)
-    reverse = reverse_map(found._refiner, found._spectra, found.refinement.state)
+    reverse = found._last.reverse_map()
     np.testing.assert_array_equal(found.pointwise_map, KDTree(points[1]).query(points[0])[1])
     np.testing.assert_array_equal(reverse, KDTree(points[0]).query(points[1])[1])
 

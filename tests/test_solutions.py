@@ -129,7 +129,7 @@ def test_quadratic_objectives_are_minimised_exactly(pair, pointwise_map, descrip
 
 
 @pytest.mark.parametrize("norm", ["area", "frobenius"])
-@pytest.mark.parametrize("convention", ["pullback", "pushforward"])
+@pytest.mark.parametrize("convention", first_always(["pullback", "pushforward"]))
 def test_wavelets_alone_give_the_closed_form(pair, pointwise_map, norm, convention):
     options = {"convention": convention}
     exact, _ = solve(LeastSquares(norm), pair, pointwise_map, **options)
@@ -367,7 +367,7 @@ def test_an_invalid_weight_is_reported_also_in_a_batch(pair, pointwise_map):
         assert (jax.jit(result)(weight) == RESULTS.successful) == fine
 
 
-@pytest.mark.parametrize("operators", [False, True])
+@pytest.mark.parametrize("operators", first_always([True, False]))
 def test_nan_in_descriptors_is_reported(pair, pointwise_map, operators):
     x, y = pair
     values = np.random.default_rng(0).normal(size=(M, D))

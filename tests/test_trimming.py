@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 from sampled_cases import first_always
@@ -168,12 +167,12 @@ def test_full_shapes_and_parts_of_similar_area_are_not_trimmed(pose, part):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_programs")
 def test_all_trims_share_one_program_that_is_compiled_ahead(pose, part, compilations):
     _, target, truth = pose
     twice = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=2))
-    jax.clear_caches()
     found = match(part, target, partial=True, preset=twice, init=rough(target, truth))
-    assert len(found.preset.judged) == 2
+    assert len(found.preset.before_final) == 2
     assert compilations.count("jit(refine)") == 3
 
 

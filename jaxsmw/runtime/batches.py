@@ -15,7 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, Int32, Shaped
 
-from jaxsmw.core.checks import check_pointwise_map
+from jaxsmw.core.checks import check_matches
 from jaxsmw.core.refinement import Refinement, RefineSettings, refine
 from jaxsmw.core.search import BLOCK, queries_per_block
 from jaxsmw.core.spectrum import Spectrum
@@ -193,7 +193,7 @@ def _check_pairs(
                 f"pair {position} is {tuple(pair)}, but there are {len(spectra)} shapes: give the indices of "
                 "two shapes, counted from 0"
             )
-        check_pointwise_map(f"initial map of pair {position}", pointwise_map, len(spectra[pair[0]].mask))
+        check_matches(f"initial map of pair {position}", pointwise_map, len(spectra[pair[0]].mask))
 
 
 class _Sizes(NamedTuple):
@@ -262,12 +262,12 @@ def _take(tree: Tree, places: Int[Array, " batch"], mesh: Mesh) -> Tree:
 
 
 def _refine_batch(batch: _Batch, mesh: Mesh, settings: RefineSettings) -> Refinement:
-    def one(pair: _Batch) -> Refinement:
+    def refine_pair(pair: _Batch) -> Refinement:
         (spectrum_x, samples_x), (spectrum_y, samples_y), initial_map = pair
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
         return refine(spectrum_x, spectrum_y, initial_map, samples=samples, **settings)
 
-    each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
+    each = partial(lax.map, refine_pair) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(refine_pair)
     if mesh.size == 1:
         return each(batch)
     # `shard_map` is not used, because the solvers of optimistix do not run within it. The compiler still

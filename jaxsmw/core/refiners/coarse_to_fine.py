@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import operator
 from collections.abc import Iterable
 from typing import Generic, TypeVar, get_args
@@ -25,12 +26,9 @@ def _whole_numbers(levels: Iterable[int]) -> tuple[int, ...]:
 
 
 class CoarseToFineState(State):
-    """The state of a coarse-to-fine refiner.
+    """The state of a coarse-to-fine refiner in the iteration of a number, counted from 0.
 
-    **Attributes:**
-
-    - `iteration`: the number of the iteration, counted from 0.
-    - `reverse_map`: the map Y -> X, for each vertex of Y to be matched, if `recover_both` has added it.
+    `recover_both` adds the `reverse_map` Y -> X, for each vertex of Y to be matched.
     """
 
     iteration: Int32[Array, ""]
@@ -73,11 +71,12 @@ class CoarseToFine(Refiner[PreparedT, CoarseStateT], Generic[PreparedT, CoarseSt
         """Always True."""
         return True
 
-    def with_traced_levels(self) -> CoarseToFine[PreparedT, CoarseStateT]:
-        """Return the refiner with an array of levels, which JAX traces.
+    def with_levels(self, levels: tuple[int, ...]) -> CoarseToFine[PreparedT, CoarseStateT]:
+        """Return the refiner with other levels."""
+        return dataclasses.replace(self, levels=levels)
 
-        Refiners with the same number of levels then share a compiled program.
-        """
+    def with_traced_levels(self) -> CoarseToFine[PreparedT, CoarseStateT]:
+        """Return the refiner with levels as an array."""
         return eqx.tree_at(lambda refiner: refiner.levels, self, np.array(self.levels, np.int32))
 
     def active_eigenvectors(

@@ -15,7 +15,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, shot_descriptors
-from jaxsmw.matching.executor import SpectralPair, Start, reverse_map, run
+from jaxsmw.matching.executor import SpectralPair, Start, run
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import principal_components
 from jaxsmw.matching.search.proxies import Proxy, distance_error
@@ -108,9 +108,9 @@ class Hands:
         shot = _shot(shape, _ASYMMETRY_RADII)
         # All descriptors have the same norm, so the nearest descriptor has the largest inner product.
         mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
-        found = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
-        random = np.random.default_rng(0).permutation(len(found))
-        return distance_error(shape, shape, found) / distance_error(shape, shape, random)
+        matches = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
+        random = np.random.default_rng(0).permutation(len(matches))
+        return distance_error(shape, shape, matches) / distance_error(shape, shape, random)
 
     def evidence(self) -> float:
         """Compare a coarse map of X with a coarse map of the mirror image of X.
@@ -165,9 +165,8 @@ class Hands:
         **Returns:** The refined map (s,) and its reverse map (t,).
         """
         spectra = SpectralPair(x.shape.sampled_spectrum(x.components), y.shape.sampled_spectrum(y.components))
-        (found,) = run([_STAGE], spectra, [Start(_nearest(x.shot, y.shot))])
-        seen = spectra.seen_by(_STAGE)
-        return found.pointwise_map, reverse_map(_STAGE.refiner, seen, found.last.state)
+        outcome = run([_STAGE], spectra, Start(_nearest(x.shot, y.shot)))
+        return outcome.pointwise_map, outcome.last.reverse_map()
 
 
 def _proxy(argument: tuple[Mesh, Spectrum]) -> Proxy:

@@ -27,7 +27,6 @@ def refine_and_repair(
     preset: Preset,
     *,
     outcome: Outcome | None = None,
-    history: bool = False,
 ) -> Scored:
     """Run the first and the repeated stages of a preset from a start, and repair a map that looks wrong.
 
@@ -43,18 +42,17 @@ def refine_and_repair(
     - `start`: the initial map.
     - `preset`: the stages and the repair. Without repair, the outcome is judged but not repaired.
     - `outcome`: the outcome of the stages if they have already run, such as a result of `run_batches`.
-    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Raises:** `InputError` if alternative maps cannot be computed.
     """
-    judge, repair = _judge(prepared, preset.judged, preset), preset.repair
+    judge, repair = _judge(prepared, preset.before_final, preset), preset.repair
     if outcome is None:
-        (outcome,) = run(preset.judged, prepared.spectra, [start], history=history)
+        outcome = run(preset.before_final, prepared.spectra, start)
     best = judge.judged(outcome)
     if repair is None or not best.successful:
         return best
-    repeater = _Repeater(prepared.spectra, preset.repeated, judge, history)
-    has_alternatives = start.origin == "shot" and repair.finalists > 0
+    repeater = _Repeater(prepared.spectra, preset.repeated, judge)
+    has_alternatives = start.has_alternatives and repair.finalists > 0
     compares = has_alternatives and not prepared.pair.partial
     if best.suspicious:
         logger.info(
@@ -73,8 +71,8 @@ def refine_and_repair(
     proxies = Alternatives(prepared, repair)
     judge = replace(judge, measure_deformation=proxies.deformation)
     repeater, usual = replace(repeater, judge=judge), best.pointwise_map
-    found = proxies.best(usual, only_better=not best.suspicious)
-    best = repeater.repaired([judge.measured(best.outcome, suspicious=best.suspicious)], found)
+    alternatives = proxies.best(usual, only_better=not best.suspicious)
+    best = repeater.repaired([judge.measured(best.outcome, suspicious=best.suspicious)], alternatives)
     tries_again = best.suspicious and proxies.has_creases and not prepared.pair.partial
     # Between shapes that differ more, crease eigenvectors make some maps worse. (Table R45)
     if tries_again and judge.area_change(best) < repair.non_isometric:
@@ -84,9 +82,7 @@ def refine_and_repair(
     return replace(best, rivals=proxies.different(best, best.rivals))
 
 
-def refine_further(
-    prepared: PreparedPair, origin: str, preset: Preset, scored: Scored, *, history: bool = False
-) -> Scored:
+def refine_further(prepared: PreparedPair, start: Start, preset: Preset, scored: Scored) -> Scored:
     """Run further passes for non-isometric shapes, because their maps converge slowly.
 
     docs/how_it_works.md explains the passes, which also run from the `rivals` of the map.
@@ -94,10 +90,9 @@ def refine_further(
     **Arguments:**
 
     - `prepared`: the prepared pair.
-    - `origin`: the origin of the initial map; see `Start`.
+    - `start`: the initial map.
     - `preset`: the stages and the repair. Without repair, no pass runs.
     - `scored`: a result of `refine_and_repair`.
-    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
     **Returns:** The map after the last pass, as suspicious as the given map. The given map is returned if no
     pass runs, if a pass fails, or if the passes worsen the score by more than `pass_tolerance`.
@@ -105,14 +100,14 @@ def refine_further(
     repair = preset.repair
     if repair is None or not scored.successful:
         return scored
-    judge = _judge(prepared, preset.judged, preset)
+    judge = _judge(prepared, preset.before_final, preset)
     change = judge.area_change(scored)
     # Rigidly aligned full shapes differ in form, not in pose. Coarse passes lower the errors of such pairs
     # even if the area-based shape difference is small. (Entry R24)
-    aligned = origin == "aligned" and not prepared.pair.partial
+    aligned = start.is_rigid and not prepared.pair.partial
     if change < repair.non_isometric and not aligned:
         return scored
-    repeater = _Repeater(prepared.spectra, preset.repeated, judge, history)
+    repeater = _Repeater(prepared.spectra, preset.repeated, judge)
     if change >= repair.without_creases_from:
         repeater = replace(repeater, spectra=_without_creases(repeater.spectra))
     passes = [repeater] * repair.passes
@@ -142,19 +137,16 @@ def refine_further(
     return replace(after, suspicious=scored.suspicious)
 
 
-def finish(
-    prepared: PreparedPair, origin: str, preset: Preset, scored: Scored, *, history: bool = False
-) -> Scored:
+def finish(prepared: PreparedPair, start: Start, preset: Preset, scored: Scored) -> Scored:
     """Refine a map further, and run the final stages of the preset; see `refine_further`.
 
     **Returns:** The map after the last stage, with its distortion. The attribute `suspicious` is copied from
     the given map.
     """
-    scored = refine_further(prepared, origin, preset, scored, history=history)
+    scored = refine_further(prepared, start, preset, scored)
     if not (preset.final and scored.successful):
         return scored
-    start = Start(scored.pointwise_map)
-    (after,) = run(preset.final, prepared.spectra, [start], history=history)
+    after = run(preset.final, prepared.spectra, Start(scored.pointwise_map))
     outcome = scored.outcome.followed_by(after)
     return _judge(prepared, preset.final, preset).measured(outcome, suspicious=scored.suspicious)
 
@@ -183,7 +175,6 @@ class _Repeater:
     spectra: SpectralPair
     stages: tuple[Stage, ...]
     judge: Judge
-    history: bool
 
     def coarse(self, levels: tuple[int, ...]) -> _Repeater:
         """Return a repeater whose last stage has the given levels."""
@@ -193,9 +184,9 @@ class _Repeater:
     def repeated(self, outcome: Outcome, excluded: Bool[np.ndarray, " m"] | None = None) -> Outcome:
         """Run the repeated stages from the map of an outcome, without a mask of vertices of X (m,)."""
         start = Start(outcome.pointwise_map, excluded=excluded)
-        (again,) = run(self.stages, self.spectra, [start], history=self.history)
-        first = max(0, len(outcome.refinements) - len(self.stages))
-        return Outcome(outcome.initial_map, outcome.refinements[:first]).followed_by(again)
+        again = run(self.stages, self.spectra, start)
+        first = max(0, len(outcome.runs) - len(self.stages))
+        return Outcome(outcome.initial_map, outcome.runs[:first]).followed_by(again)
 
     def repaired(
         self, known: Sequence[Scored], alternatives: Iterable[Int64[np.ndarray, " m"]] = ()
