@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from numbers import Integral, Real
+from os import PathLike
+from pathlib import Path
 from typing import Any, get_args
 
 
@@ -26,6 +28,13 @@ def naming(name: object) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
+
+
+def check_suffix(path: str | PathLike[str], what: str, *suffixes: str) -> None:
+    """Refuse a file name that has none of the suffixes, in upper or lower case. `what` is a plural noun."""
+    if Path(path).suffix.lower() not in suffixes:
+        listed = " or ".join(filter(None, (", ".join(suffixes[:-1]), suffixes[-1])))
+        raise InputError(f"{path}: {what} are written as {listed}: choose a name that ends in {listed}.")
 
 
 def check_choice(value: object, choices: Any, kind: str) -> None:

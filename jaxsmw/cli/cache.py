@@ -13,9 +13,7 @@ HELP = "show or clear the cache of spectra, descriptors and programs"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument(
-        "--clear",
-        action="store_true",
-        help="remove everything in the cache; later commands compute it again",
+        "--clear", action="store_true", help="remove everything in the cache; later commands compute it again"
     )
 
 

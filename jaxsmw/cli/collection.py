@@ -10,14 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, EDGES_PER_SHAPE, MirrorCollection, PresetName
-from jaxsmw.cli.arguments import (
-    add_paths,
-    add_processes,
-    add_seed,
-    add_weld,
-    path,
-    whole_number,
-)
+from jaxsmw.cli.arguments import add_paths, add_processes, add_seed, add_weld, path, whole_number
 from jaxsmw.cli.collection_inputs import Meshes, check_collection, read_collection
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children

@@ -95,8 +95,10 @@ class Stopwatch:
         self._seconds: dict[str, float] = {}
 
     @contextmanager
-    def step(self, name: str) -> Iterator[None]:
+    def step(self, name: str, *, announced: bool = False) -> Iterator[None]:
         """Record the time of the block as a step. Times of several steps with one name are added up."""
+        if announced:
+            report_progress(f"{name} ...")
         began = time.perf_counter()
         yield
         self.add({name: time.perf_counter() - began})

@@ -64,8 +64,7 @@ def run(options: argparse.Namespace) -> None:
         write_pointwise_map(found_map, correspondence.pointwise_map)
     report_written(source, target, true_points, found_map)
     maps = {"initial": correspondence.initial_map, "refined": correspondence.pointwise_map}
-    report_progress("geodesic errors ...")
-    with stopwatch.step("geodesic errors"):
+    with stopwatch.step("geodesic errors", announced=True):
         errors = {name: geodesic_error(pair.target, vertices, truth) for name, vertices in maps.items()}
     estimate_error(correspondence, stopwatch)
     write_match_report(options.output, correspondence, errors, options, stopwatch, up="y")

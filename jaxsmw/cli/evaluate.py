@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 
 from jaxsmw.cli.arguments import (
     MAP_FORMS,
@@ -20,7 +19,7 @@ from jaxsmw.cli.console import show
 from jaxsmw.cli.inputs import check_inputs, read_maps, read_meshes, read_truth
 from jaxsmw.cli.measurement import add_evaluation, add_ground_truth, check_evaluation, measure_errors
 from jaxsmw.cli.outputs import check_outputs, write_comparison_page, write_figure, write_text
-from jaxsmw.errors import InputError
+from jaxsmw.errors import check_suffix
 
 HELP = "measure the geodesic errors of maps against the ground truth"
 
@@ -52,8 +51,8 @@ def run(options: argparse.Namespace) -> None:
     inputs = [options.source, options.target, *options.map, *options.ground_truth]
     check_inputs(*inputs)
     check_outputs(inputs, files=[options.output], figures=[options.figure], pages=[options.page])
-    if options.output and Path(options.output).suffix.lower() != ".json":
-        raise InputError(f"{options.output}: errors are written as JSON: choose a name that ends in .json.")
+    if options.output:
+        check_suffix(options.output, "errors", ".json")
     mesh_x, mesh_y = read_meshes(options.source, options.target, weld=options.weld)
     truth = read_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
     maps = read_maps(options.map, mesh_x, mesh_y, index_base=options.index_base)

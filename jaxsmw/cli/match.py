@@ -154,8 +154,7 @@ def _write_files(
         write_pointwise_map(options.output, correspondence.pointwise_map)
     report_written(options.output)
     if options.one_to_one:
-        report_progress("one-to-one map ...")
-        with stopwatch.step("one-to-one map"):
+        with stopwatch.step("one-to-one map", announced=True):
             maps["one-to-one"] = one_to_one = correspondence.one_to_one()
             write_pointwise_map(options.one_to_one, one_to_one)
         report_written(options.one_to_one)

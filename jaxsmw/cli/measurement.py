@@ -92,8 +92,7 @@ def estimate_error(correspondence: Correspondence, stopwatch: Stopwatch) -> Floa
 
     The correspondence keeps the result, so the time of the first call is the time of the step.
     """
-    report_progress("expected error ...")
-    with stopwatch.step("expected error"):
+    with stopwatch.step("expected error", announced=True):
         return correspondence.expected_error()
 
 

@@ -169,10 +169,7 @@ def _changes(options: argparse.Namespace) -> list[str]:
 
 
 def match_meshes(
-    options: argparse.Namespace,
-    mesh_x: Mesh,
-    mesh_y: Mesh,
-    stopwatch: Stopwatch,
+    options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh, stopwatch: Stopwatch
 ) -> Correspondence:
     """Match two meshes with the options of a command, and print their scale and hand if unknown.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from jaxsmw.cli.console import Stopwatch, report_progress
 from jaxsmw.cli.method import preset_name
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_suffix
 from jaxsmw.runtime.files import atomic_write, check_directory, check_writable
 
 if TYPE_CHECKING:
@@ -63,8 +63,7 @@ def check_outputs(
     for path in figures:
         check_figure_path(path)
     for path in pages:
-        if not is_page(path):
-            raise InputError(f"{path}: pages are written as .html: choose a name that ends in .html.")
+        check_suffix(path, "pages", *_PAGES)
         check_writable(path)
     for path, _ in directories:
         check_directory(path)
@@ -95,7 +94,10 @@ def _refuse_place(path: str, read: set[str], taken: set[str]) -> None:
 
 def is_page(path: str) -> bool:
     """Return whether a file name has the suffix of an HTML page."""
-    return Path(path).suffix.lower() in (".html", ".htm")
+    return Path(path).suffix.lower() in _PAGES
+
+
+_PAGES = (".html", ".htm")
 
 
 def report_written(*paths: str | os.PathLike[str]) -> None:
@@ -134,10 +136,9 @@ def write_match_report(
     """Write the report of a match to a directory; its summary contains the options of the command."""
     from jaxsmw.report.summary import write_report
 
-    report_progress("report ...")
     settings = {**vars(options), "init": options.init.text, "preset": preset_name(options)}
     del settings["run"]
-    with stopwatch.step("report"):
+    with stopwatch.step("report", announced=True):
         written = write_report(
             directory,
             correspondence,

@@ -10,6 +10,7 @@ from jaxsmw.cli.banks import add_bank, make_bank
 from jaxsmw.cli.console import show
 from jaxsmw.cli.inputs import check_inputs
 from jaxsmw.cli.outputs import check_outputs, report_written, write_figure
+from jaxsmw.errors import check_suffix
 
 HELP = "describe a mesh and compute its eigenbasis"
 
@@ -47,9 +48,9 @@ def run(options: argparse.Namespace) -> None:
     check_inputs(options.mesh)
     check_outputs([options.mesh], files=[options.output], figures=[options.figure])
     if options.output:
-        from jaxsmw.io.spectra import check_spectrum_path
+        from jaxsmw.io.spectra import SPECTRUM_SUFFIXES
 
-        check_spectrum_path(options.output)
+        check_suffix(options.output, "spectra", *SPECTRUM_SUFFIXES)
     bank = make_bank(options.bank, options.filters)
     from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
     from jaxsmw.geometry.laplacian import choose_laplacian

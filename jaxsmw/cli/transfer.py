@@ -226,9 +226,8 @@ def _register(
     stiffness = options.stiffness or DEFAULT_STIFFNESS
     if not options.map:
         correspondence = match_meshes(options, *meshes, stopwatch)
-        report_progress("registered mesh and expected error ...")
         with (
-            stopwatch.step("registered mesh and expected error"),
+            stopwatch.step("registered mesh and expected error", announced=True),
             one_blas_thread(),
             ThreadPoolExecutor(1) as executor,
         ):
@@ -236,8 +235,7 @@ def _register(
             registered = correspondence.registered_mesh(stiffness=stiffness)
             expected.result()
             return correspondence, registered
-    report_progress("registered mesh ...")
-    with stopwatch.step("registered mesh"):
+    with stopwatch.step("registered mesh", announced=True):
         (pointwise_map,) = read_maps([options.map], *meshes, index_base=index_base).values()
         pair = Pair.make(*meshes, partial=options.partial, scale=options.scale or 1.0)
         scale = pair.scale if pair.partial else None
@@ -297,8 +295,7 @@ def _write_meshes(
     if options.registered:
         _write(options.registered, registered_data(source, registered), stopwatch)
     if options.attributes:
-        report_progress("attributes ...")
-        with stopwatch.step("attributes"):
+        with stopwatch.step("attributes", announced=True):
             carried = transfer_attributes(source, registered, target)
         for note in carried.mesh.notes[len(target.mesh.notes) :]:
             say(f"note: {note}")

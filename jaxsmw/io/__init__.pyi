@@ -1,12 +1,5 @@
 from .landmark_files import read_landmark_file, write_landmark_file
-from .landmarks import (
-    FrameDistances,
-    LandmarkMatch,
-    Landmarks,
-    check_frame,
-    find_frame,
-    match_landmarks,
-)
+from .landmarks import FrameDistances, LandmarkMatch, Landmarks, check_frame, find_frame, match_landmarks
 from .maps import read_landmarks, read_pointwise_map, write_pointwise_map
 from .mesh_data import MeshData, Skin, Texture
 from .meshes import read_mesh, read_mesh_data, write_mesh, write_mesh_data

@@ -14,13 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxsmw.errors import InputError, naming
-from jaxsmw.io.formats.landmark_tables import (
-    format_csv,
-    format_fcsv,
-    format_txt,
-    parse_fcsv,
-    parse_table,
-)
+from jaxsmw.io.formats.landmark_tables import format_csv, format_fcsv, format_txt, parse_fcsv, parse_table
 from jaxsmw.io.formats.landmark_xml import format_picked_points, parse_picked_points, parse_point_set
 from jaxsmw.io.formats.markups import format_markups, parse_markups
 from jaxsmw.io.landmarks import Landmarks, check_count

@@ -43,7 +43,7 @@ from jaxsmw.io.formats.polygons import Formatted, Polygons, texture_or_note, tri
 from jaxsmw.io.formats.stl import format_stl, parse_stl
 from jaxsmw.io.formats.vtk import format_vtk, parse_vtk
 from jaxsmw.io.formats.vtp import format_vtp, parse_vtp
-from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, Texture, checked_texture
+from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, checked_texture
 from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
 
@@ -158,8 +158,15 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
         at, polygon = triangles_of(polygons.sizes, is_strip)
         faces = polygons.corners[at]
         notes = [*polygons.notes, *_notes(polygons.sizes[~is_strip], polygons.lines, len(faces))]
-        texture, lost = texture_or_note(lambda: _texture_at(polygons, at))
-    face_data = {name: _repeated(values, polygon) for name, values in polygons.face_data.items()}
+        of_corners = polygons.texture
+        texture, lost = texture_or_note(
+            lambda: of_corners and checked_texture((of_corners[0], of_corners[1][at]), len(at))
+        )
+    # `MeshData` refuses arrays that are too short.
+    face_data = {
+        name: values[polygon] if values.ndim and len(values) > polygon.max(initial=-1) else values
+        for name, values in polygons.face_data.items()
+    }
     if len(faces) or not len(polygons.vertices):
         mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
     else:
@@ -202,19 +209,6 @@ def _notes(sizes: Int64[np.ndarray, " f"], lines: int, triangles: int) -> list[s
     if large:
         notes.append(f"{count_of(large, 'face')} with more than three corners split into triangles.")
     return notes
-
-
-def _texture_at(polygons: Polygons, at: Int64[np.ndarray, "t 3"]) -> Texture | None:
-    if polygons.texture is None:
-        return None
-    coordinates, corners = polygons.texture
-    return checked_texture((coordinates, corners[at]), len(at))
-
-
-def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarray:
-    """Return the data of the polygon of each triangle. `MeshData` refuses arrays that are too short."""
-    too_short = values.ndim == 0 or len(values) <= polygon.max(initial=-1)
-    return values if too_short else values[polygon]
 
 
 def check_mesh_suffix(path: str | os.PathLike[str]) -> None:

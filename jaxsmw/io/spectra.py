@@ -7,7 +7,6 @@ attributes and does not import these libraries.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,7 +17,7 @@ from jaxtyping import Array, Float, Float64
 from numpy.typing import ArrayLike
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError, naming
+from jaxsmw.errors import InputError, check_suffix, naming
 from jaxsmw.geometry.mesh import Mesh, to_host
 from jaxsmw.io.formats.mat import (
     FUNCTIONAL_MAP,
@@ -30,6 +29,9 @@ from jaxsmw.io.formats.mat import (
 )
 from jaxsmw.io.formats.npz import read_arrays
 from jaxsmw.runtime.files import atomic_write, read_bytes
+
+SPECTRUM_SUFFIXES = (".npz", ".mat")
+"""The suffixes of files with a spectrum."""
 
 # The docstring of `make_spectrum` lists the accepted objects.
 SpectrumLike: TypeAlias = Any
@@ -182,7 +184,11 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
             bases = f"{len(structs)} eigenbases ({', '.join(structs)})" if structs else "no evals and evecs"
             raise InputError(f"{path}: contains {bases}: save a single struct with evals and evecs.")
         (struct,) = structs.values()
-        return make_spectrum(struct["evals"], struct["evecs"], _areas_of(struct, name), name=name)
+        areas = [struct[field] for field in ("A", "area") if field in struct]
+        areas = [values for values in areas if sp.issparse(values) or np.ndim(values)]
+        if not areas:
+            raise InputError(f"{name}: contains evecs but no areas: save the mass matrix as A.")
+        return make_spectrum(struct["evals"], struct["evecs"], areas[0], name=name)
     if Path(path).suffix.lower() != ".npz":
         raise InputError(
             f"{path}: spectra are read from .npz and .mat files: give a file of one of these types."
@@ -194,13 +200,6 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     if missing := [field for field in fields if field not in arrays]:
         raise InputError(f"{path}: lacks {', '.join(missing)}: write the spectrum again.")
     return make_spectrum(*(arrays[field] for field in fields), name=name)
-
-
-def _areas_of(struct: Mapping[str, Any], name: str) -> Any:
-    for field in ("A", "area"):
-        if field in struct and (sp.issparse(struct[field]) or np.ndim(struct[field])):
-            return struct[field]
-    raise InputError(f"{name}: contains evecs but no areas: save the mass matrix as A.")
 
 
 def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh | None = None) -> None:
@@ -239,8 +238,8 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
             f"{path}: the spectrum has {len(areas)} vertices, but {mesh.name} has {len(mesh.vertices)}: "
             "give the mesh of this spectrum."
         )
+    check_suffix(path, "spectra", *SPECTRUM_SUFFIXES)
     if not is_mat_file(path):
-        check_spectrum_path(path)
         with atomic_write(path) as temporary:
             np.savez(temporary, eigenvalues=values, eigenvectors=vectors, vertex_areas=areas)
         return
@@ -258,14 +257,6 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
         surface = dict(zip("XYZ", position.T, strict=True)) | {"TRIV": mesh.faces + 1.0}
         struct |= {"nf": float(len(mesh.faces)), "surface": surface}
     write_variables(path, {"S": struct})
-
-
-def check_spectrum_path(path: str | os.PathLike[str]) -> None:
-    """Refuse a file name that ends neither in `.npz` nor in `.mat`."""
-    if Path(path).suffix.lower() != ".npz" and not is_mat_file(path):
-        raise InputError(
-            f"{path}: spectra are written as .npz or .mat: choose a name that ends in one of these."
-        )
 
 
 def read_functional_map(
@@ -318,6 +309,5 @@ def write_functional_map(
     """
     with naming("functional map"):
         matrix = _real(functional_map, "entries")
-    if not is_mat_file(path):
-        raise InputError(f"{path}: functional maps are written as .mat: choose a name that ends in .mat.")
+    check_suffix(path, "functional maps", ".mat")
     write_variables(path, {FUNCTIONAL_MAP: matrix})

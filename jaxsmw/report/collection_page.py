@@ -262,10 +262,7 @@ def _encode_model(
 
 
 def _statistics(
-    names: Sequence[str],
-    edges: Sequence[MatchedEdge],
-    left_out: Mapping[str, str],
-    model: ShapeModel | None,
+    names: Sequence[str], edges: Sequence[MatchedEdge], left_out: Mapping[str, str], model: ShapeModel | None
 ) -> str:
     """Return the HTML list of the numbers of shapes, pairs and modes."""
     values = {"Shapes": str(len(names))}

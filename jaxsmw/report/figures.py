@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Float64, Int
 
 from jaxsmw.choices import Axis
 from jaxsmw.core.functional_map import Convention
-from jaxsmw.errors import InputError, check_number
+from jaxsmw.errors import InputError, check_number, check_suffix
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_points import check_pointwise_map
 from jaxsmw.report.colors import ERROR_LIMIT, PLAIN, error_colors, position_colors
@@ -370,8 +370,7 @@ def check_drawable() -> None:
 
 def check_figure_path(path: str | os.PathLike[str]) -> None:
     """Check that `save_figure` can write a file."""
-    if Path(path).suffix.lower() not in _METADATA:
-        raise InputError(f"{path}: the suffix is not .png, .pdf or .svg; choose one of these suffixes.")
+    check_suffix(path, "figures", *_METADATA)
     check_drawable()
     check_writable(path)
 

@@ -97,10 +97,7 @@ def facing(mesh: Mesh) -> Float64[np.ndarray, " 3"]:
 
 
 def stand_pair(
-    mesh_x: Mesh,
-    mesh_y: Mesh,
-    up: Axis | None = None,
-    pointwise_map: Int64[np.ndarray, " m"] | None = None,
+    mesh_x: Mesh, mesh_y: Mesh, up: Axis | None = None, pointwise_map: Int64[np.ndarray, " m"] | None = None
 ) -> tuple[Mesh, Mesh]:
     """Turn both meshes upright, and scale them for a common picture; see `stand`.
 

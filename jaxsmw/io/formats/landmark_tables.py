@@ -158,7 +158,9 @@ def parse_fcsv(text: str) -> Landmarks:
     (0 undefined, 1 preview, 2 defined).
     """
     lines = _lines(text)
-    stated = dict(_setting(line) for line in lines if line.startswith("#"))
+    # Comments of the form `# key = value` contain settings.
+    comments = [line[1:].partition("=") for line in lines if line.startswith("#")]
+    stated = {key.strip().lower(): value.strip() for key, _, value in comments}
     columns, order = _fcsv_columns(stated)
     points = PointList("line")
     for number, cells in _rows(["" if line.startswith("#") else line for line in lines], ","):
@@ -179,12 +181,6 @@ def parse_fcsv(text: str) -> Landmarks:
         notes=("The file states no coordinate system.",) if system is None else (),
         why_left_out="Slicer has no defined position for them",
     )
-
-
-def _setting(line: str) -> tuple[str, str]:
-    """Return the key, in lower case, and the value of a comment of the form `# key = value`."""
-    key, _, value = line[1:].partition("=")
-    return key.strip().lower(), value.strip()
 
 
 def _fcsv_columns(stated: dict[str, str]) -> tuple[_Columns, list[str]]:

@@ -100,8 +100,7 @@ def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[
     stated = markup["coordinateSystem"]
     if not isinstance(stated, str) or stated not in SYSTEMS:
         raise export_again(
-            f"the coordinate system {_excerpt(stated)} is neither LPS (1) nor RAS (0)",
-            "markups",
+            f"the coordinate system {_excerpt(stated)} is neither LPS (1) nor RAS (0)", "markups"
         )
     return SYSTEMS[stated], ()
 

@@ -42,12 +42,7 @@ def parse_off(data: bytes) -> Polygons:
     if coordinates is not None and are_vertices(corners, n):
         texture = coordinates, corners.astype(np.int64)
     return Polygons(
-        vertices,
-        corners,
-        sizes,
-        vertex_data=vertex_data,
-        face_data=_face_data(rows, sizes),
-        texture=texture,
+        vertices, corners, sizes, vertex_data=vertex_data, face_data=_face_data(rows, sizes), texture=texture
     )
 
 

@@ -85,8 +85,7 @@ def _header(data: bytes) -> tuple[np.dtype, int, str, bytes]:
             raise ValueError
     except (KeyError, TypeError, ValueError):
         raise export_again(
-            f"the header is damaged (fields {excerpt(' '.join(names))}, data {excerpt(encoding)})",
-            "points",
+            f"the header is damaged (fields {excerpt(' '.join(names))}, data {excerpt(encoding)})", "points"
         ) from None
     return record, points, encoding, data[offset:]
 

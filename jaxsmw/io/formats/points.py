@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import numpy as np
-from jaxtyping import Float64, Shaped
+from jaxtyping import Shaped
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.npz import read_array
@@ -67,14 +67,12 @@ def parse_npy(data: bytes) -> Polygons:
 def points_of_table(table: Shaped[np.ndarray, "n columns"]) -> Polygons:
     """Return points without faces from a table. Columns 4 to 6 become normals if they are unit vectors."""
     table = table.astype(np.float64)
-    normals = {NORMALS: table[:, 3:6]} if table.shape[1] >= 6 and _are_unit(table[:, 3:6]) else {}
+    lengths = np.linalg.norm(table[:, 3:6], axis=1)
+    are_unit = table.shape[1] >= 6 and (np.abs(lengths - 1) < _UNIT).all()
+    normals = {NORMALS: table[:, 3:6]} if are_unit else {}
     used = 6 if normals else 3
     notes: tuple[str, ...] = ()
     if table.shape[1] > used:
         rest = f"{used + 1} to {table.shape[1]}" if table.shape[1] > used + 1 else str(used + 1)
         notes = (f"Columns ignored: {rest}, which are not unit normals.",)
     return Polygons(table[:, :3], notes=notes, vertex_data=normals)
-
-
-def _are_unit(vectors: Float64[np.ndarray, "n 3"]) -> bool:
-    return bool((np.abs(np.linalg.norm(vectors, axis=1) - 1) < _UNIT).all())

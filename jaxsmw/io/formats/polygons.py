@@ -89,7 +89,7 @@ def texture_or_note(
         return None, (f"The texture was left out: {error}",)
 
 
-def omissions(data: MeshData, form: str, **holds: Any) -> tuple[str, ...]:
+def omissions(data: MeshData, form: str, **holds: bool | Callable[[str, Any], bool]) -> tuple[str, ...]:
     """Return a sentence for each kind of data that a format cannot hold.
 
     `holds` maps attributes of `MeshData` that the format called `form` can hold to True, or to a function
@@ -105,8 +105,8 @@ def omissions(data: MeshData, form: str, **holds: Any) -> tuple[str, ...]:
     }
     notes = []
     for attribute, (what, values) in kinds.items():
-        fits = holds.get(attribute, lambda name, value: False)
-        names = [name for name, value in values.items() if fits is not True and not fits(name, value)]
+        fits = holds.get(attribute, False)
+        names = [n for n, value in values.items() if not (fits if isinstance(fits, bool) else fits(n, value))]
         quoted = names if attribute == "texture" else [*map(ascii, names)]
         listed = ", ".join(quoted[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
         if names:
