@@ -51,9 +51,6 @@ class CreaturePair:
         return self.truth.nearest_corners(self.target)
 
 
-# ------------------------------------------------------------------------------------------- implicit bodies
-
-
 @dataclass(frozen=True)
 class _Tube:
     """A chain of tapered capsules (convex hulls of two balls); with a `normal`, a flat plate."""
@@ -242,9 +239,6 @@ def _hulls(chain: np.ndarray) -> np.ndarray:
     return np.stack([chain[:-1], chain[1:]], axis=1)
 
 
-# ---------------------------------------------------------------------------------------------- triangulation
-
-
 def _isosurface(body: _Body, spacing: float, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Triangulate the skin by marching cubes on a random grid, which is refined only near the skin."""
     turn, shift = Rotation.from_quat(random.normal(size=4)).as_matrix(), random.uniform(size=3)
@@ -336,9 +330,6 @@ def _triangulated(body: _Body, count: int, random: np.random.Generator) -> tuple
     for _ in range(4):
         vertices, _ = body.project(vertices)
     return vertices, _flipped_to_delaunay(vertices, faces)
-
-
-# ---------------------------------------------------------------------------------------- kinds of creatures
 
 
 def _quadruped(body: _Body) -> None:
@@ -551,9 +542,6 @@ _KINDS: dict[str, tuple[Callable[[_Body], None], dict[str, str]]] = {
 
 CREATURES: Mapping[str, tuple[str, ...]] = {kind: ("rest", *poses) for kind, (_, poses) in _KINDS.items()}
 """A dictionary from each kind of creature to the names of its poses."""
-
-
-# ------------------------------------------------------------------------------------------ public functions
 
 
 def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest", seed: int = 0) -> Mesh:

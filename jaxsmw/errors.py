@@ -1,6 +1,8 @@
 """The exception for input that cannot be used, and functions that check arguments."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any, get_args
 
@@ -15,6 +17,15 @@ class InputError(ValueError):
     def lines(self) -> list[str]:
         """Return the message and the notes."""
         return [str(self), *getattr(self, "__notes__", ())]
+
+
+@contextmanager
+def naming(name: object) -> Iterator[None]:
+    """Put the name of a file or of another input before the message of each `InputError` in the block."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
 
 
 def check_choice(value: object, choices: Any, kind: str) -> None:

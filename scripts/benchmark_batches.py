@@ -78,13 +78,13 @@ class MatrixProduct(NamedTuple):
 
 def matrix_products(function: Callable, *arguments: Any) -> Counter[MatrixProduct]:
     """Return how often a function computes each matrix product, counting loops of unknown length once."""
-    found: Counter[MatrixProduct] = Counter()
+    counts: Counter[MatrixProduct] = Counter()
 
     def add(jaxpr: Jaxpr, times: int) -> None:
         for equation in jaxpr.eqns:
             if equation.primitive.name == "dot_general":
                 left, right = (variable.aval.shape for variable in equation.invars)
-                found[MatrixProduct(left, right, equation.params["dimension_numbers"])] += times
+                counts[MatrixProduct(left, right, equation.params["dimension_numbers"])] += times
             inner = times * equation.params.get("length", 1) if equation.primitive.name == "scan" else times
             for value in jax.tree.leaves(
                 list(equation.params.values()), is_leaf=lambda leaf: isinstance(leaf, ClosedJaxpr | Jaxpr)
@@ -93,24 +93,24 @@ def matrix_products(function: Callable, *arguments: Any) -> Counter[MatrixProduc
                     add(value.jaxpr if isinstance(value, ClosedJaxpr) else value, inner)
 
     add(jax.make_jaxpr(function)(*arguments).jaxpr, 1)
-    return found
+    return counts
 
 
 def time_of_products(products: Counter[MatrixProduct], count: int, repeats: int) -> float:
     """Return the seconds that the given products take for `count` pairs, in full float32 precision."""
     size = min(PRODUCTS, count)
-    everything = sum(one.operations * times for one, times in products.items())
+    everything = sum(product.operations * times for product, times in products.items())
     generator = np.random.default_rng(0)
     candidates, times_of = {}, {}
-    for number, (one, times) in enumerate(products.items()):
-        if one.operations * times < NEGLIGIBLE * everything:
+    for number, (product, times) in enumerate(products.items()):
+        if product.operations * times < NEGLIGIBLE * everything:
             continue
         factors = [
             jnp.asarray(generator.standard_normal((size, *shape)), jnp.float32)
-            for shape in (one.left, one.right)
+            for shape in (product.left, product.right)
         ]
 
-        def maximum(left: Array, right: Array, dimensions: Any = one.dimensions) -> Array:
+        def maximum(left: Array, right: Array, dimensions: Any = product.dimensions) -> Array:
             return jnp.max(lax.dot_general(left, right, dimensions, precision=lax.Precision.HIGHEST), axis=-1)
 
         each = jax.jit(jax.vmap(maximum))
@@ -216,7 +216,9 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
     preset = preset.fitted(min(len(mesh.vertices) for mesh in shapes.meshes))
 
     def in_batches_of(size: int) -> Callable[[], object]:
-        return lambda: [one.pointwise_map for one in run_batches(preset.stages, tasks, batch_size=size)]
+        return lambda: [
+            outcome.pointwise_map for outcome in run_batches(preset.stages, tasks, batch_size=size)
+        ]
 
     candidates = {f"batches of {size}": in_batches_of(size) for size in (1, *options.batch_sizes)}
     seconds = medians(candidates, options.repeats)
@@ -224,8 +226,8 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
     whole = medians(
         {
             "match_pairs": lambda: [
-                found.pointwise_map
-                for _, found in match_pairs(shapes.meshes, shapes.pairs, batch_size=largest)
+                matched.pointwise_map
+                for _, matched in match_pairs(shapes.meshes, shapes.pairs, batch_size=largest)
             ]
         },
         1,
@@ -283,13 +285,13 @@ def agreement(options: argparse.Namespace) -> Iterator[Part]:
 def errors_of(data: Path, shapes: Shapes, maps: Sequence[np.ndarray]) -> list[float]:
     """Return the mean geodesic error of each map, in thousandths of the square root of the area."""
     truths = (truth_of(data, shapes.names[i], shapes.names[j]) for i, j in shapes.pairs)
-    return [truth.error(one, truth.meshes[1]) for truth, one in zip(truths, maps, strict=True)]
+    return [truth.error(T, truth.meshes[1]) for truth, T in zip(truths, maps, strict=True)]
 
 
 def prepared_tasks(shapes: Shapes, preset: PresetName) -> list[tuple[SpectralPair, Start]]:
     """Return the spectra of all pairs, with initial maps from SHOT."""
-    found, _ = prepare_collection(shapes.meshes, PRESETS[preset])
-    prepared = (prepare_task(found[i], found[j]) for i, j in shapes.pairs)
+    prepared_shapes, _ = prepare_collection(shapes.meshes, PRESETS[preset])
+    prepared = (prepare_task(prepared_shapes[i], prepared_shapes[j]) for i, j in shapes.pairs)
     return [(pair.spectra, starts[0]) for pair, starts in prepared]
 
 

@@ -126,7 +126,7 @@ def _measure(options: argparse.Namespace, name: str, ablation: str) -> dict[str,
             bar.set_description(step)
 
         start = time.perf_counter()
-        found = match_collection(
+        collection = match_collection(
             meshes,
             names=[file.stem for file in files],
             preset=options.preset,
@@ -141,26 +141,29 @@ def _measure(options: argparse.Namespace, name: str, ablation: str) -> dict[str,
     journal = Journal(place / "direct.csv", ("source", "target"))
     through, single = [], []
     for i, j in tqdm(pairs, desc="pairs"):
-        through.append(measure(found, files, i, j, None))
+        through.append(measure(collection, files, i, j, None))
         if not direct:
             continue
         key = (files[i].stem, files[j].stem)
         if key not in journal:
-            mirrored = bool(found.mirrored[i] != found.mirrored[j])
-            one = match(
-                found.meshes[i], found.meshes[j], preset=options.preset, mirror="yes" if mirrored else "no"
+            mirrored = bool(collection.mirrored[i] != collection.mirrored[j])
+            single_match = match(
+                collection.meshes[i],
+                collection.meshes[j],
+                preset=options.preset,
+                mirror="yes" if mirrored else "no",
             )
-            error = measure(found, files, i, j, one)
+            error = measure(collection, files, i, j, single_match)
             journal.append([{"source": key[0], "target": key[1], "error": error}])
         single.append(float(journal[key]["error"]))
     result: dict[str, Any] = {
         "shapes": len(files),
-        "edges": len(found.edges),
-        "replaced": sum(edge.decision == "replaced" for edge in found.edges),
-        "contradicted": sum(edge.decision == "contradicted" for edge in found.edges),
-        "outliers": [found.names[shape] for shape in found.outliers],
+        "edges": len(collection.edges),
+        "replaced": sum(edge.decision == "replaced" for edge in collection.edges),
+        "contradicted": sum(edge.decision == "contradicted" for edge in collection.edges),
+        "outliers": [collection.names[shape] for shape in collection.outliers],
         "through_template": _summary(np.array(through)),
-        "cycles": _cycles(found) if ablation == _DEFAULT else {},
+        "cycles": _cycles(collection) if ablation == _DEFAULT else {},
         "seconds": seconds,
         "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
     }
@@ -168,12 +171,13 @@ def _measure(options: argparse.Namespace, name: str, ablation: str) -> dict[str,
         result["direct"] = _summary(np.array(single))
         result["ratio"] = float(np.mean(through) / np.mean(single))
     if options.ablations and ablation == _DEFAULT:
-        template = found.meshes[found.template]
+        meshes, points = collection.meshes, collection.points
+        template = meshes[collection.template]
         errors = []
         for i, j in pairs:
-            of_pair = found.points[i], found.points[j], template, found.meshes[i], found.meshes[j]
+            of_pair = points[i], points[j], template, meshes[i], meshes[j]
             unregistered = SimpleNamespace(pointwise_map=vertex_map_between(*of_pair))
-            errors.append(_measure_truth(found, files, i, j, unregistered))
+            errors.append(_measure_truth(collection, files, i, j, unregistered))
         result["without_registered_meshes"] = _summary(np.array(errors))
     return result
 
@@ -192,53 +196,53 @@ def _matched_growth(files: list[Path], number: int) -> dict[str, Any]:
         positions, faces, *_ = igl.decimate(mesh.vertices, mesh.faces, 2 * vertices)
         meshes.append(make_mesh(positions, faces, name=f"{file.stem} {row}"))
     start, start_cpu = time.perf_counter(), time.process_time()
-    found = match_collection(meshes)
+    collection = match_collection(meshes)
     return {
-        "shapes": len(found.meshes),
-        "edges": len(found.edges),
+        "shapes": len(collection.meshes),
+        "edges": len(collection.edges),
         "seconds": time.perf_counter() - start,
         "cpu_seconds": time.process_time() - start_cpu,
         "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-        "seconds_of_steps": found.seconds,
+        "seconds_of_steps": collection.seconds,
     }
 
 
-def _measure_truth(found: Collection, files: list[Path], i: int, j: int, single: Any) -> float:
+def _measure_truth(collection: Collection, files: list[Path], i: int, j: int, single: Any) -> float:
     """Return the mean error of a map in thousandths, against ground truth."""
     truth_files = [files[shape].parents[1] / "corres" / f"{files[shape].stem}.vts" for shape in (i, j)]
-    truth = read_ground_truth(truth_files, found.meshes[i], found.meshes[j])
-    pointwise_map = found.pointwise_map(i, j) if single is None else single.pointwise_map
-    return 1e3 * geodesic_error(found.meshes[j], pointwise_map, truth).mean
+    truth = read_ground_truth(truth_files, collection.meshes[i], collection.meshes[j])
+    pointwise_map = collection.pointwise_map(i, j) if single is None else single.pointwise_map
+    return 1e3 * geodesic_error(collection.meshes[j], pointwise_map, truth).mean
 
 
-def _measure_landmarks(found: Collection, files: list[Path], i: int, j: int, single: Any) -> float:
+def _measure_landmarks(collection: Collection, files: list[Path], i: int, j: int, single: Any) -> float:
     """Return the mean distance of carried landmarks to manual landmarks, in thousandths of the diagonal."""
     marks_x, marks_y = common_landmarks(files[i], files[j])
     if single is None:
-        on_source, _ = nearest_surface_points(marks_x.positions, found.meshes[i])
-        on_target = found.registered[j].project(found.registered[i].project_back(on_source))
-        carried = on_target.positions(found.meshes[j])
+        on_source, _ = nearest_surface_points(marks_x.positions, collection.meshes[i])
+        on_target = collection.registered[j].project(collection.registered[i].project_back(on_source))
+        carried = on_target.positions(collection.meshes[j])
     else:
         carried = transfer_landmarks(marks_x, single.registered_mesh()).landmarks.positions
     distances = np.linalg.norm(carried - marks_y.positions, axis=1)
-    return 1e3 * float(distances.mean()) / bounding_box_diagonal(found.meshes[j])
+    return 1e3 * float(distances.mean()) / bounding_box_diagonal(collection.meshes[j])
 
 
-def _cycles(found: Collection) -> dict[str, float]:
+def _cycles(collection: Collection) -> dict[str, float]:
     """Return the cycle errors of the graph, and of maps through the template for random triples of shapes."""
     generator = np.random.default_rng(0)
-    number = len(found.meshes)
+    number = len(collection.meshes)
     errors = []
     for _ in range(_TRIANGLES if number > 2 else 0):
         i, j, k = generator.choice(number, 3, replace=False)
-        mesh = found.meshes[i]
+        mesh = collection.meshes[i]
         vertex = generator.choice(np.flatnonzero(mesh.referenced_vertices), 20)
         points = vertices_as_points(mesh)[vertex]
         for before, after in ((i, j), (j, k), (k, i)):
-            points = found.registered[after].project(found.registered[before].project_back(points))
+            points = collection.registered[after].project(collection.registered[before].project_back(points))
         offsets = points.positions(mesh) - mesh.vertices[vertex]
         errors.append(np.linalg.norm(offsets, axis=1).mean() / mesh.area**0.5)
-    first, final = found.cycle_errors
+    first, final = collection.cycle_errors
     parts = (("template", errors), ("graph_first", first), ("graph_final", final))
     means = {name: float(1e3 * np.mean(values)) if len(values) else float("nan") for name, values in parts}
     return means | {"template_median": float(1e3 * np.median(errors))}

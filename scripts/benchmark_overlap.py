@@ -89,19 +89,19 @@ class _PartialPair:
         """Match the pair, and return the error in the overlap and the quality of the predicted overlap."""
         mesh_x, mesh_y = self.source.mesh, self.target.mesh
         start = time.perf_counter()
-        found = match(mesh_x, mesh_y, partial=True)
+        matched = match(mesh_x, mesh_y, partial=True)
         seconds = time.perf_counter() - start
         used = np.flatnonzero(self.inside)
         truth = GroundTruth(used, SurfacePoints(self.points.faces[used], self.points.weights[used]))
-        error = geodesic_error(mesh_y, found.pointwise_map, truth, number_of_samples=_EVALUATED)
+        error = geodesic_error(mesh_y, matched.pointwise_map, truth, number_of_samples=_EVALUATED)
         reached = error.errors[np.isfinite(error.errors)]  # a cut can fall into several components
         return {
             "share_of_source": self.shares[0],
             "share_of_target": self.shares[1],
             "error": 1e3 * float(reached.mean()) * np.sqrt(mesh_y.area) / self.unit,
-            "iou": _iou(found.overlap()[0], self.inside, mesh_x.vertex_areas),
+            "iou": _iou(matched.overlap()[0], self.inside, mesh_x.vertex_areas),
             "iou_of_all": self.shares[0],
-            "suspicious": found.suspicious,
+            "suspicious": matched.suspicious,
             "seconds": seconds,
         }
 

@@ -68,7 +68,7 @@ def pairs(data: str, number: int) -> list[tuple[Mesh, Mesh]]:
     if not data:
         kinds = ("quadruped", "biped", "dragon")
         both = [creature_pair(kinds[seed % 3], vertices=VERTICES, seed=seed) for seed in range(number)]
-        return [(one.source, one.target) for one in both]
+        return [(pair.source, pair.target) for pair in both]
     files = sorted((Path(data) / "off").glob("*.off"))
     step = len(files) // (2 * number)
     meshes = [read_mesh(file) for file in files[:: max(step, 1)]]
@@ -77,23 +77,23 @@ def pairs(data: str, number: int) -> list[tuple[Mesh, Mesh]]:
 
 def matched(data: str, file: str) -> None:
     """Match all pairs in this process, and write their maps to a file."""
-    given = pairs(data, COMPARED_PAIRS)
+    of_data = pairs(data, COMPARED_PAIRS)
     if size := os.environ.get("BATCH_SIZE"):
-        meshes = [mesh for pair in given for mesh in pair]
-        chosen = [(2 * i, 2 * i + 1) for i in range(len(given))]
-        results = dict(match_pairs(meshes, chosen, batch_size=int(size)))
-        found = [results[number].pointwise_map for number in range(len(given))]
+        meshes = [mesh for pair in of_data for mesh in pair]
+        numbers = [(2 * i, 2 * i + 1) for i in range(len(of_data))]
+        results = dict(match_pairs(meshes, numbers, batch_size=int(size)))
+        maps = [results[number].pointwise_map for number in range(len(of_data))]
     else:
-        found = [match(*pair).pointwise_map for pair in given]
-    np.savez(file, *found)
+        maps = [match(*pair).pointwise_map for pair in of_data]
+    np.savez(file, *maps)
 
 
 def determinism(options: argparse.Namespace) -> Iterator[Part]:
     """Yield the shares of vertices whose matches change in other conditions."""
     data = str(options.data.resolve()) if options.data else ""
-    given = pairs(data, COMPARED_PAIRS)
+    of_data = pairs(data, COMPARED_PAIRS)
     rows: list[list[str]] = []
-    found: dict[str, list[np.ndarray]] = {}
+    maps: dict[str, list[np.ndarray]] = {}
     measured = {}
     for name, (reference, variables) in CONDITIONS.items():
         with tempfile.TemporaryDirectory() as directory:
@@ -104,12 +104,12 @@ def determinism(options: argparse.Namespace) -> Iterator[Part]:
             environment["PYTHONPATH"] = os.pathsep.join(filter(None, path))
             subprocess.run([sys.executable, "-c", code, data, file], env=environment, check=True)
             with np.load(file) as arrays:
-                found[name] = [arrays[key] for key in arrays.files]
+                maps[name] = [arrays[key] for key in arrays.files]
         if not reference:
             continue
-        changed = [float(np.mean(a != b)) for a, b in zip(found[name], found[reference], strict=True)]
+        changed = [float(np.mean(a != b)) for a, b in zip(maps[name], maps[reference], strict=True)]
         moved = []
-        for a, b, (_, target) in zip(found[name], found[reference], given, strict=True):
+        for a, b, (_, target) in zip(maps[name], maps[reference], of_data, strict=True):
             lengths = np.linalg.norm(target.vertices[a] - target.vertices[b], axis=1)
             moved.append(float(lengths[a != b].mean() / edge_length(target)) if (a != b).any() else 0.0)
         rows.append(

@@ -374,12 +374,12 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
             "first `demo`": started(*program, "demo", "--output", str(root / "demo")),
         }
         busy = {f"{name}, busy": beside(run) for name, run in matches.items()}
-        found = medians(matches | others | busy, options.repeats, wall_and_cpu, warm=False)
+        times = medians(matches | others | busy, options.repeats, wall_and_cpu, warm=False)
     rows = [["", "wall seconds", "CPU seconds", "wall seconds beside busy processes", "relative to quiet"]]
     for name in (*matches, *others):
-        wall, cpu = found[name]
+        wall, cpu = times[name]
         row = [name, f"{wall:.2f}", f"{cpu:.2f}", "", ""]
-        if beside_busy := found.get(f"{name}, busy"):
+        if beside_busy := times.get(f"{name}, busy"):
             row[3:] = f"{beside_busy[0]:.2f}", f"{beside_busy[0] / wall:.2f}"
         rows.append(row)
     m, n = (len(mesh.vertices) for mesh in timed)
@@ -389,7 +389,7 @@ def command(options: argparse.Namespace) -> Iterator[Part]:
         "the results of an earlier command with other or with the same meshes. One busy process ran for each "
         f"core. Times are medians of {options.repeats} runs.",
         rows,
-        {"seconds": found},
+        {"seconds": times},
     )
 
 
@@ -412,7 +412,7 @@ def later_pairs(options: argparse.Namespace) -> Iterator[Part]:
         for pair in others:
             arrays = [(mesh.vertices, mesh.faces) for mesh in pair]
             start = wall_and_cpu()
-            match(*(make_mesh(*one) for one in arrays), preset=preset)
+            match(*(make_mesh(*mesh) for mesh in arrays), preset=preset)
             times.append(wall_and_cpu() - start)
         wall, cpu = np.median(times, axis=0)
         walls = [float(time_[0]) for time_ in times]
@@ -652,12 +652,12 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
                 if turn > 1 and name.startswith("geomfum"):
                     continue  # geomfum is timed only once, because each of its runs takes a minute
                 start = time.perf_counter()
-                found, refining = run(files)
+                pointwise_map, refining = run(files)
                 taken = time.perf_counter() - start
                 of = measured.setdefault(name, {"all": [], "refining": [], "error": None})
                 of["all"].append(taken)
                 of["refining"].append(refining)
-                of["error"] = truth.error(found, truth.meshes[1])
+                of["error"] = truth.error(pointwise_map, truth.meshes[1])
     table = [["", "files to map, seconds", "of ours", "refinement", "of ours", "first time", "error x10^-3"]]
     ours = [float(np.median(measured["ours"][kind][1:])) for kind in ("all", "refining")]
     for name, of in measured.items():
@@ -696,7 +696,7 @@ def throughput(options: argparse.Namespace) -> Iterator[Part]:
 
     def add(name: str, matched: list[tuple[str, str]], maps: list[np.ndarray], seconds: float) -> None:
         truths = [truth_of(options.data, *pair) for pair in matched]
-        errors = [truth.error(one, truth.meshes[1], 400) for truth, one in zip(truths, maps, strict=True)]
+        errors = [truth.error(T, truth.meshes[1], 400) for truth, T in zip(truths, maps, strict=True)]
         measured[name] = {"pairs": len(matched), "seconds": seconds, "errors": errors}
 
     with tempfile.TemporaryDirectory() as directory:
@@ -705,9 +705,9 @@ def throughput(options: argparse.Namespace) -> Iterator[Part]:
             start = time.perf_counter()
             starts, maps = {}, []  # only the maps are kept, because results contain both spectra
             for pair in tqdm(pairs, f"throughput, {preset}"):
-                found = match(*(read_mesh(files[name]) for name in pair), preset=preset)
-                starts[pair] = found.initial_map
-                maps.append(found.pointwise_map)
+                result = match(*(read_mesh(files[name]) for name in pair), preset=preset)
+                starts[pair] = result.initial_map
+                maps.append(result.pointwise_map)
             add(f"jaxsmw, {preset}", pairs, maps, time.perf_counter() - start)
         os.environ["JAXSMW_CACHE"] = "off"
     for name, library, run, matched in (
@@ -751,7 +751,7 @@ def in_ten_processes(
     with ProcessPoolExecutor(10, spawned, initializer=import_alone, initargs=(library,)) as pool:
         list(pool.map(time.sleep, [5] * 10))  # all processes start
         start = time.perf_counter()
-        calls = [pool.submit(run, *one) for one in arguments]
+        calls = [pool.submit(run, *of_pair) for of_pair in arguments]
         maps = [call.result()[0] for call in calls]
         return maps, time.perf_counter() - start
 
@@ -790,8 +790,8 @@ def pyfm_defaults_from_files(
     model.preprocess()
     model.fit(verbose=False)
     start = time.perf_counter()
-    found = model.get_p2p(model.zoomout_refine(step=step))
-    return np.asarray(found), time.perf_counter() - start
+    pointwise_map = model.get_p2p(model.zoomout_refine(step=step))
+    return np.asarray(pointwise_map), time.perf_counter() - start
 
 
 def pyfm_from_files(files: list[str], first: np.ndarray) -> tuple[np.ndarray, float]:
@@ -804,7 +804,7 @@ def pyfm_from_files(files: list[str], first: np.ndarray) -> tuple[np.ndarray, fl
     start = time.perf_counter()
     k = EIGENVECTORS - ZOOMOUT_STEPS * 5
     functional_map = p2p_to_FM(first, y.eigenvectors[:, :k], x.eigenvectors[:, :k], A2=x.A)
-    _, found = zoomout_refine(
+    _, pointwise_map = zoomout_refine(
         functional_map,
         y.eigenvectors[:, :EIGENVECTORS],
         x.eigenvectors[:, :EIGENVECTORS],
@@ -814,7 +814,7 @@ def pyfm_from_files(files: list[str], first: np.ndarray) -> tuple[np.ndarray, fl
         return_p2p=True,
         n_jobs=-1,
     )
-    return np.asarray(found), time.perf_counter() - start
+    return np.asarray(pointwise_map), time.perf_counter() - start
 
 
 def geomfum_from_files(files: list[str], first: np.ndarray) -> tuple[np.ndarray, float]:

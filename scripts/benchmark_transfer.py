@@ -95,8 +95,8 @@ def _measure_body(source: Path, target: Path) -> dict[str, Any]:
     mesh_x, mesh_y = read_mesh(source), read_mesh(target)
     truth_files = [source.parents[1] / "corres" / f"{file.stem}.vts" for file in (source, target)]
     truth = read_ground_truth(truth_files, mesh_x, mesh_y)
-    found, registered, seconds = _register(mesh_x, mesh_y, mirrored=False)
-    points = found.surface_points()
+    correspondence, registered, seconds = _register(mesh_x, mesh_y, mirrored=False)
+    points = correspondence.surface_points()
     return {
         "error_of_points": 1e3 * geodesic_error(mesh_y, points, truth).mean,
         "error_of_registered": 1e3 * geodesic_error(mesh_y, registered.surface_points, truth).mean,
@@ -111,11 +111,11 @@ def _register(
 ) -> tuple[Correspondence, RegisteredMesh, dict[str, float]]:
     """Match and register a pair, and measure the time of each of these two steps."""
     start = time.perf_counter()
-    found = match(mesh_x, mesh_y, init=init, mirror="yes" if mirrored else "no")
+    correspondence = match(mesh_x, mesh_y, init=init, mirror="yes" if mirrored else "no")
     matched = time.perf_counter()
-    registered = found.registered_mesh()
+    registered = correspondence.registered_mesh()
     times = {"match_seconds": matched - start, "transfer_seconds": time.perf_counter() - matched}
-    return found, registered, times
+    return correspondence, registered, times
 
 
 def _measure_scan(source: Path, target: Path, init: MatchInit) -> dict[str, Any]:
@@ -123,13 +123,13 @@ def _measure_scan(source: Path, target: Path, init: MatchInit) -> dict[str, Any]
     mesh_x, mesh_y = read_mesh(source), read_mesh(target)
     marks_x, marks_y = common_landmarks(source, target)
     mirrored = side_of(source) != side_of(target)
-    found, registered, seconds = _register(mesh_x, mesh_y, mirrored=mirrored, init=init)
+    correspondence, registered, seconds = _register(mesh_x, mesh_y, mirrored=mirrored, init=init)
     on_source, off_source = nearest_surface_points(marks_x.positions, mesh_x)
     _, off_target = nearest_surface_points(marks_y.positions, mesh_y)
     hand = np.array([-1.0 if mirrored else 1.0, 1, 1])
     carried = {
         "registered": transfer_landmarks(marks_x, registered).landmarks.positions,
-        "map": mesh_y.vertices[found.pointwise_map[on_source.nearest_corners(mesh_x)]],
+        "map": mesh_y.vertices[correspondence.pointwise_map[on_source.nearest_corners(mesh_x)]],
         **_aligned(mesh_x, mesh_y, marks_x.positions, hand),
     }
     unit = 1e-3 * bounding_box_diagonal(mesh_y)
@@ -181,14 +181,14 @@ def _drifted(
 def _summary(journal: Journal) -> str:
     """Return the mean of each column, with a 95 % bootstrap interval over the pairs."""
     generator = np.random.default_rng(0)
-    found = []
+    texts = []
     for column in journal.rows[0]:
         if column not in ("source", "target", "mirrored"):
             values = np.array([float(row[column]) for row in journal.rows])
             means = values[generator.integers(len(values), size=(1000, len(values)))].mean(axis=1)
             low, high = np.quantile(means, [0.025, 0.975])
-            found.append(f"{column} {values.mean():.4g} ({low:.4g} to {high:.4g})")
-    return f"{len(journal.rows)} pairs, " + ", ".join(found)
+            texts.append(f"{column} {values.mean():.4g} ({low:.4g} to {high:.4g})")
+    return f"{len(journal.rows)} pairs, " + ", ".join(texts)
 
 
 if __name__ == "__main__":

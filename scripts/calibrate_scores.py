@@ -80,10 +80,12 @@ def measure(
 ) -> Measured:
     """Match a pair, and measure the errors and the scores of the result."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
-    found = match(mesh_x, mesh_y, preset=preset, partial=pair.partial)
+    result = match(mesh_x, mesh_y, preset=preset, partial=pair.partial)
     truth = pair.ground_truth(mesh_x, mesh_y)
-    error = geodesic_error(mesh_y, found.pointwise_map, truth, number_of_samples=number_of_samples, seed=seed)
-    known = np.isfinite(error.errors)
+    error = geodesic_error(
+        mesh_y, result.pointwise_map, truth, number_of_samples=number_of_samples, seed=seed
+    )
+    finite = np.isfinite(error.errors)
     scores: dict[str, tuple[float, float]] = {}
     mirrored = None
     if preset == "accurate":
@@ -91,36 +93,36 @@ def measure(
             mirrored = pair.ground_truth(mesh_x, mesh_y, mirrored=True)
     if mirrored is not None and isinstance(mirrored.targets, np.ndarray) and not pair.partial:
         reflected = match(mesh_x, mesh_y, init=mirrored.everywhere(mesh_x), preset=WITHOUT_REPAIR)
-        direct, other = (scores_of(result) for result in (found, reflected))
+        direct, other = map(scores_of, (result, reflected))
         scores = {name: (direct[name], other[name]) for name in direct}
-    expected = found.expected_error()
-    assert found.distortion is not None
+    expected = result.expected_error()
+    assert result.distortion is not None
     return Measured(
-        error.errors[known],
-        expected[error.source_vertices][known],
-        found.distortion,
+        error.errors[finite],
+        expected[error.source_vertices][finite],
+        result.distortion,
         float(mesh_x.average(expected)),
         scores,
     )
 
 
-def scores_of(found: Correspondence) -> dict[str, float]:
+def scores_of(result: Correspondence) -> dict[str, float]:
     """Return a dictionary from the name of each score to its value for a map. Lower values are better."""
-    known = found.pair, found.pointwise_map, found.spectrum_x
-    regression = match(*found.pair.meshes, init=found.pointwise_map, preset=WITHOUT_REPAIR[0])
+    measured_map = result.pair, result.pointwise_map, result.spectrum_x
+    regression = match(*result.pair.meshes, init=result.pointwise_map, preset=WITHOUT_REPAIR[0])
     uncertainty = regression.refinement.state.uncertainty
     assert uncertainty is not None
     return {
-        "Dirichlet energy ratio": dirichlet_energy_ratio(*known),
+        "Dirichlet energy ratio": dirichlet_energy_ratio(*measured_map),
         "uncertainty of the regression": float(uncertainty),
-        "distortion": distortion(*known),
+        "distortion": distortion(*measured_map),
     }
 
 
 def fitted(maps: Sequence[Measured]) -> WrongProbabilitySettings:
     """Fit the coefficients of `jaxsmw.matching.judge` to maps by logistic regression."""
-    features = np.array([[1, np.log(one.distortion), np.log(one.mean_expected)] for one in maps])
-    signs = np.where([one.wrong for one in maps], 1, -1)
+    features = np.array([[1, np.log(m.distortion), np.log(m.mean_expected)] for m in maps])
+    signs = np.where([m.wrong for m in maps], 1, -1)
 
     def loss(weights: Float64[np.ndarray, " 3"]) -> float:
         # The penalty keeps the weights finite if a plane separates the right maps from the wrong maps.
@@ -131,8 +133,8 @@ def fitted(maps: Sequence[Measured]) -> WrongProbabilitySettings:
 
 def calibration(maps: Sequence[Measured], settings: WrongProbabilitySettings) -> str:
     """Return a table that compares predicted probabilities with the shares of wrong maps."""
-    predicted = np.array([wrong_probability(one.distortion, one.mean_expected, settings) for one in maps])
-    wrong = np.array([one.wrong for one in maps])
+    predicted = np.array([wrong_probability(m.distortion, m.mean_expected, settings) for m in maps])
+    wrong = np.array([m.wrong for m in maps])
     rows = [["probability", "maps", "mean probability", "wrong"]]
     for low, high in pairwise(PROBABILITIES):
         own = (low <= predicted) & ((predicted < high) | (high == 1))
@@ -183,11 +185,11 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
         rows[-1].append(f"{np.mean(own > GROSS):.1%}")
     yield "Vertices of all pairs, in ten groups of equal size by expected error:\n\n" + markdown(rows)
 
-    chosen = WrongProbabilitySettings()
+    settings = WrongProbabilitySettings()
     yield (
         "Probability that a map is wrong:\n\n"
-        + calibration(everything, chosen)
-        + f"\nThe chosen coefficients are {chosen}. Logistic regression on these maps gives "
+        + calibration(everything, settings)
+        + f"\nThe chosen coefficients are {settings}. Logistic regression on these maps gives "
         f"{fitted(everything)}.\n"
     )
 

@@ -57,8 +57,8 @@ def main() -> None:
         truth = pair.ground_truth(source, target)
         pictures, errors = [], []
         for directory in (options.before, options.after):
-            found = read_pointwise_map(directory / f"{'__'.join(pair.names)}.npy", source, target)
-            error = geodesic_error(target, found, truth, number_of_samples=MEASURED)
+            pointwise_map = read_pointwise_map(directory / f"{'__'.join(pair.names)}.npy", source, target)
+            error = geodesic_error(target, pointwise_map, truth, number_of_samples=MEASURED)
             errors.append(1e3 * error.mean)
             _, nearest = KDTree(source.vertices[error.source_vertices]).query(source.vertices)
             pictures.append(body(source, error_colors(error.errors[nearest], ERROR_LIMIT), options.up))

@@ -154,8 +154,8 @@ def draw_case(case: Case) -> str:
         cells += [f"{error.mean:.3f}", f"{case.source.average(expected):.3f}"]
         if settings is case.failing:
             # A vertex without ground truth is drawn with the error of the nearest vertex with ground truth.
-            known = KDTree(case.source.vertices[error.source_vertices])
-            errors = error.errors[known.query(case.source.vertices)[1]]
+            measured = KDTree(case.source.vertices[error.source_vertices])
+            errors = error.errors[measured.query(case.source.vertices)[1]]
             panels = {"Error": errors, "Expected error": expected}
             figure = draw_correspondence(
                 case.source, case.target, result.pointwise_map, errors=panels, up=case.up
@@ -203,8 +203,8 @@ def draw_transfers() -> None:
     pair = jaxsmw.creature_pair("quadruped", vertices=3000)
     mesh_x, mesh_y = pair.source, pair.target
     registered = jaxsmw.match(mesh_x, mesh_y).registered_mesh()
-    chosen = jaxsmw.geometry.farthest_point_samples(mesh_x, 40)
-    points = jaxsmw.io.Landmarks(tuple(map(str, range(40))), mesh_x.vertices[chosen])
+    samples = jaxsmw.geometry.farthest_point_samples(mesh_x, 40)
+    points = jaxsmw.io.Landmarks(tuple(map(str, range(40))), mesh_x.vertices[samples])
     carried = jaxsmw.transfer.transfer_landmarks(points, registered).landmarks
     hues = hsv_to_rgb(np.stack([np.arange(40) / 40, np.ones(40), np.full(40, 0.85)], axis=1))
     marked = {"Source": (mesh_x, points), "Target": (mesh_y, carried)}
@@ -248,18 +248,18 @@ def draw_another_kind() -> None:
 def draw_without_repair() -> None:
     """Match a collection by `paper` and by `accurate`, and draw its template and one other quadruped."""
     meshes = [creature("quadruped", vertices=800 + 20 * seed, seed=seed) for seed in range(5)]
-    found = {
+    collections = {
         preset: jaxsmw.match_collection(meshes, preset=preset, template=0, mirror="no")
         for preset in ("paper", "accurate")
     }
     errors = np.zeros(len(meshes))
-    for edge in found["paper"].edges:
+    for edge in collections["paper"].edges:
         if edge.source == 0:
             errors[edge.target] = edge.estimated_error
     shape = int(errors.argmax())
     colors = position_colors(meshes[0])
     panels = {"template": (meshes[0], colors)}
-    for preset, collection in found.items():
+    for preset, collection in collections.items():
         print(preset, *collection.sentences(), sep="\n")
         panels[preset] = meshes[shape], colors[collection.to_template(shape)]
     draw_side_by_side("failure_collection", panels)

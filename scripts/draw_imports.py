@@ -32,7 +32,7 @@ def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
     """
     modules = {".".join(p.relative_to(library).with_suffix("").parts): p for p in library.rglob("*.py")}
     names = {name.removesuffix(".__init__"): path for name, path in modules.items() if name != "__init__"}
-    found: dict[str, set[str]] = {}
+    imports: dict[str, set[str]] = {}
     for name, path in names.items():
         imported: set[str] = set()
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
@@ -40,9 +40,9 @@ def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
                 imported |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
                 inner = {f"{node.module}.{alias.name}" for alias in node.names}
-                imported |= {one if one.removeprefix("jaxsmw.") in names else node.module for one in inner}
-        found[name] = {one.removeprefix("jaxsmw.") for one in imported if one.startswith("jaxsmw.")}
-    return found
+                imported |= {m if m.removeprefix("jaxsmw.") in names else node.module for m in inner}
+        imports[name] = {m.removeprefix("jaxsmw.") for m in imported if m.startswith("jaxsmw.")}
+    return imports
 
 
 def imported_layers() -> dict[str, set[str]]:
@@ -60,10 +60,10 @@ def heights(layers: dict[str, set[str]]) -> dict[str, int]:
 
     **Raises:** `graphlib.CycleError` if layers import each other in a circle.
     """
-    found: dict[str, int] = {}
+    height: dict[str, int] = {}
     for layer in graphlib.TopologicalSorter(layers).static_order():
-        found[layer] = 1 + max((found[other] for other in layers[layer]), default=-1)
-    return found
+        height[layer] = 1 + max((height[other] for other in layers[layer]), default=-1)
+    return height
 
 
 def direct(layers: dict[str, set[str]]) -> dict[str, set[str]]:
@@ -72,7 +72,7 @@ def direct(layers: dict[str, set[str]]) -> dict[str, set[str]]:
     for layer in graphlib.TopologicalSorter(layers).static_order():
         reachable[layer] = layers[layer].union(*(reachable[other] for other in layers[layer]))
     return {
-        layer: {one for one in others if not any(one in reachable[other] for other in others - {one})}
+        layer: {a for a in others if not any(a in reachable[b] for b in others - {a})}
         for layer, others in layers.items()
     }
 

@@ -162,16 +162,16 @@ class DescriptorNetwork(eqx.Module):
         self.leave = eqx.nn.Linear(sizes.width, sizes.outputs, key=keys[1])
 
     def __call__(self, spectrum: Spectrum) -> Float[Array, "n outputs"]:
-        given = spectrum.descriptors
-        if given is None or given.shape[1] != self.sizes.inputs:
+        shot = spectrum.descriptors
+        if shot is None or shot.shape[1] != self.sizes.inputs:
             raise ValueError(
-                f"the spectrum has {'no' if given is None else given.shape[1]} descriptors, but "
+                f"the spectrum has {'no' if shot is None else shot.shape[1]} descriptors, but "
                 f"{self.sizes.inputs} per vertex are needed: pass the result of shot_descriptors to "
                 "Spectrum.with_descriptors"
             )
         waves = wave_kernel_signature(spectrum, dimensions=self.sizes.waves) - 1
         # SHOT descriptors have norm 1. This factor scales their entries to a mean square of 1.
-        inputs = jnp.concatenate([given * self.sizes.inputs**0.5, waves], axis=1)
+        inputs = jnp.concatenate([shot * self.sizes.inputs**0.5, waves], axis=1)
         features = jax.vmap(self.enter)(inputs)
         for block in self.blocks:
             features = block(features, spectrum)
@@ -249,18 +249,18 @@ def matched(network: DescriptorNetwork, x: Shape, y: Shape) -> Matched:
     features = network(x.spectrum), network(y.spectrum)
     spectra = [side.spectrum.truncate(LAYER_EIGENVECTORS) for side in (x, y)]
     module = layer()
-    found = module(*features, *spectra)
+    of_layer = module(*features, *spectra)
     by_descriptors = module.recovery_of_features(*features, *(s.vertex_areas for s in spectra))
-    energy = module.refiner.problem(*spectra, sampled=True).energy(found.soft_map)(found.functional_map)
-    return Matched(by_descriptors, found.soft_map, found.functional_map, energy / LAYER_EIGENVECTORS)
+    energy = module.refiner.problem(*spectra, sampled=True).energy(of_layer.soft_map)(of_layer.functional_map)
+    return Matched(by_descriptors, of_layer.soft_map, of_layer.functional_map, energy / LAYER_EIGENVECTORS)
 
 
 def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
     """Return the loss `labels`: a weighted sum of the errors of both soft maps of `Matched`."""
-    found = matched(network, pair.x, pair.y)
+    maps = matched(network, pair.x, pair.y)
     by_layer, by_descriptors = (
         root_mean_square(soft_map.pull_back, pair.y.positions, pair.truth)
-        for soft_map in (found.by_layer, found.by_descriptors)
+        for soft_map in (maps.by_layer, maps.by_descriptors)
     )
     return by_layer + by_descriptors / 2
 
@@ -339,8 +339,8 @@ def descriptor_errors(
     initial_maps = {REFERENCE: first}
     for name, network in networks.items():
         initial_maps[name] = np.asarray(nearest_descriptors(network, x, y))[:m].astype(np.int64)
-    maps = {f"{name}{START}": found for name, found in initial_maps.items()}
-    maps |= {f"{name}{REFINED}": refined(spectra, found) for name, found in initial_maps.items()}
+    maps = {f"{name}{START}": T for name, T in initial_maps.items()}
+    maps |= {f"{name}{REFINED}": refined(spectra, T) for name, T in initial_maps.items()}
     return errors(pair, mesh_x, mesh_y, maps, seed)
 
 

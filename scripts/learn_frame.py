@@ -109,17 +109,20 @@ def sampled(pair: DataPair) -> Sampled:
     spectra = paired_spectra(pair_of_meshes, EIGENVECTORS)
     samples = [farthest_point_samples(mesh, SAMPLES) for mesh in (mesh_x, mesh_y)]
     positions = [
-        unit_area_positions(mesh)[chosen] for mesh, chosen in zip((mesh_x, mesh_y), samples, strict=True)
+        unit_area_positions(mesh)[of_mesh] for mesh, of_mesh in zip((mesh_x, mesh_y), samples, strict=True)
     ]
 
     def nearest(pointwise_map: np.ndarray, source: int, mesh: Mesh) -> np.ndarray:
         """Restrict a map between all vertices to the samples, and move each match to the nearest sample."""
-        found = unit_area_positions(mesh)[pointwise_map[samples[source]]]
-        return KDTree(positions[1 - source]).query(found)[1].astype(np.int32)
+        images = unit_area_positions(mesh)[pointwise_map[samples[source]]]
+        return KDTree(positions[1 - source]).query(images)[1].astype(np.int32)
 
     truth = pair.ground_truth(mesh_x, mesh_y).everywhere(mesh_x)[samples[0]]
     return Sampled(
-        *(spectrum.sample(jnp.asarray(chosen)) for spectrum, chosen in zip(spectra, samples, strict=True)),
+        *(
+            spectrum.sample(jnp.asarray(of_shape))
+            for spectrum, of_shape in zip(spectra, samples, strict=True)
+        ),
         *(jnp.asarray(place, jnp.float32) for place in positions),
         jnp.asarray(nearest(initial_map(pair_of_meshes, *spectra), 0, mesh_y)),
         jnp.asarray(nearest(initial_map(pair_of_meshes.reversed(), *spectra[::-1]), 1, mesh_x)),
@@ -140,8 +143,8 @@ def soft_map(
 
 def distance_to_truth(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
     """Return the loss `labels`: the mean distance between soft matches and the ground truth."""
-    found = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
-    return root_mean_square(found.pull_back, pair.positions_y, pair.truth)
+    matched = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
+    return root_mean_square(matched.pull_back, pair.positions_y, pair.truth)
 
 
 def round_trip_distance(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:

@@ -104,8 +104,8 @@ def root_mean_square(
     distances from the points. The function `carried` pulls functions on a shape with these positions back by
     one or several soft maps.
     """
-    found = carried(jnp.concatenate([positions, jnp.sum(positions**2, axis=1, keepdims=True)], axis=1))
-    squares = found[:, 3] - 2 * jnp.sum(found[:, :3] * wanted, axis=1) + jnp.sum(wanted**2, axis=1)
+    pulled = carried(jnp.concatenate([positions, jnp.sum(positions**2, axis=1, keepdims=True)], axis=1))
+    squares = pulled[:, 3] - 2 * jnp.sum(pulled[:, :3] * wanted, axis=1) + jnp.sum(wanted**2, axis=1)
     return jnp.mean(jnp.sqrt(jnp.maximum(squares, 0) + 1e-6))
 
 
@@ -250,8 +250,8 @@ def refined(
     m = len(initial)
     x, y = map(padded, spectra)
     initial = jnp.asarray(np.pad(np.asarray(initial), (0, x.mask.shape[0] - m)), jnp.int32)
-    found = refine(x, y, initial, refiner=refiner, iterations=ITERATIONS)
-    return np.asarray(found.pointwise_map)[:m].astype(np.int64)
+    refinement = refine(x, y, initial, refiner=refiner, iterations=ITERATIONS)
+    return np.asarray(refinement.pointwise_map)[:m].astype(np.int64)
 
 
 def errors(
@@ -260,7 +260,7 @@ def errors(
     """Return the mean geodesic error x 10³ of each map. All maps are evaluated at the same points."""
     truth = pair.ground_truth(mesh_x, mesh_y)
     options: dict[str, Any] = {"number_of_samples": EVALUATED_POINTS, "seed": seed}
-    return {name: 1e3 * geodesic_error(mesh_y, found, truth, **options).mean for name, found in maps.items()}
+    return {name: 1e3 * geodesic_error(mesh_y, T, truth, **options).mean for name, T in maps.items()}
 
 
 Measured = dict[str, list[dict[str, float]]]
@@ -376,5 +376,5 @@ def running(arguments: argparse.ArgumentParser, settings: Mapping[str, Any]) -> 
 def _public(options: argparse.Namespace) -> list[str]:
     """Return the options that affect the results, without the paths on this machine."""
     numbers = [("--steps", options.steps), ("--test-pairs", options.test_pairs), ("--seed", options.seed)]
-    given = ["--quick"] if options.quick else [str(part) for pair in numbers[:2] for part in pair]
-    return ["DATA_DIRECTORY", *given, *map(str, numbers[2])]
+    counts = ["--quick"] if options.quick else [str(part) for pair in numbers[:2] for part in pair]
+    return ["DATA_DIRECTORY", *counts, *map(str, numbers[2])]

@@ -85,15 +85,15 @@ def find_data_sets(data: Path, names: list[str] | None) -> list[DataSet]:
         return [open_data_set(data / name) for name in names]
     if not data.is_dir():
         raise InputError(f"{data}: is not a directory: give the directory that holds the data sets.")
-    found = []
+    data_sets = []
     for directory in sorted(path for path in data.iterdir() if path.is_dir()):
         try:
-            found.append(open_data_set(directory))
+            data_sets.append(open_data_set(directory))
         except InputError as error:
             print(f"left out: {error}")
-    if not found:
+    if not data_sets:
         raise InputError(f"{data}: holds no data set: give the directory that holds the data sets.")
-    return found
+    return data_sets
 
 
 def is_isometric(data_set: DataSet) -> bool:
@@ -106,17 +106,17 @@ def is_isometric(data_set: DataSet) -> bool:
 def table1(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
     """Yield the runs of all methods on full near-isometric shapes."""
     for data_set in filter(is_isometric, data_sets):
-        pairs = chosen(data_set, options)
-        found = methods(pairs, options)
-        found.pop("smooth-shells", None)  # table2
-        yield Run("table1", data_set.name, data_set, pairs, found, same(options))
+        pairs = drawn_pairs(data_set, options)
+        every = methods(pairs, options)
+        every.pop("smooth-shells", None)  # table2
+        yield Run("table1", data_set.name, data_set, pairs, every, same(options))
 
 
 def table2(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
     """Yield the runs of MWP, `accurate` and SmoothShells on full near-isometric shapes."""
     some = {name: METHODS[name] for name in TABLE2_METHODS}
     for data_set in filter(is_isometric, data_sets):
-        yield Run("table2", data_set.name, data_set, chosen(data_set, options), some, same(options))
+        yield Run("table2", data_set.name, data_set, drawn_pairs(data_set, options), some, same(options))
 
 
 def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
@@ -128,7 +128,7 @@ def fig6(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
             pairs = tuple(pair for pair in data_set.pairs if pair.source.startswith(kind))
             if pairs:
                 name, subset = f"{data_set.name}-{kind}", dataclasses.replace(data_set, pairs=pairs)
-                some = chosen(subset, options)
+                some = drawn_pairs(subset, options)
                 yield Run("fig6", name, subset, some, methods(pairs, options), same(options))
 
 
@@ -136,7 +136,7 @@ def fig7(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
     """Yield the runs on shapes with topological noise."""
     for data_set in data_sets:
         if data_set.layout == "SHREC'16 topology":
-            pairs = chosen(data_set, options)
+            pairs = drawn_pairs(data_set, options)
             yield Run("fig7", data_set.name, data_set, pairs, methods(pairs, options), same(options))
 
 
@@ -145,7 +145,7 @@ def fig9(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]
     some = {name: METHODS[name] for name in FIG9_METHODS}
     few = argparse.Namespace(**{**vars(options), "pairs": max(2, (options.pairs or 40) // FIG9_SHARE)})
     for data_set in filter(is_isometric, data_sets):
-        pairs = chosen(data_set, few)
+        pairs = drawn_pairs(data_set, few)
         for init in (*INITIAL_MAPS, *published(data_set)):
             setting = same(options, init=init, mirrored=_can_mirror(init, pairs))
             yield Run("fig9", f"{data_set.name}-from-{Path(init).name}", data_set, pairs, some, setting)
@@ -171,7 +171,7 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
             finished = {
                 Path(path).name: PublishedMaps(Path(path)) for path in directories if path not in initial
             }
-            name, pairs = f"{data_set.name}-from-{Path(init).name}", chosen(data_set, options)
+            name, pairs = f"{data_set.name}-from-{Path(init).name}", drawn_pairs(data_set, options)
             every = methods(pairs, options) | finished
             yield Run("nonisometric", name, data_set, pairs, every, same(options, init=init))
 
@@ -179,15 +179,15 @@ def nonisometric(data_sets: list[DataSet], options: argparse.Namespace) -> Itera
 def settings(data_sets: list[DataSet], options: argparse.Namespace) -> Iterator[Run]:
     """Yield the runs with the published settings and with other settings."""
     for data_set in filter(is_isometric, data_sets):
-        pairs = chosen(data_set, options)
+        pairs = drawn_pairs(data_set, options)
         yield Run("settings", data_set.name, data_set, pairs, other_settings(), same(options))
 
 
 def other_settings() -> dict[str, Method]:
     """Return the methods with their published settings, and with each change in `_CHANGES`."""
-    found = {"initial": METHODS["initial"]}
+    variants = {"initial": METHODS["initial"]}
     for name, changes in _CHANGES.items():
-        method = found[name] = METHODS[name]
+        method = variants[name] = METHODS[name]
         assert dataclasses.is_dataclass(method)
         reference = method.reference.partition(":")[0]
         for change in changes:
@@ -195,10 +195,10 @@ def other_settings() -> dict[str, Method]:
                 _NAMES.get(setting, setting): value for setting, value in change.items()
             }
             label = ", ".join(f"{setting} = {value}" for setting, value in change.items())
-            found[f"{name}: {label}"] = dataclasses.replace(
+            variants[f"{name}: {label}"] = dataclasses.replace(
                 method, reference=f"{reference}, with {label}", **changed
             )
-    return found
+    return variants
 
 
 _NAMES = {"k": "number_of_eigenvectors"}
@@ -213,7 +213,7 @@ _CHANGES: dict[str, list[dict[str, int]]] = {
 EXPERIMENTS = {f.__name__: f for f in (table1, table2, fig6, fig7, fig9, nonisometric, settings)}
 
 
-def chosen(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
+def drawn_pairs(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
     """Return the pairs of a data set that the run measures."""
     return choose_pairs(data_set, None if options.pairs is None else str(options.pairs), options.seed)
 
@@ -306,14 +306,14 @@ def perform(run: Run, output: Path, executor: Executor) -> tuple[Results, dict[s
     return results, write_tables(directory, run.data_set, results, run.settings, run.methods)
 
 
-def overview(found: Mapping[tuple[str, str], Mapping[str, MethodSummary]]) -> str:
+def overview(tables: Mapping[tuple[str, str], Mapping[str, MethodSummary]]) -> str:
     """Return a table for each experiment. Each cell contains the mean error and the seconds of one method."""
     parts = [
         "# The paper's comparisons",
         "Each cell contains the mean error x 10⁻³ √area, and the seconds from the initial map to the result.",
     ]
-    for experiment in dict.fromkeys(experiment for experiment, _ in found):
-        columns = {name: summaries for (own, name), summaries in found.items() if own == experiment}
+    for experiment in dict.fromkeys(experiment for experiment, _ in tables):
+        columns = {name: summaries for (own, name), summaries in tables.items() if own == experiment}
         names = dict.fromkeys(name for summaries in columns.values() for name in summaries)
         rows = [["method", *(f"[{name}]({experiment}/{name}/summary.md)" for name in columns)]]
         rows += [[name, *(_cell(summaries.get(name)) for summaries in columns.values())] for name in names]
@@ -344,15 +344,15 @@ def main() -> None:
         options.pairs = min(options.pairs or 2, 2)
     try:
         data_sets = find_data_sets(options.data, options.sets)
-        found: dict[tuple[str, str], dict[str, MethodSummary]] = {}
+        tables: dict[tuple[str, str], dict[str, MethodSummary]] = {}
         failures: dict[str, str] = {}
         with open_executor(options.workers, options.scheduler) as executor:
             for name in options.only:
                 for run in EXPERIMENTS[name](data_sets, options):
-                    results, found[run.experiment, run.name] = perform(run, options.output, executor)
+                    results, tables[run.experiment, run.name] = perform(run, options.output, executor)
                     for what, why in results.failures.items():
                         failures[f"{run.experiment}, {run.name}, {what}"] = why
-                    write_text(options.output / "README.md", overview(found))
+                    write_text(options.output / "README.md", overview(tables))
         Results([], {}, failures).check()
     except InputError as error:
         parser.exit(2, "\n".join([*error.lines(), ""]))

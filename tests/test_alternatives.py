@@ -204,13 +204,13 @@ def test_maps_that_look_right_are_compared(
         yield truth
 
     monkeypatch.setattr(Alternatives, "best", best)
-    monkeypatch.setattr(Judge, "score", lambda self, scored: -float(len(scored.outcome.refinements) == 1))
+    monkeypatch.setattr(Judge, "score", lambda self, scored: -float(len(scored.outcome.runs) == 1))
     settings = replace(REPAIR, suspicious=100.0, suspicious_area=1.0, compared=compared, finalists=finalists)
     pair = prepared(mesh_x, mesh_y, partial=is_partial)
     start = make_start(pair, "shot")._replace(origin=init)
     found = refine_and_repair(pair, start, replace(TWO_STAGES, repair=settings))
     assert asked == [True] * compares and not found.suspicious
-    assert len(found.outcome.refinements) == (1 if compares else 2)
+    assert len(found.outcome.runs) == (1 if compares else 2)
 
 
 def test_creased_alternatives_are_right_and_use_other_features(pair, monkeypatch):
@@ -256,7 +256,7 @@ def test_a_second_attempt_uses_crease_eigenvectors(
         yield from [truth] * creased
 
     monkeypatch.setattr(Alternatives, "best", best)
-    monkeypatch.setattr(Judge, "score", lambda self, scored: score * (len(scored.outcome.refinements) == 1))
+    monkeypatch.setattr(Judge, "score", lambda self, scored: score * (len(scored.outcome.runs) == 1))
     settings = replace(
         REPAIR, suspicious=0.1, doubtful=0.1, non_isometric=non_isometric, finalists=1, rounds=0
     )
@@ -264,7 +264,7 @@ def test_a_second_attempt_uses_crease_eigenvectors(
     found = refine_and_repair(pair, make_start(pair, "shot"), replace(TWO_STAGES, repair=settings))
     assert [creased for _, creased in asked] == [False] + [True] * tried
     assert all(known == asked[0][0] for known, _ in asked)  # both attempts also start from the usual map
-    assert len(found.outcome.refinements) == (1 if replaced else 2)
+    assert len(found.outcome.runs) == (1 if replaced else 2)
     assert found.suspicious
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from jaxsmw import InputError, creature_pair, match
 from jaxsmw.collection import (
@@ -25,14 +26,16 @@ from jaxsmw.collection.pairs import prepare_task
 from jaxsmw.collection.shapes import prepare_collection, prepare_shape, preset_key
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
 from jaxsmw.core.banks import LowPass
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.creature import creature
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching.executor import SpectralPair, Start, run_batches
+from jaxsmw.matching.executor import SpectralPair, Start, run, run_batches
+from jaxsmw.matching.preparation import prepare_shapes
 from jaxsmw.matching.search.chirality import Decision
-from jaxsmw.matching.stages import PRESETS, Preset, Stage
+from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
 
 
 def random_distances(number, seed=0):
@@ -80,7 +83,7 @@ def test_the_graph_contains_the_minimum_spanning_tree_and_is_connected_with_few_
 def test_added_shapes_add_only_their_own_edges():
     distances = random_distances(20)
     before = choose_edges(distances[:16, :16], edges_per_shape=3)
-    after = choose_edges(distances, edges_per_shape=3, given=before)
+    after = choose_edges(distances, edges_per_shape=3, matched=before)
     assert set(before) <= set(after)
     added = set(after) - set(before)
     assert len(added) == 3 * 4
@@ -90,15 +93,15 @@ def test_added_shapes_add_only_their_own_edges():
         18,
         19,
     }
-    assert choose_edges(distances, edges_per_shape=3, given=after) == after
+    assert choose_edges(distances, edges_per_shape=3, matched=after) == after
 
 
 def test_a_removed_shape_does_not_split_the_graph():
     distances = random_distances(6)
     star = [(0, 1), (0, 2), (0, 3)]
-    assert is_connected(choose_edges(distances[:4, :4], given=star), 4)
+    assert is_connected(choose_edges(distances[:4, :4], matched=star), 4)
     # Shape 0 was removed, and with it all edges of the star; shapes 3 and 4 are still matched with each other.
-    assert is_connected(choose_edges(distances, edges_per_shape=2, given=[(1, 2), (3, 4)]), 6)
+    assert is_connected(choose_edges(distances, edges_per_shape=2, matched=[(1, 2), (3, 4)]), 6)
 
 
 def test_random_edges_depend_on_the_seed_only():
@@ -277,10 +280,10 @@ def test_the_medoid_has_the_smallest_sum_of_path_errors(body):
         (np.ones((3, 3)), {"random_share": True}, "random_share is True"),
         (np.ones((3, 3)), {"seed": -1}, "seed is -1: give a whole number of at least 0"),
         (np.ones((3, 3)), {"seed": 1.0}, "seed is 1.0"),
-        (np.ones((3, 3)), {"given": [(0, 3)]}, "3 shapes"),
-        (np.ones((3, 3)), {"given": [(0, 1), (0, 1.0)]}, "given edge 1 is"),
-        (np.ones((3, 3)), {"given": [3]}, "given edge 0 is 3"),
-        (np.ones((3, 3)), {"given": [(1, 1)]}, "joins shape 1 to itself"),
+        (np.ones((3, 3)), {"matched": [(0, 3)]}, "3 shapes"),
+        (np.ones((3, 3)), {"matched": [(0, 1), (0, 1.0)]}, "given edge 1 is"),
+        (np.ones((3, 3)), {"matched": [3]}, "given edge 0 is 3"),
+        (np.ones((3, 3)), {"matched": [(1, 1)]}, "joins shape 1 to itself"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -362,7 +365,7 @@ def test_batches_are_not_refined_a_second_time(three, monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("a stage ran on a single pair")
 
-    monkeypatch.setattr("jaxsmw.matching.executor._run_one", refuse)
+    monkeypatch.setattr("jaxsmw.matching.executor.run", refuse)
     monkeypatch.setattr("jaxsmw.matching.search.repair.run", refuse)
     found = match_pairs(three, PAIRS, preset="paper", batch_size=3)
     assert len(dict(found)) == len(PAIRS)
@@ -375,7 +378,21 @@ def test_the_first_failure_of_a_batch_is_reported(three, monkeypatch):
     broken = SpectralPair(shape.spectrum, replace(shape.spectrum, eigenvectors=eigenvectors))
     identity = np.arange(len(three[0].vertices))
     (outcome,) = run_batches([Stage(), Stage()], [(broken, Start(identity))], batch_size=1)
-    assert [found.result == RESULTS.nonfinite_spectrum for found in outcome.refinements] == [True]
+    assert [run.refinement.result == RESULTS.nonfinite_spectrum for run in outcome.runs] == [True]
+
+
+def test_batches_take_pairs_with_and_without_crease_eigenvectors(three):
+    """Large meshes have no crease eigenvectors, so neither do pairs with them."""
+    stage = Stage(FeatureRegression((8, 12)), number_of_crease_eigenvectors=4)
+    *creased, bare = (shape.spectrum for shape in prepare_shapes(three, Sizes(12, 4)))
+    spectra = [*creased, bare.with_crease_eigenvectors(None)]
+    tasks = []
+    for i, j in ((0, 1), (0, 2), (2, 1), (1, 0)):
+        _, nearest = KDTree(three[j].vertices).query(three[i].vertices)
+        tasks.append((SpectralPair(spectra[i], spectra[j]), Start(nearest)))
+    for outcome, task in zip(run_batches([stage], tasks, batch_size=2), tasks, strict=True):
+        alone = run([stage], *task)
+        assert outcome.successful and np.mean(outcome.pointwise_map == alone.pointwise_map) > 0.99
 
 
 def test_presets_of_different_arrays_have_different_keys():

@@ -6,9 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from synthetic import body_with_arms
 
 from jaxsmw import compiler_options
+from jaxsmw.core.refinement import refine
 from jaxsmw.functional_maps import nearest_neighbor
+from jaxsmw.geometry.eigenbasis import compute_spectrum
+from jaxsmw.matching.executor import SpectralPair, Start, compile_stage, run
+from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime import compilation
 from jaxsmw.runtime.compilation import compile_ahead, compiled, release_programs
 
@@ -124,3 +129,14 @@ def test_programs_are_released_when_they_use_many_memory_maps(monkeypatch):
         release_programs()
         compiled(total)(jnp.zeros(7))
         assert len(traced) == times
+
+
+def test_a_stage_that_was_compiled_ahead_is_not_compiled_again():
+    mesh = body_with_arms(2)
+    spectrum = compute_spectrum(mesh, 12)
+    stage, n = Stage(number_of_eigenvectors=10, iterations=1), len(mesh.vertices)
+    programs = compilation._compiled(refine, jax.default_backend())._programs
+    before = set(programs)
+    compile_stage(stage, n, n)
+    (outcome,) = run([stage], SpectralPair(spectrum, spectrum), [Start(np.arange(n))])
+    assert outcome.successful and len(set(programs) - before) == 1

@@ -30,7 +30,6 @@ from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching import preparation
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.executor import reverse_map
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import describe, paired_spectra
@@ -194,7 +193,7 @@ def test_the_reverse_map_of_registration_compares_all_columns():
     queries, database = (np.asarray(points) for points in found._embeddings())
     assert database.shape[1] > found.functional_map.shape[0]
     with found._precision():
-        reverse = reverse_map(found._refiner, found._spectra, found.refinement.state)
+        reverse = found._last.reverse_map()
     _, nearest = KDTree(queries[found.mesh_x.referenced_vertices]).query(database)
     expected = np.flatnonzero(found.mesh_x.referenced_vertices)[nearest]
     agree = reverse == expected
@@ -217,7 +216,7 @@ def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, search):
     points = [np.asarray(p) for p in found._embeddings()]
     # Registration also compares columns that are not eigenvectors.
     assert (points[1].shape[1] > found.functional_map.shape[0]) == (refiner is Registration)
-    reverse = reverse_map(found._refiner, found._spectra, found.refinement.state)
+    reverse = found._last.reverse_map()
     np.testing.assert_array_equal(found.pointwise_map, KDTree(points[1]).query(points[0])[1])
     np.testing.assert_array_equal(reverse, KDTree(points[0]).query(points[1])[1])
 

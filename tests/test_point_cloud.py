@@ -292,7 +292,7 @@ HOSTILE = {
     "nan.xyz": (b"nan nan nan\n" * 30, "cannot represent a surface"),
     "binary.xyz": (bytes(range(256)) * 4, "not a text file"),
     "empty.npy": (b"", "is empty"),
-    "text.npy": (b"1 2 3\n" * 30, "not a .npy file"),
+    "text.npy": (b"1 2 3\n" * 30, "is not an array saved by NumPy"),
     "no data.pcd": (b"FIELDS x y z\n", "no line DATA"),
     "empty.pcd": (b"", "is empty"),
     "no header.pcd": (b"DATA ascii\n" + lines(POINTS).encode(), "the header is damaged"),

@@ -63,7 +63,7 @@ def identity(body):
 def prepared_body(body, initial_map, origin="map"):
     """Return the prepared pair of the body and itself, and the start from a map."""
     mesh, spectrum = body
-    prepared = PreparedPair.of(Pair(mesh, mesh), spectrum, spectrum)
+    prepared = PreparedPair.from_spectra(Pair(mesh, mesh), spectrum, spectrum)
     return prepared, Start(np.asarray(initial_map, np.int64), origin)
 
 
@@ -96,7 +96,7 @@ def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), init="map"):
     prepared, start = prepared_body(body, initial_map, init)
     preset, mesh = Preset(repeated=tuple(stages), repair=repair), body[0]
     found = refine_and_repair(prepared, start, preset)
-    found = refine_further(prepared, start.origin, preset, found)
+    found = refine_further(prepared, start, preset, found)
     assert found.successful
     wrong = found.pointwise_map != np.arange(len(mesh.vertices))
     return mesh.vertex_areas[wrong].sum() / mesh.area, found
@@ -112,7 +112,7 @@ def test_padding_changes_nothing(body, swapped, monkeypatch):
     padded_size = executor.padded_size
     monkeypatch.setattr(executor, "padded_size", lambda size: padded_size(size) + 20)
     _, more = outcome(body, swapped)
-    padded, padded_more = (one.outcome.last.pointwise_map.shape[0] for one in (found, more))
+    padded, padded_more = (one.outcome.last.refinement.pointwise_map.shape[0] for one in (found, more))
     assert padded_more == padded + 20
     np.testing.assert_array_equal(more.pointwise_map, found.pointwise_map)
 
@@ -186,9 +186,9 @@ def test_passes_do_not_clear_the_suspicion(body, identity):
     once = refine_and_repair(prepared, start, UNREPAIRED)
     preset = replace(UNREPAIRED, repair=settings)
     for suspicious in (True, False):
-        found = refine_further(prepared, "map", preset, replace(once, suspicious=suspicious))
+        found = refine_further(prepared, start, preset, replace(once, suspicious=suspicious))
         assert found.suspicious == suspicious and found.distortion < 10
-        assert len(found.outcome.refinements) == 1
+        assert len(found.outcome.runs) == 1
 
 
 @pytest.mark.parametrize(("limit", "used"), [(0.0, False), (10.0, True)])
@@ -207,7 +207,7 @@ def test_passes_use_crease_eigenvectors_only_for_similar_shapes(body, limit, use
         once = refine_and_repair(prepared, begin, preset)
         first.append(once.pointwise_map)
         once = replace(once, outcome=Outcome(begin.pointwise_map))
-        found = refine_further(prepared, "map", replace(preset, repair=settings), once)
+        found = refine_further(prepared, begin, replace(preset, repair=settings), once)
         after.append(found.pointwise_map)
     assert np.any(first[0] != first[1])
     assert np.any(after[0] != after[1]) == used
@@ -221,12 +221,12 @@ def test_passes_that_worsen_the_score_are_undone(body, monkeypatch):
     prepared, begin = prepared_body(body, start)
     once = refine_and_repair(prepared, begin, Preset(repeated=(Stage(FeatureRegression((30,))),)))
     preset = replace(UNREPAIRED, repair=settings)
-    further = partial(refine_further, prepared, "map", preset)
+    further = partial(refine_further, prepared, begin, preset)
 
     def score(self, scored, *, after):
         return after if np.any(scored.pointwise_map != once.pointwise_map) else 0.0
 
-    assert refine_further(prepared, "map", replace(preset, repair=replace(settings, passes=0)), once) is once
+    assert refine_further(prepared, begin, replace(preset, repair=replace(settings, passes=0)), once) is once
     for after, kept in ((-1.0, False), (0.9, False), (1.1, True), (np.nan, True)):
         monkeypatch.setattr(Judge, "score", partialmethod(score, after=after))
         assert (further(once) is once) == kept
@@ -244,11 +244,11 @@ def test_a_rival_replaces_the_map_if_its_score_is_better_after_the_passes(body, 
     ):
         chosen = replace(UNREPAIRED, repair=replace(settings, rival_margin=margin))
         rivalled = replace(first, suspicious=True, rivals=(rival,))
-        found = refine_further(prepared, "map", chosen, rivalled)
+        found = refine_further(prepared, start, chosen, rivalled)
         np.testing.assert_array_equal(found.pointwise_map, expected)
         assert found.suspicious
         # If the map looks right, so does its rival, and the better score decides.
-        found = refine_further(prepared, "map", chosen, replace(rivalled, suspicious=False))
+        found = refine_further(prepared, start, chosen, replace(rivalled, suspicious=False))
         np.testing.assert_array_equal(found.pointwise_map, identity)
         assert not found.suspicious
 
@@ -358,13 +358,14 @@ def test_final_stages_run_once_after_repair(body, swapped, identity, monkeypatch
     preset = Preset(repeated=(STAGE,), final=(final,), repair=repair)
     ran = []
 
-    def watched(stages, spectra, starts, **options):
+    def watched(stages, spectra, start):
         ran.extend(stages)
-        return run(stages, spectra, starts, **options)
+        return run(stages, spectra, start)
 
     monkeypatch.setattr("jaxsmw.matching.search.repair.run", watched)
     found = match(mesh, mesh, preset=preset, init=swapped, mirror="no", history=True)
-    assert ran.count(final) == 1 and ran[-1] == final and ran.count(STAGE) > 2
+    recorded = replace(final, history=True)
+    assert ran.count(recorded) == 1 and ran[-1] == recorded and ran.count(STAGE) > 2
     assert found.refinement.history.energy.shape[0] == 2
     before = match(mesh, mesh, preset=replace(preset, final=()), init=swapped, mirror="no")
     after = match(mesh, mesh, preset=Preset((final,)), init=before.pointwise_map, mirror="no")

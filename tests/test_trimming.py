@@ -172,7 +172,7 @@ def test_all_trims_share_one_program_that_is_compiled_ahead(pose, part, compilat
     _, target, truth = pose
     twice = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=2))
     found = match(part, target, partial=True, preset=twice, init=rough(target, truth))
-    assert len(found.preset.judged) == 2
+    assert len(found.preset.before_final) == 2
     assert compilations.count("jit(refine)") == 3
 
 

@@ -113,9 +113,9 @@ def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
 def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[str, Any]]:
     """Return the contents of `provenance.json`."""
     # Only the name of the directory with initial maps is stored, because its path may change.
-    chosen = asdict(settings) | {"init": Path(settings.init).name}
+    named = asdict(settings) | {"init": Path(settings.init).name}
     return {
-        "settings": chosen | {"number_of_eigenvectors": number_of_eigenvectors},
+        "settings": named | {"number_of_eigenvectors": number_of_eigenvectors},
         "versions": versions() | {"code": code_digest(measured_code())},
     }
 

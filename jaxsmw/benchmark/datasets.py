@@ -336,11 +336,11 @@ def _within_classes(names: Iterable[str]) -> list[tuple[str, str]]:
 def _listed_first(
     pair: Callable[[str, str], DataPair],
     listed: Iterable[tuple[str, str]] | None,
-    known: Iterable[tuple[str, str]],
+    with_truth: Iterable[tuple[str, str]],
 ) -> _Pairs:
     """Return the listed pairs (all pairs if there is no list), and the other pairs with ground truth."""
-    wanted = dict.fromkeys(known if listed is None else listed)
-    others = (names for names in known if names not in wanted)
+    wanted = dict.fromkeys(with_truth if listed is None else listed)
+    others = (names for names in with_truth if names not in wanted)
     return [pair(*names) for names in wanted], [pair(*names) for names in others]
 
 
@@ -351,7 +351,7 @@ def _remeshed(directory: Path) -> _Pairs | None:
     if not plain:
         return None
     folders = (folder for folder in sorted(directory.iterdir()) if folder.is_dir() and folder != truths)
-    shapes = next((found for found in map(_meshes, folders) if set(found) & set(plain)), {})
+    shapes = next((meshes for meshes in map(_meshes, folders) if meshes.keys() & plain.keys()), {})
     if not shapes:
         raise InputError(
             f"{directory}: has {len(plain)} .vts files in corres/, but no folder with their meshes: put the "
@@ -403,8 +403,8 @@ def _shrec19(directory: Path) -> _Pairs | None:
             )
         return DataPair(x, y, shapes[x], shapes[y], (truths[x, y],), index_base=1)
 
-    known = [names for names in truths if set(names) <= set(shapes)]
-    return _listed_first(pair, _listed_pairs(directory, shapes), known)
+    with_truth = [names for names in truths if shapes.keys() >= set(names)]
+    return _listed_first(pair, _listed_pairs(directory, shapes), with_truth)
 
 
 def _partial(directory: Path) -> _Pairs | None:
@@ -413,8 +413,8 @@ def _partial(directory: Path) -> _Pairs | None:
     if not full and not partial:
         return None
     if not full or not partial:
-        found = "cuts/ or holes/ but no null/" if partial else "null/ but no cuts/ or holes/"
-        raise InputError(f"{directory}: has {found}: add the missing folder.")
+        folders = "cuts/ or holes/ but no null/" if partial else "null/ but no cuts/ or holes/"
+        raise InputError(f"{directory}: has {folders}: add the missing folder.")
     pairs = []
     for name, file in partial.items():
         match = re.fullmatch(r"(?:cuts|holes)_(.+)_shape_\d+", name)
@@ -464,7 +464,7 @@ def _characters(directory: Path) -> _Pairs | None:
     for folder in sorted(directory.iterdir()):
         if folder.is_dir() and folder.name != "corres" and not shapes:
             classes = (inner for inner in sorted(folder.iterdir()) if inner.is_dir())
-            shapes = {f"{one.name}/{name}": file for one in classes for name, file in _meshes(one).items()}
+            shapes = {f"{c.name}/{name}": file for c in classes for name, file in _meshes(c).items()}
     _check_complete(directory, shapes, truths)
 
     def pair(x: str, y: str, *between: Path) -> DataPair:
@@ -472,9 +472,9 @@ def _characters(directory: Path) -> _Pairs | None:
 
     others = []
     for file in sorted((directory / "corres" / _BETWEEN_CLASSES).glob("*_*.vts")):
-        one, _, another = file.stem.partition("_")
-        of_one, of_another = ([name for name in shapes if class_of(name) == c] for c in (one, another))
-        others += [pair(x, y, file) for x in of_one for y in of_another]
+        class_x, _, class_y = file.stem.partition("_")
+        of_x, of_y = ([name for name in shapes if class_of(name) == c] for c in (class_x, class_y))
+        others += [pair(x, y, file) for x in of_x for y in of_y]
     return [pair(*names) for names in _within_classes(shapes)], others
 
 

@@ -92,27 +92,27 @@ class StoredResults:
         kept = ("mirrored", "evaluated_points", "seed")
         self.settings = Settings(init, **{name: stored[name] for name in kept})
 
-    def chosen_methods(self, given: Sequence[str] | None, known: Container[str]) -> list[str]:
+    def chosen_methods(self, requested: Sequence[str] | None, available: Container[str]) -> list[str]:
         """Return the methods to measure again, as names or directories with maps of stored methods.
 
-        By default, these are all stored methods, which must be `known` methods that need no directory.
+        By default, these are all stored methods, which must be `available` methods that need no directory.
 
         **Raises:** `InputError` if there are no stored results of a method, or a stored method needs a
         directory.
         """
-        if given is None:
-            if unknown := [name for name in self.methods if name not in known]:
+        if requested is None:
+            if unknown := [name for name in self.methods if name not in available]:
                 raise InputError(
                     f"{self.path}: contains the method {unknown[0]}, whose maps come from a directory: give "
                     "--methods, with this directory or without this method."
                 )
             return self.methods
-        if missing := [name for name in given if Path(name).name not in self.methods]:
+        if missing := [name for name in requested if Path(name).name not in self.methods]:
             raise InputError(
                 f"{self.path}: has no results of the method {missing[0]}: choose from "
                 f"{', '.join(self.methods)}."
             )
-        return list(given)
+        return list(requested)
 
     def draw(self, data_set: DataSet, seed: int) -> list[DataPair]:
         """Draw a tenth of the stored pairs at random, but at least one pair.

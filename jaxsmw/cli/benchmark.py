@@ -15,6 +15,7 @@ from jaxsmw.cli.console import report_progress, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
 from jaxsmw.cli.outputs import check_outputs
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import make_directory
 from jaxsmw.wording import count_of
 
 HELP = "match many pairs of a data set and measure the errors; an interrupted run can be continued"
@@ -124,7 +125,6 @@ def _measure(options: argparse.Namespace) -> None:
     from jaxsmw.benchmark.opponents.registry import find_methods, suited_methods
     from jaxsmw.benchmark.protocols import protocol_pairs
     from jaxsmw.benchmark.tables import markdown_table, write_tables
-    from jaxsmw.runtime.files import make_directory
     from jaxsmw.runtime.workers import open_executor
 
     data_set = open_data_set(options.data)
@@ -170,19 +170,19 @@ def _verify(options: argparse.Namespace) -> None:
     report_progress(f"{data_set.layout}: measuring {count_of(len(pairs), 'stored pair')} again")
     announce_consequence("the stored results are unchanged")
     with quiet_children(), open_executor(options.workers, options.scheduler) as executor:
-        found = stored.measure_again(data_set, pairs, methods, executor, quiet=options.quiet)
+        comparisons = stored.measure_again(data_set, pairs, methods, executor, quiet=options.quiet)
     rows = [["method", "errors", "equal", "that hold", "largest difference x10^-3"]]
     for name in methods:
-        own = [one for one in found if one.method == name]
-        equal, hold = sum(one.difference == 0 for one in own), sum(one.holds for one in own)
-        largest = max((one.difference for one in own), default=0.0)
+        own = [error for error in comparisons if error.method == name]
+        equal, hold = sum(error.difference == 0 for error in own), sum(error.holds for error in own)
+        largest = max((error.difference for error in own), default=0.0)
         rows.append([name, str(len(own)), str(equal), str(hold), f"{1000 * largest:.3g}"])
     show(markdown(rows))
-    if wrong := [one for one in found if not one.holds]:
-        worst = max(wrong, key=lambda one: one.difference)
+    if wrong := [error for error in comparisons if not error.holds]:
+        worst = max(wrong, key=lambda error: error.difference)
         raise ArithmeticError(
-            f"{options.verify}: {len(wrong)} of {len(found)} errors do not hold. The largest difference is "
-            f"that of {worst.method} on {worst.source} to {worst.target}: {worst.stored:.4f} is stored, and "
-            f"{worst.measured:.4f} was measured now."
+            f"{options.verify}: {len(wrong)} of {len(comparisons)} errors do not hold. The largest "
+            f"difference is that of {worst.method} on {worst.source} to {worst.target}: {worst.stored:.4f} "
+            f"is stored, and {worst.measured:.4f} was measured now."
         )
-    show(f"All {len(found)} errors hold: they differ by at most 2 %, or by at most 0.0005.")
+    show(f"All {len(comparisons)} errors hold: they differ by at most 2 %, or by at most 0.0005.")

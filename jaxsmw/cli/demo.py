@@ -8,7 +8,8 @@ from jaxsmw.cli.arguments import add_seed, path, whole_number
 from jaxsmw.cli.console import Stopwatch, report_progress, show
 from jaxsmw.cli.measurement import estimate_error, show_match
 from jaxsmw.cli.method import add_method, check_method, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
+from jaxsmw.cli.outputs import check_outputs, report_written, write_match_report
+from jaxsmw.runtime.files import make_directory
 
 HELP = "generate a creature in two poses, match the poses and write a report"
 
@@ -43,14 +44,12 @@ def run(options: argparse.Namespace) -> None:
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         check_method(options)
-        ((output, report_files),) = report_directories(options.output)
-        check_outputs(options.init.files, directories=[(output, (*_FILES, *report_files))])
+        check_outputs(options.init.files, report=options.output, directories=[(options.output, _FILES)])
         from jaxsmw.creature import creature_pair
         from jaxsmw.evaluation.ground_truth import GroundTruth, write_ground_truth
         from jaxsmw.evaluation.metrics import geodesic_error
         from jaxsmw.io.maps import write_pointwise_map
         from jaxsmw.io.meshes import write_mesh
-        from jaxsmw.runtime.files import make_directory
     report_progress("generating the creature ...")
     with stopwatch.step("creature"):
         pair = creature_pair(options.kind, vertices=options.vertices, seed=options.seed)

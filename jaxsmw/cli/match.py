@@ -26,8 +26,9 @@ from jaxsmw.cli.measurement import (
     show_match,
 )
 from jaxsmw.cli.method import add_method, check_method, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
+from jaxsmw.cli.outputs import check_outputs, report_written, write_match_report
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import atomic_write, make_directory
 
 if TYPE_CHECKING:
     import numpy as np
@@ -132,26 +133,14 @@ def _check(options: argparse.Namespace) -> None:
     check_outputs(
         inputs,
         files=[options.output, points, options.one_to_one, expected, overlap],
-        directories=_directories(options),
+        report=options.report,
+        texture=options.texture,
     )
     from jaxsmw.io.maps import check_map_name
 
     for file in filter(None, (options.output, options.one_to_one)):
         check_map_name(file)
     import jaxsmw.matching.match  # noqa: F401 (imported here because loading is timed separately)
-
-
-def _directories(options: argparse.Namespace) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the requested directories, each with the names of the files that the command writes to it."""
-    directories: list[tuple[str, tuple[str, ...]]] = []
-    if options.texture:
-        from jaxsmw.report.figures import check_drawable
-
-        check_drawable()
-        from jaxsmw.report.texture import TEXTURE_FILES
-
-        directories.append((options.texture, TEXTURE_FILES))
-    return directories + report_directories(options.report)
 
 
 def _write_files(
@@ -191,7 +180,6 @@ def _write_points(options: argparse.Namespace, correspondence: Correspondence, p
         report_written(options.surface_points)
     if options.texture:
         from jaxsmw.report.texture import TEXTURE_FILES, write_textured_pair
-        from jaxsmw.runtime.files import make_directory
 
         directory = make_directory(options.texture)
         write_textured_pair(directory, correspondence.mesh_x, correspondence.mesh_y, points)
@@ -213,8 +201,6 @@ def _write_overlap(file: str, correspondence: Correspondence, stopwatch: Stopwat
 def _write_numbers(file: str, numbers: Shaped[np.ndarray, " m"], form: str = "%.6f") -> None:
     """Write one number per line."""
     from numpy import savetxt
-
-    from jaxsmw.runtime.files import atomic_write
 
     with atomic_write(file) as temporary:
         savetxt(temporary, numbers, form)

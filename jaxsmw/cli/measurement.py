@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias, get_args
 from jaxsmw.choices import GeodesicMethod
 from jaxsmw.cli.arguments import path, refuse_without, whole_number
 from jaxsmw.cli.console import Stopwatch, report_progress, show
+from jaxsmw.wording import percentage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -98,7 +99,6 @@ def estimate_error(correspondence: Correspondence, stopwatch: Stopwatch) -> Floa
 
 def show_quality(correspondence: Correspondence) -> None:
     """Print one line with the quality of a match."""
-    from jaxsmw.wording import percentage
 
     parts = []
     if correspondence.distortion is not None:

@@ -20,7 +20,7 @@ from jaxsmw.choices import (
 from jaxsmw.cli.arguments import add_eigenproblem, add_values, option_of, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
 from jaxsmw.cli.console import Stopwatch, report_progress, say, show
-from jaxsmw.cli.initial_map import InitialMap
+from jaxsmw.cli.inputs import InitialMap
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
@@ -207,9 +207,9 @@ def match_meshes(
         show(f"scale:       {correspondence.pair.scale:.4g} (lengths on the target / lengths on the source)")
     evidence = correspondence.mirror_evidence
     if correspondence.mirrored or evidence is not None:
-        took = "the mirror image of the source" if correspondence.mirrored else "the source itself"
-        known = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"
-        show(f"hand:        {took}{known}")
+        hand = "the mirror image of the source" if correspondence.mirrored else "the source itself"
+        reason = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"
+        show(f"hand:        {hand}{reason}")
     return correspondence
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from jaxsmw.cli.console import Stopwatch, report_progress
 from jaxsmw.cli.method import preset_name
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import atomic_write, check_directory, check_writable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,7 +32,9 @@ def check_outputs(
     files: Iterable[str | None] = (),
     figures: Iterable[str | None] = (),
     pages: Iterable[str | None] = (),
-    directories: Sequence[tuple[str, Sequence[str]]] = (),
+    report: str | None = None,
+    texture: str | None = None,
+    directories: Iterable[tuple[str, Sequence[str]]] = (),
 ) -> None:
     """Check before a long computation that all outputs can be written.
 
@@ -39,23 +42,29 @@ def check_outputs(
     `directories` are those of the files that the command writes into the directory.
     """
     files, figures, pages = ([path for path in paths if path] for paths in (files, figures, pages))
+    directories = list(directories)
+    if figures or pages or report or texture:
+        from jaxsmw.report.figures import check_drawable, check_figure_path
+
+        check_drawable()
+    if report:
+        from jaxsmw.report.summary import REPORT_FILES
+
+        directories.append((report, REPORT_FILES))
+    if texture:
+        from jaxsmw.report.texture import TEXTURE_FILES
+
+        directories.append((texture, TEXTURE_FILES))
     written = [*files, *figures, *pages]
     written += [os.path.join(directory, name) for directory, names in directories for name in names]
     _refuse_clashes(filter(None, inputs), written, [directory for directory, _ in directories])
-    from jaxsmw.runtime.files import check_directory, check_writable
-
     for path in files:
         check_writable(path)
     for path in figures:
-        from jaxsmw.report.figures import check_figure_path
-
         check_figure_path(path)
     for path in pages:
-        from jaxsmw.report.figures import check_drawable
-
         if not is_page(path):
             raise InputError(f"{path}: pages are written as .html: choose a name that ends in .html.")
-        check_drawable()
         check_writable(path)
     for path, _ in directories:
         check_directory(path)
@@ -84,18 +93,6 @@ def _refuse_place(path: str, read: set[str], taken: set[str]) -> None:
         raise InputError(f"{path}: two outputs have this name: choose another name for one of the outputs.")
 
 
-def report_directories(directory: str | None) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the directory of a report and the names of its files, for `check_outputs`."""
-    if directory is None:
-        return []
-    from jaxsmw.report.figures import check_drawable
-
-    check_drawable()
-    from jaxsmw.report.summary import REPORT_FILES
-
-    return [(directory, REPORT_FILES)]
-
-
 def is_page(path: str) -> bool:
     """Return whether a file name has the suffix of an HTML page."""
     return Path(path).suffix.lower() in (".html", ".htm")
@@ -117,7 +114,6 @@ def write_figure(path: str, figure: Figure) -> None:
 
 def write_text(path: str, text: str) -> None:
     """Write a text to a file."""
-    from jaxsmw.runtime.files import atomic_write
 
     with atomic_write(path) as temporary:
         temporary.write_text(text, "utf-8")

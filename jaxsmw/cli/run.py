@@ -13,6 +13,7 @@ from jaxsmw.cli import benchmark, cache, collection, demo, evaluate, match, rend
 from jaxsmw.cli.arguments import add_quiet, shortened
 from jaxsmw.cli.console import flush_output, log_to_console, say, show
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import check_working_directory
 
 
 def run_command(arguments: Sequence[str]) -> int:
@@ -61,7 +62,6 @@ def _run(arguments: Sequence[str]) -> None:
     with warnings.catch_warnings():
         warnings.showwarning = show_once
         from jaxsmw.runtime.cache import cache_compiled_programs
-        from jaxsmw.runtime.files import check_working_directory
         from jaxsmw.runtime.memory import check_address_space
 
         check_address_space()
@@ -105,7 +105,7 @@ class Parser(argparse.ArgumentParser):
 
     def _unknown_option(self, words: Sequence[str]) -> str | None:
         """Return the name of the first unknown option. The name of `--x=3` is `--x`."""
-        known = self._option_string_actions
+        options = self._option_string_actions
         if not {"-h", "--help"}.isdisjoint(words):
             return None
         for i, word in enumerate(words):
@@ -114,14 +114,14 @@ class Parser(argparse.ArgumentParser):
                 return None
             name = word.partition("=")[0]
             # Like argparse, treat negative numbers and words with blanks as values.
-            if name in known or " " in word or not re.match(r"-(?!\.?\d).", word):
+            if name in options or " " in word or not re.match(r"-(?!\.?\d).", word):
                 continue
             # The words `--up -z` are not reported here: argparse reports that the value of `--up` is missing.
-            if len(word) > 2 or i == 0 or words[i - 1] not in known or known[words[i - 1]].nargs == 0:
+            if len(word) > 2 or i == 0 or words[i - 1] not in options or options[words[i - 1]].nargs == 0:
                 return name
         return None
 
-    def print_help(self, file: Any = None) -> None:
+    def print_help(self, file: object = None) -> None:
         """Print the help. Unlike argparse, raise an error if standard output cannot be written."""
         show(self.format_help().rstrip())
 
@@ -156,7 +156,7 @@ class _Version(argparse.Action):
             option_strings, argparse.SUPPRESS, nargs=0, default=argparse.SUPPRESS, help="print the version"
         )
 
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
         import jaxsmw
 
         show(f"jaxsmw {jaxsmw.__version__}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from concurrent.futures import ThreadPoolExecutor
+from statistics import median
 from typing import TYPE_CHECKING, get_args
 
 from jaxsmw.choices import CoordinateSystem
@@ -14,6 +15,7 @@ from jaxsmw.cli.arguments import (
     add_reading,
     add_source_and_target,
     add_up,
+    path,
     positive_number,
     refuse_without,
 )
@@ -21,7 +23,7 @@ from jaxsmw.cli.console import Stopwatch, report_progress, say, show
 from jaxsmw.cli.inputs import check_inputs, read_maps, report_mesh
 from jaxsmw.cli.measurement import show_quality
 from jaxsmw.cli.method import add_method, check_method, given_method, match_meshes
-from jaxsmw.cli.outputs import check_outputs, report_directories, report_written, write_match_report
+from jaxsmw.cli.outputs import check_outputs, report_written, write_match_report
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,15 +60,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="coordinate system of both meshes, to which landmarks are converted. By default, the coordinate "
         "system of the landmark file is assumed",
     )
-    add_paths(
-        parser,
-        {
-            "--attributes FILE": "write the target with the attributes of the source to this file: colours "
-            "and other data of vertices and faces, texture coordinates, blend shapes and skin weights. The "
-            "suffix determines the format",
-            "--report DIR": "write pictures, an interactive 3D page and a summary to this directory, like "
-            "match --report",
-        },
+    parser.add_argument(
+        "--attributes",
+        metavar="FILE",
+        type=path,
+        help="write the target with the attributes of the source to this file: colours and other data of "
+        "vertices and faces, texture coordinates, blend shapes and skin weights. The suffix determines the "
+        "format",
     )
     parser.add_argument(
         "--stiffness",
@@ -74,6 +74,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_number,
         help="length below which noise of the map is smoothed, in units of the square root of the target's "
         "area (default: 0.005)",
+    )
+    parser.add_argument(
+        "--report",
+        metavar="DIR",
+        type=path,
+        help="write pictures, an interactive 3D page and a summary to this directory, like match --report",
     )
     add_up(parser)
     add_partial(parser, with_scale=True)
@@ -145,8 +151,8 @@ def _check(options: argparse.Namespace) -> None:
     refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_output", "coordinates")
     written = options.landmarks_output or options.report
     refuse_without(options, "--landmarks-output or --report", bool(written), "landmarks")
-    if options.map and (given := given_method(options)):
-        raise InputError(f"{given[0]} has no effect with --map: give one of the two.")
+    if options.map and (names := given_method(options)):
+        raise InputError(f"{names[0]} has no effect with --map: give one of the two.")
     if options.map and options.report:
         raise InputError("--report: describes a match, but --map gives a map: leave one of the two out.")
     refuse_without(options, "--partial", options.partial, "scale")
@@ -170,7 +176,7 @@ def _check(options: argparse.Namespace) -> None:
     check_outputs(
         inputs,
         files=[options.registered, options.attributes, options.landmarks_output],
-        directories=report_directories(options.report),
+        report=options.report,
     )
     import jaxsmw.matching.match  # noqa: F401 (imported here because loading is timed separately)
 
@@ -251,25 +257,24 @@ def _transfer_landmarks(
     from jaxsmw.transfer.landmarks import transfer_landmarks
 
     with stopwatch.step("landmarks"):
-        found = transfer_landmarks(landmarks, registered, expected_error=expected_error)
-    for note in found.notes:
+        transferred = transfer_landmarks(landmarks, registered, expected_error=expected_error)
+    for note in transferred.notes:
         say(f"note: {note}")
-    _show_landmarks(found)
+    _show_landmarks(transferred)
     if options.landmarks_output:
-        write_landmark_file(options.landmarks_output, found.landmarks)
+        write_landmark_file(options.landmarks_output, transferred.landmarks)
         report_written(options.landmarks_output)
-    return found.landmarks
+    return transferred.landmarks
 
 
-def _show_landmarks(found: TransferredLandmarks) -> None:
+def _show_landmarks(transferred: TransferredLandmarks) -> None:
     """Print the expected error of each landmark, and mark large errors."""
-    if found.expected_errors is None:
+    if transferred.expected_errors is None:
         return
-    import numpy as np
-
     show("expected errors of landmarks, in the unit of the target:")
-    large = found.expected_errors > _LARGE * np.median(found.expected_errors)
-    for name, error, is_large in zip(found.landmarks.names, found.expected_errors, large, strict=True):
+    errors = transferred.expected_errors.tolist()
+    for name, error in zip(transferred.landmarks.names, errors, strict=True):
+        is_large = error > _LARGE * median(errors)
         show(
             f"  {name}: {error:.3g}{' (more than twice the median: check this landmark)' if is_large else ''}"
         )

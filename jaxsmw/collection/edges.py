@@ -74,14 +74,14 @@ class EdgeMap:
         }
 
     @classmethod
-    def of(cls, found: Correspondence) -> EdgeMap:
+    def of(cls, matched: Correspondence) -> EdgeMap:
         """Return the maps of a correspondence of `match` in both directions."""
-        assert found.distortion is not None
+        assert matched.distortion is not None
         return cls(
-            found.surface_points(),
-            found.reverse_surface_points(),
-            float(found.mesh_x.average(found.expected_error())),
-            found.distortion,
+            matched.surface_points(),
+            matched.reverse_surface_points(),
+            float(matched.mesh_x.average(matched.expected_error())),
+            matched.distortion,
         )
 
 
@@ -103,9 +103,9 @@ def match_edges(
     provide a better initial map later.
     """
     prepared = (prepare_task(task.x, task.y, init=task.init, aligned=task.aligned) for task in tasks)
-    for found in match_many(prepared, preset.without_alternatives(), devices=devices):
+    for matched in match_many(prepared, preset.without_alternatives(), devices=devices):
         try:
-            yield found if isinstance(found, ArithmeticError) else EdgeMap.of(found)
+            yield matched if isinstance(matched, ArithmeticError) else EdgeMap.of(matched)
         except ArithmeticError as error:
             yield error
 

@@ -62,7 +62,7 @@ def choose_edges(
     *,
     edges_per_shape: float | int = EDGES_PER_SHAPE,
     random_share: float = _RANDOM_SHARE,
-    given: Sequence[Edge] = (),
+    matched: Sequence[Edge] = (),
     seed: int = 0,
 ) -> list[Edge]:
     """Choose the pairs of a collection that are matched.
@@ -76,7 +76,7 @@ def choose_edges(
     - `distances`: the distances of the shapes (N, N), in any unit; see `shape_distances`.
     - `edges_per_shape`: the number of edges divided by N, if there are so many pairs.
     - `random_share`: the share of random edges, from 0 to 1.
-    - `given`: edges that are already matched and are kept. Only edges of the other shapes are then new.
+    - `matched`: edges that are already matched and are kept. Only edges of the other shapes are then new.
     - `seed`: the seed of the random edges, an integer of at least 0.
 
     **Returns:** The edges in ascending order, as tuples (i, j) of 0-based numbers with i < j.
@@ -99,20 +99,20 @@ def choose_edges(
     check_number("edges_per_shape", edges_per_shape, positive=True)
     check_number("random_share", random_share, most=1.0)
     check_whole_number("seed", seed, 0)
-    chosen = {(min(edge), max(edge)) for edge in check_pairs(given, number, "given edge")}
-    if alike := [i for i, j in chosen if i == j]:
+    kept = {(min(edge), max(edge)) for edge in check_pairs(matched, number, "given edge")}
+    if alike := [i for i, j in kept if i == j]:
         raise InputError(f"a given edge joins shape {alike[0]} to itself: leave the edge out.")
-    known = {shape for edge in chosen for shape in edge}
-    wanted = [(i, j) for i in range(number) for j in range(i + 1, number) if not known >= {i, j}]
-    new = number - len(known)
-    most = min(len(wanted), round(edges_per_shape * new)) if known else round(edges_per_shape * number)
+    old = {shape for edge in kept for shape in edge}
+    wanted = [(i, j) for i in range(number) for j in range(i + 1, number) if not old >= {i, j}]
+    new = number - len(old)
+    most = min(len(wanted), round(edges_per_shape * new)) if old else round(edges_per_shape * number)
     # The tree prefers edges that are already matched. All lengths are positive, because SciPy ignores edges
     # of length zero.
     lengths = distances + 1e-6 * (1 + distances.max(initial=0))
-    for edge in chosen:
+    for edge in kept:
         lengths[edge] *= 1e-6
     tree = minimum_spanning_tree(np.triu(lengths, 1)).tocoo()
-    added = set(zip(tree.row.tolist(), tree.col.tolist(), strict=True)) - chosen
+    added = set(zip(tree.row.tolist(), tree.col.tolist(), strict=True)) - kept
     generator = np.random.default_rng(seed)
     random = [wanted[row] for row in generator.permutation(len(wanted))]
     added |= set(random[: round(random_share * most)])
@@ -124,7 +124,7 @@ def choose_edges(
             if len(added) >= most:
                 break
             added.add(edge)
-    return sorted(chosen | added)
+    return sorted(kept | added)
 
 
 def extended_graph(
@@ -137,16 +137,16 @@ def extended_graph(
     names = [shape.mesh.name for shape in shapes]
     inputs = (float(edges_per_shape), _RANDOM_SHARE, seed)
     stored = store.load("graph", inputs)
-    given: list[Edge] = []
+    matched: list[Edge] = []
     if stored is not None:
         row = {name: number for number, name in enumerate(names)}
         pairs = stored["edges"].reshape(-1, 2).tolist()
-        given = [(row[a], row[b]) for a, b in pairs if a in row and b in row]
+        matched = [(row[a], row[b]) for a, b in pairs if a in row and b in row]
     edges = choose_edges(
         shape_distances(shapes),
         edges_per_shape=edges_per_shape,
         random_share=_RANDOM_SHARE,
-        given=given,
+        matched=matched,
         seed=seed,
     )
     store.save("graph", inputs, {"edges": np.array([[names[i], names[j]] for i, j in edges])})

@@ -77,9 +77,10 @@ def compare_hands(
         x, y = (shapes[number] for number in edge)
 
         def compute() -> dict[str, np.ndarray]:
-            found = Hands(Pair(x.mesh, y.mesh), x.spectrum, y.spectrum).decide("auto")
-            evidence = np.nan if found.evidence is None else found.evidence
-            return {"decision": np.array([found.mirrored, evidence, found.doubtful, found.asymmetric], float)}
+            decided = Hands(Pair(x.mesh, y.mesh), x.spectrum, y.spectrum).decide("auto")
+            evidence = np.nan if decided.evidence is None else decided.evidence
+            values = decided.mirrored, evidence, decided.doubtful, decided.asymmetric
+            return {"decision": np.array(values, float)}
 
         key_x, key_y = (shape_key(shape, preset, eigensolver) for shape in (x, y))
         arrays = store.get("hand", (*key_x, *key_y), compute)
@@ -91,7 +92,7 @@ def compare_hands(
     edges = choose_edges(shape_distances(shapes), edges_per_shape=_COMPARED_PER_SHAPE, seed=seed)
     first = edges[:: max(1, len(edges) // _COMPARED_FIRST)][:_COMPARED_FIRST]
     decisions = {edge: decision(edge) for edge in first}
-    if not any(found.asymmetric for found in decisions.values()):
+    if not any(decided.asymmetric for decided in decisions.values()):
         return decisions
     for number, edge in enumerate(edges):
         if edge not in decisions:

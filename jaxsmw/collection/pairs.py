@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 
 import jax
 import numpy as np
@@ -19,7 +18,7 @@ from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import Outcome, Start, run_batches
 from jaxsmw.matching.match import match_prepared
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedPair, PreparedShape, pair_up
+from jaxsmw.matching.preparation import PreparedPair, PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.matching.starts import make_start
 from jaxsmw.runtime.batches import check_devices
@@ -100,7 +99,7 @@ def prepare_task(
     - `aligned`: whether a pair without an initial map also starts from `"aligned"`.
     """
     pair = Pair(x.mesh, y.mesh)
-    prepared = replace(pair_up(pair, x, y), given=given or pair)
+    prepared = PreparedPair.of(pair, x, y, given=given)
     with warned_already():
         starts = [make_start(prepared, "shot" if init is None else init)]
         if aligned and init is None:
@@ -139,7 +138,7 @@ def match_many(
         while waiting := list(itertools.islice(group, _PAIRS_PER_DEVICE * len(devices))):
             release_programs()
             flat = [(pair.spectra, start) for _, pair, starts in waiting for start in starts]
-            outcomes = iter(run_batches(own.judged, flat, batch_size=batch_size, devices=devices))
+            outcomes = iter(run_batches(own.before_final, flat, batch_size=batch_size, devices=devices))
             for _, prepared, starts in waiting:
                 of_pair = list(itertools.islice(outcomes, len(starts)))
                 yield _matched(prepared, starts, own, of_pair)

@@ -223,7 +223,7 @@ class Collection:
         template enter the model as mirror images. If the meshes have different units, `scale` must be True.
         """
         return shape_model(
-            [one.vertices * sign for one, sign in zip(self.registered, self.signs, strict=True)],
+            [mesh.vertices * sign for mesh, sign in zip(self.registered, self.signs, strict=True)],
             scale=scale,
             weights=self.meshes[self.template].vertex_areas,
             reference=self.template,

@@ -149,13 +149,13 @@ class Network:
             n, size = len(start), padded_size(len(start))
             # Maps and vertices are padded, so that all shapes share one compiled program.
             padding = ((0, self._most - len(neighbors)), (0, size - n), (0, 0))
-            found = compiled(robust_mean)(
+            mean = compiled(robust_mean)(
                 jnp.asarray(np.pad(candidates, padding), jnp.float32),
                 jnp.asarray(pad_rows(weights / weights.max(), self._most), jnp.float32),
                 jnp.asarray(pad_rows(start, size), jnp.float32),
                 jnp.asarray(_ROBUST_SCALE, jnp.float32),
             )
-            return self._project(np.asarray(found, np.float64)[:n] * unit + center, shape)
+            return self._project(np.asarray(mean, np.float64)[:n] * unit + center, shape)
 
         return [moved(shape) for shape in range(len(self.meshes))]
 

@@ -12,6 +12,15 @@ from jaxsmw.core.search import Patches, make_patches, nearest_vertices
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
 
+# `"auto"` uses patches if the geometric mean of the numbers of vertices of X and Y is at least this number.
+# For smaller shapes, the compilation of the search in patches takes more time than the search saves.
+_PATCHES_FROM = 15_000
+# These values gave the fastest search in scripts/benchmark_speed.py. A patch of X has _QUERIES vertices. For
+# Y, the argument `rank` of `make_patches` is _RANK. If Y has _VERTICES_OF_SMALLEST vertices or fewer, a patch
+# of Y has _SMALLEST_PATCH vertices.
+_QUERIES, _RANK = 128, 5
+_SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 52, 5000
+
 
 def spectral_embeddings(
     functional_map: FunctionalMap,
@@ -119,13 +128,3 @@ def chosen_patches(
     if search == "patches" or (search == "auto" and pays):
         return search_patches(spectrum_x, spectrum_y)
     return None
-
-
-# `"auto"` uses patches if the geometric mean of the numbers of vertices of X and Y is at least this number.
-# For smaller shapes, the compilation of the search in patches takes more time than the search saves.
-_PATCHES_FROM = 15_000
-# These values gave the fastest search in scripts/benchmark_speed.py. A patch of X has _QUERIES vertices. For
-# Y, the argument `rank` of `make_patches` is _RANK. If Y has _VERTICES_OF_SMALLEST vertices or fewer, a patch
-# of Y has _SMALLEST_PATCH vertices.
-_QUERIES, _RANK = 128, 5
-_SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 52, 5000

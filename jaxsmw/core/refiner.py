@@ -46,10 +46,8 @@ class Problem(eqx.Module):
 class Prepared(eqx.Module):
     """The values that a refiner computes once per problem. A refiner may add fields.
 
-    **Attributes:**
-
-    - `spectrum_x`, `spectrum_y`: the result of `Problem.query_spectra`. Pointwise maps have one entry per
-      vertex of `spectrum_x`.
+    The spectra are the result of `Problem.query_spectra`. Pointwise maps have one entry per vertex of
+    `spectrum_x`.
     """
 
     spectrum_x: Spectrum
@@ -59,9 +57,7 @@ class Prepared(eqx.Module):
 class State(eqx.Module):
     """The values that a refiner passes from one iteration to the next. A refiner may add fields.
 
-    **Attributes:**
-
-    - `functional_map`: C (k_out, k_in), without unit, in the convention `Refiner.convention`.
+    The functional map C (k_out, k_in), without unit, has the convention `Refiner.convention`.
     """
 
     functional_map: Float[Array, "k_out k_in"]

@@ -201,10 +201,10 @@ class _Tempered(Recovery):
         query_areas: Float[Array, " m"],
         database_areas: Float[Array, " n"],
     ) -> SoftMap | SparseSoftMap:
-        return self.map_from(_normalized(queries, database, query_areas, database_areas, self.temperature))
+        return self._map_from(_normalized(queries, database, query_areas, database_areas, self.temperature))
 
     @abc.abstractmethod
-    def map_from(self, transport: _Transport) -> SoftMap | SparseSoftMap:
+    def _map_from(self, transport: _Transport) -> SoftMap | SparseSoftMap:
         """Return the soft map of scaled inputs."""
 
 
@@ -217,7 +217,7 @@ class Softmax(_Tempered):
 
     temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
 
-    def map_from(self, transport: _Transport) -> SoftMap:
+    def _map_from(self, transport: _Transport) -> SoftMap:
         b = transport.database_areas
         unknown, no_iterations = jnp.asarray(jnp.nan, b.dtype), jnp.asarray(0, jnp.int32)
         return transport.soft_map(jnp.zeros_like(b), unknown, jnp.asarray(False), no_iterations)
@@ -245,7 +245,7 @@ class NearestFew(_Tempered):
         if self.number < 1:
             raise ValueError(f"NearestFew needs at least 1 row, not {self.number}")
 
-    def map_from(self, transport: _Transport) -> SparseSoftMap:
+    def _map_from(self, transport: _Transport) -> SparseSoftMap:
         queries, database, _, b, temperature = transport
         settled_queries, settled = lax.stop_gradient((queries, database))
         unit = jnp.asarray(1, queries.dtype)
@@ -285,7 +285,7 @@ class Sinkhorn(_Tempered):
                 f"{self.tolerance}"
             )
 
-    def map_from(self, transport: _Transport) -> SoftMap:
+    def _map_from(self, transport: _Transport) -> SoftMap:
         return _sinkhorn_map(transport, self.iterations, self.tolerance)
 
 

@@ -203,9 +203,9 @@ def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, 
 def _faces(table: Table, column: int, mesh: Mesh, base: IndexBase) -> Int64[np.ndarray, " p"]:
     """Return a column of face numbers, which also count dropped faces, as rows of `mesh.faces`."""
     count = len(mesh.faces) + len(mesh.dropped_faces)
-    given = table.indices(column, count, f"faces of {mesh.name}", base)
-    faces = np.searchsorted(mesh.face_numbers, given)
-    dropped = np.isin(given, mesh.dropped_faces)
+    numbers = table.indices(column, count, f"faces of {mesh.name}", base)
+    faces = np.searchsorted(mesh.face_numbers, numbers)
+    dropped = np.isin(numbers, mesh.dropped_faces)
     if dropped.any():
         row = int(dropped.argmax())
         raise InputError(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float64, Int64
 
 
-def ratio(numerator: Any, denominator: np.ndarray, otherwise: float = 0.0) -> Any:
+def ratio(numerator: np.ndarray | float, denominator: np.ndarray, otherwise: float = 0.0) -> np.ndarray:
     """Return the quotient where the denominator is positive, and `otherwise` elsewhere."""
     shape = np.broadcast_shapes(np.shape(numerator), denominator.shape)
     quotient = np.full(shape, otherwise, np.result_type(numerator, denominator))

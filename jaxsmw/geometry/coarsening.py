@@ -15,6 +15,11 @@ from jaxsmw.geometry.sampling import maximal_independent_set
 
 Matrix = TypeVar("Matrix", np.ndarray, sp.csr_matrix)
 
+_MOST_NEIGHBORS = 100
+# A cell is large if its area is more than `_LARGE` times the mean area of a cell. The share of the total area
+# in large cells may be at most `_MOST_IN_LARGE`.
+_LARGE, _MOST_IN_LARGE = 4, 0.1
+
 
 class Coarsening(NamedTuple):
     """A generalized eigenproblem, projected onto a subspace of smooth functions; see `coarsen`."""
@@ -70,12 +75,6 @@ def coarsen(stiffness: sp.csc_matrix, mass: sp.csc_matrix, dimensions: int) -> C
         (prolongation.T @ (mass @ prolongation)).tocsc(),
         lambda values: rough(values.astype(np.float32), degree - 1),
     )
-
-
-_MOST_NEIGHBORS = 100
-# A cell is large if its area is more than `_LARGE` times the mean area of a cell. The share of the total area
-# in large cells may be at most `_MOST_IN_LARGE`.
-_LARGE, _MOST_IN_LARGE = 4, 0.1
 
 
 def _cells(graph: sp.csr_matrix, radius: int) -> sp.csr_matrix:

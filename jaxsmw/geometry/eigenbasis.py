@@ -33,6 +33,15 @@ _RESIDUAL_TOLERANCE = 1e-6
 _ORTHONORMALITY_TOLERANCE = 1e-8
 # Up to this number of vertices, a dense solver is as fast as the sparse solvers and always succeeds.
 _DENSE = 400
+# The number of vectors in a block. SuperLU holds Python's global lock while it manages memory, so other
+# threads must wait. Larger blocks reduce the time for which other threads wait, but need more products to
+# converge.
+_BLOCK = 4
+# The number of subspace dimensions per eigenvector.
+_DIMENSIONS_OF_SUBSPACE = 30
+# If one more smoothing step lowers an eigenvalue by more than this fraction, the approximation is rejected.
+# The relative error of an accepted eigenvalue is up to three times this fraction.
+_MOST_LOWERED = 0.015
 
 
 def compute_spectrum(
@@ -135,7 +144,7 @@ def check_number_of_eigenvectors(mesh: Mesh, number: int) -> None:
     """Refuse a number that `compute_spectrum` would refuse."""
     if not isinstance(number, int | np.integer):
         raise InputError(f"{mesh.name}: the number of eigenvectors is {number!r}: give an integer.")
-    referenced = len(mesh.used_vertices)
+    referenced = len(mesh.referenced_indices)
     if not 1 <= number < referenced:
         raise InputError(
             f"{mesh.name}: cannot compute {number} eigenvectors from {referenced} referenced vertices: "
@@ -154,7 +163,7 @@ def solve_on_surface(
 
     The unit is the unit of the areas. The rest is as in `compute_spectrum`.
     """
-    used = mesh.used_vertices
+    used = mesh.referenced_indices
     if len(used) < len(areas):
         stiffness, areas = stiffness[used][:, used], areas[used]
     with one_blas_thread():
@@ -168,7 +177,7 @@ def solve_on_surface(
 
 def choose_eigensolver(*meshes: Mesh) -> Literal["exact", "approximate"]:
     """Choose the eigensolver that `"auto"` stands for if the spectra of the meshes will be compared."""
-    most = max(len(mesh.used_vertices) for mesh in meshes)
+    most = max(len(mesh.referenced_indices) for mesh in meshes)
     return "exact" if most < APPROXIMATE_FROM else "approximate"
 
 
@@ -303,12 +312,6 @@ def _lanczos(
     raise RuntimeError("not all copies of a multiple eigenvalue were found")
 
 
-# The number of vectors in a block. SuperLU holds Python's global lock while it manages memory, so other
-# threads must wait. Larger blocks reduce the time for which other threads wait, but need more products to
-# converge.
-_BLOCK = 4
-
-
 def _converged(
     inverse: SuperLU, shift: float, mass: sp.csc_matrix, k: int, size: int, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -429,13 +432,6 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     if lowered > _MOST_LOWERED:
         raise RuntimeError(f"eigenvalues would be wrong by {lowered:.0%} or more")
     return eigenvalues, eigenvectors
-
-
-# The number of subspace dimensions per eigenvector.
-_DIMENSIONS_OF_SUBSPACE = 30
-# If one more smoothing step lowers an eigenvalue by more than this fraction, the approximation is rejected.
-# The relative error of an accepted eigenvalue is up to three times this fraction.
-_MOST_LOWERED = 0.015
 
 
 def _slices(number: int) -> Iterator[slice]:

@@ -41,14 +41,14 @@ def assemble_laplacian(
                 f"{mesh.name}: the robust Laplacian contains NaN, or a vertex has no positive area: remesh "
                 "the surface, or remove the triangles without area."
             )
-        used = mesh.used_vertices
+        used = mesh.referenced_indices
         scatter = sp.csc_matrix(
             (np.ones(len(used)), (used, np.arange(len(used)))), (len(mesh.vertices), len(used))
         )
         return (scatter @ stiffness @ scatter.T).tocsc(), mesh.spread(masses)
     stiffness = -igl.cotmatrix(mesh.vertices, mesh.faces).tocsc()
     areas = mesh.vertex_areas
-    if not np.isfinite(stiffness.data).all() or (areas[mesh.used_vertices] <= 0).any():
+    if not np.isfinite(stiffness.data).all() or (areas[mesh.referenced_indices] <= 0).any():
         raise InputError(
             f"{mesh.name}: the cotangent Laplacian is undefined on zero-area faces: use the robust Laplacian "
             "(laplacian='robust', on the command line --laplacian robust)."

@@ -141,26 +141,26 @@ class Mesh:
         return referenced
 
     @cached_property
-    def used_vertices(self) -> Int64[np.ndarray, " u"]:
+    def referenced_indices(self) -> Int64[np.ndarray, " u"]:
         """The indices of the referenced vertices (u,), ascending."""
         return np.flatnonzero(self.referenced_vertices)
 
     @cached_property
     def middle(self) -> Float64[np.ndarray, " 3"]:
         """The mean position of the referenced vertices (3,)."""
-        return self.vertices[self.used_vertices].mean(axis=0)
+        return self.vertices[self.referenced_indices].mean(axis=0)
 
     def compact(self) -> tuple[Float64[np.ndarray, "u 3"], Int64[np.ndarray, "f 3"]]:
-        """Return the positions of the `used_vertices`, and the faces as rows of these positions."""
+        """Return the positions of the referenced vertices, and the faces as rows of these positions."""
         number = np.cumsum(self.referenced_vertices) - 1
-        return self.vertices[self.used_vertices], number[self.faces]
+        return self.vertices[self.referenced_indices], number[self.faces]
 
     def spread(self, rows: Shaped[np.ndarray, "u ..."]) -> Shaped[np.ndarray, "n ..."]:
-        """Return the rows of the `used_vertices` as rows of all vertices, with zeros at the others."""
+        """Return rows of the referenced vertices (u, ...) as rows of all vertices, with zeros elsewhere."""
         if len(rows) == len(self.vertices):
             return rows
         everywhere = np.zeros((len(self.vertices), *rows.shape[1:]), rows.dtype)
-        everywhere[self.used_vertices] = rows
+        everywhere[self.referenced_indices] = rows
         return everywhere
 
     @cached_property
@@ -319,7 +319,7 @@ class Diagnosis:
 
 def diagnose(mesh: Mesh) -> Diagnosis:
     """Count all unusual elements of a mesh, such as boundary edges and degenerate triangles."""
-    unreferenced = len(mesh.vertices) - len(mesh.used_vertices)
+    unreferenced = len(mesh.vertices) - len(mesh.referenced_indices)
     boundary_chain = connected_components(mesh.boundary_edges, len(mesh.vertices))[1]
     return Diagnosis(
         vertices=len(mesh.vertices),
@@ -432,8 +432,8 @@ def make_mesh(
             if welded
             else "Welding changed nothing: no two vertices of faces have the same position."
         )
-    number, dropped = _distinct_faces(triangles)
-    notes += dropped
+    number, about_faces = _distinct_faces(triangles)
+    notes += about_faces
     if lost.any():
         with_lost = lost[triangles[number]].any(axis=1)
         number = number[~with_lost]
@@ -443,10 +443,8 @@ def make_mesh(
             f"{count_of(int(with_lost.sum()), 'face')} dropped."
         )
 
-    def with_faces(kept: Int64[np.ndarray, " g"]) -> Mesh:
-        return Mesh(position, triangles[kept], name, dropped_faces=np.delete(np.arange(len(triangles)), kept))
-
-    mesh = with_faces(number)
+    dropped_faces = np.delete(np.arange(len(triangles)), number)
+    mesh = Mesh(position, triangles[number], name, dropped_faces=dropped_faces)
     if mesh.degenerate_faces.all():
         raise InputError(
             f"{name}: no triangle has an area, because all corners coincide or lie on a line: "
@@ -462,7 +460,7 @@ def make_mesh(
             f"the area left out ({count_of(int(small.sum()), 'face')}): they take no part in the match, but "
             "move with their surroundings."
         )
-        mesh = replace(with_faces(number[~small]), small_faces=triangles[number[small]])
+        mesh = replace(mesh.without_faces(small), small_faces=mesh.faces[small])
     return replace(mesh, notes=(*notes, *_unusual_vertices(mesh)))
 
 
@@ -495,7 +493,7 @@ def _unusual_vertices(mesh: Mesh) -> list[str]:
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
             "surface should be closed there, weld it (`weld=True`, on the command line `--weld`)."
         )
-    if unreferenced := len(mesh.vertices) - len(mesh.used_vertices):
+    if unreferenced := len(mesh.vertices) - len(mesh.referenced_indices):
         notes.append(
             f"{count_of(unreferenced, 'unreferenced vertex')} (in no face) among {len(mesh.vertices)} "
             "vertices."
@@ -524,10 +522,10 @@ def _check_resolution(mesh: Mesh) -> None:
     """Refuse a mesh with a vertex so far away that rounding errors are comparable to edge lengths."""
     lengths = mesh.lengths(mesh.edges)
     median = np.median(lengths[lengths > 0])
-    middle = np.median(mesh.vertices[mesh.used_vertices], axis=0)
+    middle = np.median(mesh.vertices[mesh.referenced_indices], axis=0)
     for vertices, center, limit, place in (
         (np.arange(len(mesh.vertices)), 0, LARGEST_COORDINATE, "origin"),
-        (mesh.used_vertices, middle, LARGEST_DISTANCE, "middle of the mesh"),
+        (mesh.referenced_indices, middle, LARGEST_DISTANCE, "middle of the mesh"),
     ):
         distances = np.abs(mesh.vertices[vertices] - center).max(axis=1) / median
         if distances.max() > limit:

@@ -14,6 +14,10 @@ from scipy.spatial import KDTree
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 
+# If edges are much shorter than the usual errors of matches, even good maps look discontinuous at these
+# edges. Therefore a mesh with more than `_DENSE` vertices is reduced to about `_SPREAD` samples.
+_DENSE, _SPREAD = 15_000, 5000
+
 
 def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarray, " s"]:
     """Choose vertices one by one, each as far as possible from all earlier samples, in Euclidean distance.
@@ -30,7 +34,7 @@ def farthest_point_samples(mesh: Mesh, number_of_samples: int) -> Int64[np.ndarr
 
     **Raises:** `InputError` if the number of samples is out of its range.
     """
-    referenced = mesh.used_vertices
+    referenced = mesh.referenced_indices
     if not 1 <= number_of_samples <= len(referenced):
         raise InputError(
             f"{mesh.name}: cannot choose {number_of_samples} samples from {len(referenced)} referenced "
@@ -106,7 +110,7 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     - `mesh`: the surface with n vertices. Unreferenced vertices are never chosen.
     - `number_of_samples`: the approximate number of samples; a coarse mesh has fewer.
     """
-    candidates = mesh.used_vertices
+    candidates = mesh.referenced_indices
     # At a minimum distance d, a surface has room for about 0.7 area / d² samples.
     distance = (0.7 * mesh.area / number_of_samples) ** 0.5
     # In each box of a grid around the centroid, only the lowest-numbered vertex remains a candidate.
@@ -135,11 +139,6 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     samples = poisson_disk_samples(mesh, _SPREAD)
     pairs = np.unique(np.sort(samples.nearest[mesh.edges], axis=1), axis=0)
     return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
-
-
-# If edges are much shorter than the usual errors of matches, even good maps look discontinuous at these
-# edges. Therefore a mesh with more than `_DENSE` vertices is reduced to about `_SPREAD` samples.
-_DENSE, _SPREAD = 15_000, 5000
 
 
 def maximal_independent_set(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarray, " s"]:

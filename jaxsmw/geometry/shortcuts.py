@@ -169,7 +169,7 @@ def _handle_loops(surface: Mesh, genus: int) -> Iterator[_HandleLoop]:
     valleys = replace(surface, faces=surface.faces[np.unique(edges.left[edges.in_valley] // 3)])
     # The handles can belong to different components.
     number = max(min(_BASE_POINTS, max(_FEWEST_BASE_POINTS, _REACHED // n)), 3 * genus)
-    number = min(number, len(valleys.used_vertices))
+    number = min(number, len(valleys.referenced_indices))
     graph = csr_array((edges.weighted_length, (edges.tail, edges.head)), shape=(n, n))
     distances, predecessors = csgraph.dijkstra(
         graph, directed=False, indices=farthest_point_samples(valleys, number), return_predecessors=True

@@ -70,7 +70,7 @@ def shot_descriptors(
 
     def compute() -> dict[str, np.ndarray]:
         if samples is None:
-            vertices = mesh.used_vertices
+            vertices = mesh.referenced_indices
             normals = mesh.vertex_normals[vertices]
         else:
             vertices, number = samples.vertices, len(samples.vertices)

@@ -110,7 +110,7 @@ def distances_to_surface(points: Float64[np.ndarray, "p 3"], mesh: Mesh) -> Floa
 
 def bounding_box_diagonal(mesh: Mesh) -> float:
     """Return the length of the diagonal of the box around all faces of a mesh."""
-    return float(np.linalg.norm(np.ptp(mesh.vertices[mesh.used_vertices], axis=0)))
+    return float(np.linalg.norm(np.ptp(mesh.vertices[mesh.referenced_indices], axis=0)))
 
 
 def nearest_points_of_triangles(

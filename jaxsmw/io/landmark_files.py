@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.io.formats.landmark_tables import (
     format_csv,
     format_fcsv,
@@ -81,36 +81,31 @@ def read_landmark_file(path: str | os.PathLike[str]) -> Landmarks:
     suffix = check_readable_suffix(path)
     _check_size(path, size_of_file(path), suffix)
     data = read_bytes(path)
-    try:
+    with naming(path):
         landmarks = _FORMATS[suffix].parse(_decode(data))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     return replace(landmarks, name=str(path))
 
 
 def write_landmark_file(path: str | os.PathLike[str], landmarks: Landmarks) -> None:
     """Write landmarks to a file. Reading the file returns exactly the same names and positions.
 
-    The write is atomic: an incomplete file never appears at `path`.
+    The write is atomic: an incomplete file never appears at `path`. Files of 3D Slicer state their coordinate
+    system. Files of the format `.mrk.json` also state their unit if it is known. Files in the other formats
+    cannot state a coordinate system, so their readers must know it.
 
     **Arguments:**
 
     - `path`: the file to create or to replace. The suffix determines the format: `.mrk.json` or `.fcsv` for
       3D Slicer, `.pp` for MeshLab, `.csv` for a table with commas, or `.txt` for a table with tabs.
-    - `landmarks`: `Landmarks`. Files of Slicer state their coordinate system. Files of the format `.mrk.json`
-      also state their unit if it is known. Files in the other formats cannot state a coordinate system, so
-      their readers must know the coordinate system.
+    - `landmarks`: `Landmarks`.
 
-    **Raises:** `InputError` for another suffix, for a file that cannot be written, or for more landmarks or
-    bytes than `read_landmark_file` accepts. For files of Slicer, `InputError` is also raised if the
-    coordinate system of the landmarks is None.
+    **Raises:** `InputError` for another suffix, a file that cannot be written, more landmarks or bytes than
+    `read_landmark_file` accepts, or for files of Slicer if the coordinate system is not known.
     """
     check_known_system(path, landmarks)
     suffix = check_landmark_suffix(path)
-    try:
+    with naming(path):
         check_count(len(landmarks))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     write = _FORMATS[suffix].format
     assert write is not None
     data = write(landmarks).encode("utf-8")

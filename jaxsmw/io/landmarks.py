@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.choices import CoordinateSystem
-from jaxsmw.errors import InputError, check_choice
+from jaxsmw.errors import InputError, check_choice, naming
 from jaxsmw.geometry.mesh import LARGEST_EXTENT, Mesh
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal, distances_to_surface
 from jaxsmw.io.formats.text import is_number
@@ -61,12 +61,10 @@ class Landmarks:
     unit: str | None = None
 
     def __post_init__(self) -> None:
-        try:
+        with naming(self.name):
             if self.coordinates is not None:
                 check_choice(self.coordinates, CoordinateSystem, "a coordinate system")
             _check_points(self.names, self.positions, lambda i: f"landmark {i + 1}")
-        except InputError as error:
-            raise InputError(f"{self.name}: {error}") from None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -226,13 +224,12 @@ def check_count(count: int) -> None:
 
 
 class LandmarkMatch(NamedTuple):
-    """The result of `match_landmarks`.
+    """The result of `match_landmarks`: three tuples of names, in the order of the set that contains them.
 
     **Attributes:**
 
-    - `names`: a tuple of the names in both sets of landmarks, in the order of the first set.
-    - `only_first`: a tuple of the names in the first set only, in the order of the first set.
-    - `only_second`: a tuple of the names in the second set only, in the order of the second set.
+    - `names`: the names in both sets of landmarks, in the order of the first set.
+    - `only_first`, `only_second`: the names in only one of the two sets.
     """
 
     names: tuple[str, ...]
@@ -242,10 +239,6 @@ class LandmarkMatch(NamedTuple):
 
 def match_landmarks(first: Landmarks, second: Landmarks) -> LandmarkMatch:
     """Match the landmarks of two meshes by their names. Names that differ in case are different.
-
-    **Arguments:**
-
-    - `first`, `second`: the `Landmarks` of two meshes.
 
     **Returns:** A `LandmarkMatch`. Pass its `names` to `Landmarks.select` to bring the landmarks of both
     meshes into the same order.
@@ -272,8 +265,8 @@ class FrameDistances(NamedTuple):
 
     **Attributes:**
 
-    - `as_read`: the mean distance from the landmarks to the surface, a float.
-    - `flipped`: the mean distance from the flipped landmarks (`Landmarks.flipped`) to the surface, a float.
+    - `as_read`, `flipped`: the mean distance from the landmarks to the surface, as they are and after
+      `Landmarks.flipped`.
     """
 
     as_read: float
@@ -283,12 +276,8 @@ class FrameDistances(NamedTuple):
 def find_frame(landmarks: Landmarks, mesh: Mesh) -> FrameDistances:
     """Measure how far landmarks are from a surface, with and without reversed signs of x and y.
 
-    A change between the coordinate systems LPS and RAS reverses these signs.
-
-    **Arguments:**
-
-    - `landmarks`: `Landmarks` in the unit of the mesh.
-    - `mesh`: the `Mesh` to which the landmarks belong.
+    A change between the coordinate systems LPS and RAS reverses these signs. The landmarks and the mesh must
+    have the same unit.
 
     **Returns:** The mean distances as `FrameDistances`.
     """
@@ -300,12 +289,7 @@ def find_frame(landmarks: Landmarks, mesh: Mesh) -> FrameDistances:
 
 
 def check_frame(landmarks: Landmarks, mesh: Mesh) -> tuple[str, ...]:
-    """Check that landmarks lie on a surface as they are, without a conversion between LPS and RAS.
-
-    **Arguments:**
-
-    - `landmarks`: `Landmarks` in the unit of the mesh.
-    - `mesh`: the `Mesh` to which the landmarks belong.
+    """Check that landmarks, in the unit of a mesh, lie on its surface without a conversion of coordinates.
 
     **Returns:** A tuple with a sentence for each landmark whose distance to the surface is above 2 % of the
     diagonal of the box around the mesh.

@@ -6,20 +6,19 @@ say whether their indices count from 0 or from 1, so the argument `index_base` o
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from pathlib import Path
-from tokenize import TokenError
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy.typing import ArrayLike
 
 from jaxsmw.choices import IndexBase
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.formats.mat import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
+from jaxsmw.io.formats.npz import read_array
 from jaxsmw.io.formats.text import is_number
 from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
 from jaxsmw.io.meshes import MESH_SUFFIXES, POINT_CLOUD_SUFFIXES
@@ -63,17 +62,15 @@ def read_pointwise_map(
 def read_landmarks(
     path: str | os.PathLike[str], mesh_x: Mesh, mesh_y: Mesh, *, index_base: IndexBase | None = None
 ) -> Int64[np.ndarray, "l 2"]:
-    """Read landmarks from a file. Each row contains a vertex of X and its match on Y.
+    """Read landmarks: vertices of X and their matches on Y.
 
     **Arguments:**
 
-    - `path`: a `.npy` file, a `.mat` file, or a text file with two vertices per line. A `.mat` file contains
-      either a single matrix with two columns, or such a matrix called `T12` among other variables.
-    - `mesh_x`, `mesh_y`: the source X and the target Y, each a `Mesh`.
-    - `index_base`: the index of the first vertex in the file, as in `read_pointwise_map`.
+    - `path`: a `.npy` file, a `.mat` file, or a text file with a vertex of X and a vertex of Y per line. A
+      `.mat` file contains either a single matrix with two columns, or such a matrix `T12` among others.
+    - `mesh_x`, `mesh_y`, `index_base`: as for `read_pointwise_map`.
 
-    **Returns:** The l landmarks as an int64 array (l, 2), 0-based, with a vertex of X and its match on Y in
-    each row.
+    **Returns:** The l landmarks as an int64 array (l, 2), 0-based.
 
     **Raises:** `InputError` if the file cannot be read, does not have two columns, or contains a number that
     is not a vertex.
@@ -84,20 +81,17 @@ def read_landmarks(
 
 
 def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) -> None:
-    """Write a pointwise map T: X -> Y.
-
-    The suffix of the file determines the format. A `.mat` file contains the column `T12` of 1-based vertices,
-    as is usual in MATLAB. A `.npy` file contains an array (m,) of 0-based vertices. A file with any other
-    suffix is text with one 0-based vertex per line. The write is atomic: an incomplete file never appears
-    under this name.
+    """Write a pointwise map T: X -> Y. An incomplete file never appears under this name.
 
     **Arguments:**
 
-    - `path`: the file to create or to replace.
+    - `path`: the file to create or to replace. A `.mat` file contains the column `T12` of 1-based vertices,
+      as is usual in MATLAB. A `.npy` file contains an array (m,) of 0-based vertices. A file with any other
+      suffix is text with one 0-based vertex per line.
     - `pointwise_map`: the target vertex of each source vertex, as 0-based integers (m,).
 
-    **Raises:** `InputError` if the array is not a list of non-negative integers, or the file cannot be
-    written. `InputError` is also raised for the suffixes that `check_map_name` refuses, such as `.ply`.
+    **Raises:** `InputError` if the array is not a list of non-negative integers, the file cannot be written,
+    or the suffix is one of those that `check_map_name` refuses, such as `.ply`.
     """
     check_map_name(path)
     targets = np.asarray(pointwise_map)
@@ -117,7 +111,7 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 
 
 def check_map_name(path: str | os.PathLike[str]) -> None:
-    """Refuse the suffixes of pictures, pages, meshes, points and landmarks as the name of a map."""
+    """Refuse the suffixes of other kinds of files, such as pictures and meshes, as the name of a map."""
     suffix = Path(path).suffix.lower()
     if suffix in _NOT_MAPS:
         raise InputError(
@@ -152,13 +146,9 @@ class Table:
 
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
         """Read an array as a matrix. A list becomes one column, and so does a row if `columns` is 1."""
-        data = io.BytesIO(read_bytes(self.path))
-        try:
-            array = np.lib.format.read_array(data, allow_pickle=False)
-        except (ValueError, EOFError, MemoryError, SyntaxError, TokenError) as error:
-            raise InputError(
-                f"{self.path}: is not an array saved by NumPy: save the array with numpy.save, or as text."
-            ) from error
+        data = read_bytes(self.path)
+        with naming(self.path):
+            array = read_array(data)
         is_list = array.ndim == 1 or (columns == 1 and array.shape[:-1] == (1,))
         table = array.reshape(-1, 1) if is_list else array
         fits = table.ndim == 2 and columns in (None, table.shape[1]) and table.size
@@ -200,10 +190,10 @@ class Table:
                 )
         return rows
 
-    def index_base(self, chosen: IndexBase | None, *, default: IndexBase = 0) -> IndexBase:
-        """Return the chosen index of the first vertex or face, or else the default; 1 for `.mat` files."""
-        if chosen is not None:
-            return chosen
+    def index_base(self, stated: IndexBase | None, *, default: IndexBase = 0) -> IndexBase:
+        """Return the stated index of the first vertex or face, or else the default; 1 for `.mat` files."""
+        if stated is not None:
+            return stated
         return 1 if is_mat_file(self.path) else default
 
     def place(self, row: int) -> str:
@@ -231,8 +221,8 @@ class Table:
     def indices(self, column: int, count: int, what: str, base: IndexBase) -> Int64[np.ndarray, " p"]:
         """Return a column as 0-based indices (p,) of `count` elements, which messages call `what`.
 
-        **Raises:** `InputError` if a number is not a valid index. The message names the first such row. If
-        all numbers are valid with the other index base, the message recommends that index base.
+        If a number is not a valid index, but all numbers are valid with the other index base, the message
+        recommends that index base.
         """
         numbers = self.values[:, column]
         good = (numbers == np.floor(numbers)) & (numbers >= base) & (numbers < count + base)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.wording import count_of
 
@@ -58,21 +58,20 @@ class MeshData:
     **Attributes:**
 
     - `mesh`: the `Mesh` that matching uses, with n vertices. The positions are in the unit of the file.
-    - `faces`: all triangles of the file, in the order of the file, before cleaning and welding. The array
-      (f, 3), int64, contains 0-based vertices of `mesh`. Polygons are split into fans of triangles.
-    - `vertex_data`: a dictionary from names to arrays (n,) or (n, c) with numbers for each vertex. The arrays
-      contain integers, floats or Booleans; Booleans are stored as uint8. Colours are called `colors`; they
-      are uint8, or floats from 0 to 1. Normals are called `normals`.
+    - `faces`: all triangles of the file (f, 3), int64, 0-based vertices of `mesh`, in the order of the file,
+      before cleaning and welding. Polygons are split into fans of triangles.
+    - `vertex_data`: a dictionary from names to arrays (n,) or (n, c) with numbers for each vertex: integers,
+      floats, or Booleans, which are stored as uint8. Colours are called `colors`; they are uint8, or floats
+      from 0 to 1. Normals are called `normals`.
     - `face_data`: a dictionary from names to arrays (f,) or (f, c) with numbers for each triangle, of the
       same types.
     - `texture`: a `Texture`, or None.
     - `blend_shapes`: a dictionary from the names of blend shapes (morph targets) to displacements (n, 3) of
       the vertices, float64, in the unit of the vertices.
     - `skin`: a `Skin`, or None.
-    - `label_names`: a dictionary for arrays of labels 0, 1, … in `vertex_data` or `face_data`. Its keys are
-      the names of these arrays, and its values are tuples of the names of the labels. For example,
-      `face_data["group"]` of an OBJ file contains the number of each triangle's group, and
-      `label_names["group"]` contains the names of all groups.
+    - `label_names`: a dictionary from the names of arrays of labels 0, 1, … in `vertex_data` or `face_data`
+      to tuples of the names of the labels. For example, `face_data["group"]` of an OBJ file contains the
+      number of each triangle's group, and `label_names["group"]` contains the names of all groups.
 
     **Raises:** `InputError` if an array has a wrong length or type, an index is out of range, or a
     displacement, weight or texture coordinate is not finite.
@@ -89,7 +88,7 @@ class MeshData:
 
     def __post_init__(self) -> None:
         n = len(self.mesh.vertices)
-        try:
+        with naming(self.mesh.name):
             faces = _indices(self.faces, n, "faces", "vertices")
             checked = {
                 "faces": faces,
@@ -106,8 +105,6 @@ class MeshData:
             for attribute, value in checked.items():
                 object.__setattr__(self, attribute, value)
             self._check_labels()
-        except InputError as error:
-            raise InputError(f"{self.mesh.name}: {error}") from None
 
     @property
     def has_attributes(self) -> bool:
@@ -189,9 +186,9 @@ def _within(array: np.ndarray, count: int, first: int = 0) -> bool:
 
 def _canonical(array: np.ndarray) -> np.ndarray:
     """Return a contiguous copy of Booleans as uint8, and of other numbers in types that all formats have."""
-    kind = {"b": np.uint8, "f2": np.float32, "f16": np.float64, "f12": np.float64}
-    wanted = kind.get(array.dtype.str[1:], kind.get(array.dtype.kind, array.dtype.newbyteorder("=")))
-    return np.array(array, dtype=wanted, order="C")
+    kinds = {"b": np.uint8, "f2": np.float32, "f16": np.float64, "f12": np.float64}
+    kind = kinds.get(array.dtype.str[1:], kinds.get(array.dtype.kind, array.dtype.newbyteorder("=")))
+    return np.array(array, dtype=kind, order="C")
 
 
 def _indices(values: Any, count: int, what: str, whole: str, first: int = 0) -> Int64[np.ndarray, "f 3"]:
@@ -217,13 +214,12 @@ def texture_of_corners(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return texture vertices, and the texture vertex of each corner, given the coordinates of all corners.
 
-    Two corners share a texture vertex if they belong to the same vertex and have equal texture coordinates.
-    The texture vertices of vertex 0 come first, then the texture vertices of vertex 1, and so on. A corner
-    has no texture vertex if its texture coordinates are NaN.
+    Corners of one vertex with equal coordinates share a texture vertex. The texture vertices of vertex 0 come
+    first, then those of vertex 1, and so on. A corner whose coordinates are NaN has none.
     """
-    known = np.isfinite(at_corners).all(axis=1)
-    rows = np.column_stack([corners, at_corners])[known]
+    has_texture = np.isfinite(at_corners).all(axis=1)
+    rows = np.column_stack([corners, at_corners])[has_texture]
     distinct, number = np.unique(rows, axis=0, return_inverse=True)
     of_corner = np.full(len(corners), -1)
-    of_corner[known] = number.ravel()
+    of_corner[has_texture] = number.ravel()
     return distinct[:, 1:], of_corner

@@ -1,10 +1,10 @@
 """Readers and writers of meshes, alone or together with their data, and the table of all formats.
 
 Vertices must keep their order, and a damaged file must cause one clear error message. Therefore this library
-has its own parsers, one per module of `jaxsmw.io.formats`, which is imported when such a file is opened. The
-reader of libigl accepts indices out of range and aborts the process on some invalid headers. The reader of
-trimesh splits and drops vertices of OBJ files, and cannot read binary PLY files of different polygons.
-pygltflib parses only the JSON part of glTF files, and has no checks.
+has its own parsers, one per module of `jaxsmw.io.formats`. The reader of libigl accepts indices out of range
+and aborts the process on some invalid headers. The reader of trimesh splits and drops vertices of OBJ files,
+and cannot read binary PLY files of different polygons. pygltflib parses only the JSON part of glTF files, and
+has no checks.
 
 The other libraries were tried on the files of `tests/corpus`, with one to three damages of
 `tests/test_fuzzing.py` each. On 1000 damaged VTK legacy files, the reader of VTK 9.7.2 ended the process with
@@ -19,34 +19,48 @@ from __future__ import annotations
 
 import codecs
 import os
+from collections.abc import Callable
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Int64, UInt8
 from numpy.typing import ArrayLike
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.point_cloud import triangulate_points
-from jaxsmw.io.formats.polygons import Polygons, texture_or_note, triangles_of
+from jaxsmw.io.formats.gltf import parse_glb, parse_gltf
+from jaxsmw.io.formats.gltf_writing import format_glb, format_gltf
+from jaxsmw.io.formats.mat import format_mat, parse_mat
+from jaxsmw.io.formats.npz import format_npz, parse_npz
+from jaxsmw.io.formats.obj import format_obj, parse_obj
+from jaxsmw.io.formats.off import format_off, parse_off
+from jaxsmw.io.formats.pcd import parse_pcd
+from jaxsmw.io.formats.ply import format_ply, parse_ply
+from jaxsmw.io.formats.points import parse_npy, parse_xyz
+from jaxsmw.io.formats.polygons import Formatted, Polygons, texture_or_note, triangles_of
+from jaxsmw.io.formats.stl import format_stl, parse_stl
+from jaxsmw.io.formats.vtk import format_vtk, parse_vtk
+from jaxsmw.io.formats.vtp import format_vtp, parse_vtp
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, Texture, checked_texture
 from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
 
-# The module of each suffix. Its functions are called `parse_` and `format_`, followed by the suffix.
-_WRITABLE = {
-    **{".off": "off", ".obj": "obj", ".ply": "ply", ".stl": "stl", ".mat": "mat", ".vtk": "vtk"},
-    **{".vtp": "vtp", ".gltf": "gltf", ".glb": "gltf", ".npz": "npz"},
+_PARSERS: dict[str, Callable[..., Polygons]] = {
+    **{".off": parse_off, ".obj": parse_obj, ".ply": parse_ply, ".stl": parse_stl, ".mat": parse_mat},
+    **{".vtk": parse_vtk, ".vtp": parse_vtp, ".gltf": parse_gltf, ".glb": parse_glb, ".npz": parse_npz},
+    **{".xyz": parse_xyz, ".pcd": parse_pcd, ".npy": parse_npy},
 }
-_ONLY_POINTS = {".xyz": "points", ".pcd": "pcd", ".npy": "points"}
+_FORMATTERS: dict[str, Callable[[MeshData], Formatted]] = {
+    **{".off": format_off, ".obj": format_obj, ".ply": format_ply, ".stl": format_stl, ".mat": format_mat},
+    **{".vtk": format_vtk, ".vtp": format_vtp, ".gltf": format_gltf, ".glb": format_glb, ".npz": format_npz},
+}
 # The formats whose files begin with text, even if numbers are binary.
 _TEXT = (".off", ".obj", ".ply", ".vtk", ".pcd")
-MESH_SUFFIXES = tuple(suffix for suffix in _WRITABLE if suffix != ".npz")
+MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
 """The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
-POINT_CLOUD_SUFFIXES = tuple(_ONLY_POINTS)
+POINT_CLOUD_SUFFIXES = tuple(suffix for suffix in _PARSERS if suffix not in _FORMATTERS)
 """The suffixes of files that contain only points."""
 
 
@@ -133,20 +147,18 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     path = Path(path)
     data = read_bytes(path)
     suffix = path.suffix.lower()
-    if suffix not in _WRITABLE | _ONLY_POINTS:
+    if suffix not in _PARSERS:
         raise InputError(
             f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
-            f"mesh to one of {', '.join(_WRITABLE | _ONLY_POINTS)}."
+            f"mesh to one of {', '.join(_PARSERS)}."
         )
-    try:
+    with naming(path):
         polygons = _parse(data, suffix, path.parent)
         is_strip = np.zeros(len(polygons.sizes), bool) if polygons.strips is None else polygons.strips
         at, polygon = triangles_of(polygons.sizes, is_strip)
         faces = polygons.corners[at]
         notes = [*polygons.notes, *_notes(polygons.sizes[~is_strip], polygons.lines, len(faces))]
         texture, lost = texture_or_note(lambda: _texture_at(polygons, at))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     face_data = {name: _repeated(values, polygon) for name, values in polygons.face_data.items()}
     if len(faces) or not len(polygons.vertices):
         mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
@@ -166,22 +178,14 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     )
 
 
-def _function(kind: str, suffix: str) -> Any:
-    module = (_WRITABLE | _ONLY_POINTS)[suffix]
-    if kind == "format" and module == "gltf":
-        module = "gltf_writing"  # the writer shares little with the reader
-    return getattr(import_module(f"jaxsmw.io.formats.{module}"), f"{kind}_{suffix[1:]}")
-
-
 def _parse(data: bytes, suffix: str, folder: Path) -> Polygons:
     if not data:
         raise InputError("is empty: export the mesh again.")
     if suffix in _TEXT and data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise InputError("is UTF-16 text, which cannot be read: save the file as UTF-8.")
-    parse = _function("parse", suffix)
     # Damaged files can contain numbers that overflow, or signalling NaN. `make_mesh` refuses them later.
     with np.errstate(all="ignore"):
-        return parse(data, folder) if suffix == ".gltf" else parse(data)
+        return parse_gltf(data, folder) if suffix == ".gltf" else _PARSERS[suffix](data)
 
 
 def _notes(sizes: Int64[np.ndarray, " f"], lines: int, triangles: int) -> list[str]:
@@ -215,10 +219,10 @@ def _repeated(values: np.ndarray, polygon: Int64[np.ndarray, " t"]) -> np.ndarra
 
 def check_mesh_suffix(path: str | os.PathLike[str]) -> None:
     """Refuse a file name whose suffix belongs to no format in which meshes can be written."""
-    if Path(path).suffix.lower() not in _WRITABLE:
+    if Path(path).suffix.lower() not in _FORMATTERS:
         raise InputError(
             f"{path}: meshes cannot be written as {Path(path).suffix!r}: choose a name that ends in "
-            f"{', '.join(_WRITABLE)}."
+            f"{', '.join(_FORMATTERS)}."
         )
 
 
@@ -272,12 +276,9 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
 
     `read_mesh_data` lists the formats, and reads the same data from the file, in the precision of the format:
     float32 in STL and glTF files, and float64 in the other formats. Colours in OBJ files become floats.
-
     Vertices keep their order in all formats except STL. glTF files need one texture vertex per vertex, so
     vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
-    them again.
-
-    The write is atomic: an incomplete file never appears at `path`.
+    them again. The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 
@@ -286,18 +287,15 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
     - `data`: a `MeshData`. The file contains all triangles of `data.faces`, including triangles that cleaning
         dropped from `data.mesh`.
 
-    **Returns:** A tuple of sentences about the data that the format cannot hold. The tuple is empty if the
-    file contains everything. Only a `.npz` file can contain all data of any `MeshData`.
+    **Returns:** A tuple of sentences about the data that the format cannot hold, which is empty for `.npz`.
 
     **Raises:** `InputError` for another suffix, positions that the format cannot hold, or a file that cannot
     be written.
     """
     path = Path(path)
     check_mesh_suffix(path)
-    try:
-        content, notes = _function("format", path.suffix.lower())(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    with naming(path):
+        content, notes = _FORMATTERS[path.suffix.lower()](data)
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
     return notes

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Float64
 from numpy.typing import ArrayLike
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh, to_host
 from jaxsmw.io.formats.mat import (
     FUNCTIONAL_MAP,
@@ -59,11 +59,10 @@ def make_spectrum(
 
     **Arguments:**
 
-    - `eigenvalues`: the eigenvalues (k,), ascending and not negative, in units of 1 / length². If
-        `eigenvectors` and `vertex_areas` are None, `eigenvalues` is instead a shape of another library. The
-        shape can be a `TriMesh` of pyFM after a call of its method `process`, or a shape of geomfum with an
-        eigenbasis. Any other object with the attributes `eigenvalues`, `eigenvectors` and `vertex_areas` is
-        also accepted.
+    - `eigenvalues`: the eigenvalues (k,), ascending and not negative, in units of 1 / length². If it is the
+        only argument, it is a shape of another library: a `TriMesh` of pyFM after a call of its method
+        `process`, a shape of geomfum with an eigenbasis, or any other object with the attributes
+        `eigenvalues`, `eigenvectors` and `vertex_areas`.
     - `eigenvectors`: the eigenvectors (n, k), in units of 1 / length, orthonormal with respect to the vertex
         areas.
     - `vertex_areas`: the vertex areas (n,), in units of length², or the lumped mass matrix (n, n), dense or
@@ -71,63 +70,68 @@ def make_spectrum(
     - `name`: the name of the spectrum in messages.
 
     **Returns:** A `Spectrum` of a surface of area 1, with `eigenvalues` (k,), `eigenvectors` (n, k),
-    `vertex_areas` (n,) and `mask` (n,). It has no descriptors, positions or normals. Its arrays have JAX's
+    `vertex_areas` (n,) and `mask` (n,), but without descriptors, positions and normals. Its arrays have JAX's
     default float type (float32 unless `jax_enable_x64` is set).
 
-    **Raises:** `InputError` if the arrays do not fit each other or are not finite real numbers. `InputError`
-    is also raised if the eigenvalues are negative or not ascending, a vertex area is negative, the
-    eigenvectors are not orthonormal, or an object of another library has no eigenbasis.
+    **Raises:** `InputError` if the arrays do not fit each other or are not finite real numbers, if
+    eigenvalues are negative or not ascending, a vertex area is negative, the eigenvectors are not
+    orthonormal, or an object of another library has no eigenbasis.
     """
-    if eigenvectors is None and vertex_areas is None:
-        eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues, name)
-    values, vectors = _real(eigenvalues, "eigenvalues", name), _real(eigenvectors, "eigenvectors", name)
-    areas = _real(_lumped(vertex_areas, vectors.shape, name), "vertex areas", name)
+    with naming(name):
+        if eigenvectors is None and vertex_areas is None:
+            eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues)
+        values, vectors = _real(eigenvalues, "eigenvalues"), _real(eigenvectors, "eigenvectors")
+        areas = _real(_lumped(vertex_areas, vectors.shape), "vertex areas")
+        _check_basis(values, vectors, areas)
+    total, vectors = areas.sum(), np.where(areas[:, None] > 0, vectors, 0)
+    arrays = np.maximum(values, 0) * total, vectors * np.sqrt(total), areas / total, areas > 0
+    return Spectrum(*map(jax.device_put, arrays))
+
+
+def _check_basis(values: np.ndarray, vectors: np.ndarray, areas: np.ndarray) -> None:
     k, n = values.size, areas.size
     if values.ndim != 1 or areas.ndim != 1 or vectors.shape != (n, k) or not 1 <= k <= n:
         raise InputError(
-            f"{name}: eigenvalues {values.shape}, eigenvectors {vectors.shape} and vertex areas "
-            f"{areas.shape} do not fit each other: for n vertices give shapes (k,), (n, k) and (n,)."
+            f"eigenvalues {values.shape}, eigenvectors {vectors.shape} and vertex areas {areas.shape} do not "
+            "fit each other: for n vertices give shapes (k,), (n, k) and (n,)."
         )
-    total = areas.sum()
-    if (areas < 0).any() or not total > 0:
-        raise InputError(f"{name}: some vertex areas are negative, or all are zero: correct the areas.")
-    largest = np.abs(values).max()
-    if values.min() < -_EIGENVALUE_TOLERANCE * largest:
+    if (areas < 0).any() or not areas.sum() > 0:
+        raise InputError("some vertex areas are negative, or all are zero: correct the areas.")
+    rounding = _EIGENVALUE_TOLERANCE * np.abs(values).max()
+    if values.min() < -rounding:
         raise InputError(
-            f"{name}: some eigenvalues are negative, down to {values.min():.3g}, but the Laplacian must be "
-            "positive semi-definite: change its sign."
+            f"some eigenvalues are negative, down to {values.min():.3g}, but the Laplacian must be positive "
+            "semi-definite: change its sign."
         )
-    if (np.diff(values) < -_EIGENVALUE_TOLERANCE * largest).any():
+    if (np.diff(values) < -rounding).any():
         raise InputError(
-            f"{name}: the eigenvalues do not ascend: sort them together with the columns of the eigenvectors."
+            "the eigenvalues do not ascend: sort them together with the columns of the eigenvectors."
         )
     vectors = np.where(areas[:, None] > 0, vectors, 0)
     deviation = np.abs(vectors.T @ (areas[:, None] * vectors) - np.eye(k)).max()
     if deviation > _ORTHONORMALITY_TOLERANCE:
         raise InputError(
-            f"{name}: the eigenvectors are not orthonormal with respect to the vertex areas (deviation "
+            "the eigenvectors are not orthonormal with respect to the vertex areas (deviation "
             f"{deviation:.2g}): give the lumped mass matrix with which the eigenvectors were computed, in "
             "the same unit of length."
         )
-    arrays = np.maximum(values, 0) * total, vectors * np.sqrt(total), areas / total, areas > 0
-    return Spectrum(*map(jax.device_put, arrays))
 
 
-def _parts(shape: SpectrumLike, name: str) -> tuple[Any, Any, Any]:
+def _parts(shape: SpectrumLike) -> tuple[Any, Any, Any]:
     """Return the eigenvalues, eigenvectors and vertex areas from a shape object of another library."""
     if hasattr(shape, "eigenvectors") and hasattr(shape, "vertex_areas"):
         if shape.eigenvectors is None:
-            raise InputError(f"{name}: the shape has no eigenvectors yet: call its method process first.")
+            raise InputError("the shape has no eigenvectors yet: call its method process first.")
         return shape.eigenvalues, shape.eigenvectors, shape.vertex_areas
     if hasattr(shape, "basis") and hasattr(shape, "laplacian"):
         return shape.basis.vals, shape.basis.vecs, shape.laplacian.mass_matrix
     raise InputError(
-        f"{name}: {type(shape).__name__} has no eigenbasis: give eigenvalues, eigenvectors and vertex areas, "
+        f"{type(shape).__name__} has no eigenbasis: give eigenvalues, eigenvectors and vertex areas, "
         "or a shape of pyFM or geomfum with an eigenbasis."
     )
 
 
-def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
+def _lumped(areas: Any, shape: tuple[int, ...]) -> Any:
     """Return vertex areas as a list. Those of a mass matrix (n, n) are the sums of its rows."""
     areas = to_host(areas)
     if hasattr(areas, "to_sparse_coo") and "sparse" in str(areas.layout):  # a sparse tensor of PyTorch
@@ -137,39 +141,34 @@ def _lumped(areas: Any, shape: tuple[int, ...], name: str) -> Any:
         # The row sums of a malicious sparse matrix could fill the memory, so its shape is checked first.
         if sp.issparse(areas) and areas.shape != 2 * shape[:1]:
             raise InputError(
-                f"{name}: eigenvectors {shape} and a mass matrix {areas.shape} do not fit each "
+                f"eigenvectors {shape} and a mass matrix {areas.shape} do not fit each "
                 "other: for n vertices give an (n, n) matrix."
             )
         return np.asarray(areas.sum(axis=1)).ravel()
     return areas
 
 
-def _real(values: Any, what: str, name: str) -> np.ndarray:
+def _real(values: Any, what: str) -> np.ndarray:
     """Convert values to a float64 array of any shape, and check that all numbers are finite."""
     try:
         array = np.asarray(to_host(values))
     except (TypeError, ValueError, RuntimeError):
         array = np.asarray(None)
     if array.dtype.kind not in "iuf":
-        raise InputError(
-            f"{name}: the {what} are not an array of real numbers: convert them to an array of floats."
-        )
+        raise InputError(f"the {what} are not an array of real numbers: convert them to an array of floats.")
     array = array.astype(np.float64)
     if not np.isfinite(array).all():
-        raise InputError(f"{name}: the {what} are not all finite: compute them again.")
+        raise InputError(f"the {what} are not all finite: compute them again.")
     return array
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     """Read the eigenbasis of a shape from a `.mat` file or a `.npz` file (see `write_spectrum`).
 
-    **Arguments:**
-
-    - `path`: the file.
-        - A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,).
-        - A `.mat` file contains the following variables, or one struct with fields of these names. `evals`
-          (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are either
-          `A`, which is the lumped mass matrix (n, n) or its diagonal, or a list `area` (n).
+    A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,). A `.mat` file
+    contains the following variables, or one struct with fields of these names. `evals` (k) are the
+    eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are either `A`, which is the lumped
+    mass matrix (n, n) or its diagonal, or a list `area` (n).
 
     **Returns:** A `Spectrum`, as from `make_spectrum`.
 
@@ -180,8 +179,8 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
     if is_mat_file(path):
         structs = find_structs(read_variables(path), "evals", "evecs")
         if len(structs) != 1:
-            found = f"{len(structs)} eigenbases ({', '.join(structs)})" if structs else "no evals and evecs"
-            raise InputError(f"{path}: contains {found}: save a single struct with evals and evecs.")
+            bases = f"{len(structs)} eigenbases ({', '.join(structs)})" if structs else "no evals and evecs"
+            raise InputError(f"{path}: contains {bases}: save a single struct with evals and evecs.")
         (struct,) = structs.values()
         return make_spectrum(struct["evals"], struct["evecs"], _areas_of(struct, name), name=name)
     if Path(path).suffix.lower() != ".npz":
@@ -189,10 +188,8 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
             f"{path}: spectra are read from .npz and .mat files: give a file of one of these types."
         )
     data = read_bytes(path, largest=None)
-    try:
+    with naming(path):
         arrays = read_arrays(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     fields = "eigenvalues", "eigenvectors", "vertex_areas"
     if missing := [field for field in fields if field not in arrays]:
         raise InputError(f"{path}: lacks {', '.join(missing)}: write the spectrum again.")
@@ -209,8 +206,8 @@ def _areas_of(struct: Mapping[str, Any], name: str) -> Any:
 def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh | None = None) -> None:
     """Write the spectrum of a shape to a `.npz` file, or as a struct `S` to a `.mat` file for MATLAB.
 
-    A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,). In a `.mat`
-    file, `S` has the following fields.
+    A `.npz` file contains the arrays that `read_spectrum` lists. In a `.mat` file, `S` has the following
+    fields.
 
     - `evals` (k) and `evecs` (n, k) are the eigenvalues and eigenvectors.
     - `A` (n, n) is the lumped mass matrix, as a sparse matrix.
@@ -226,9 +223,9 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
     **Arguments:**
 
     - `path`: the file to create or to replace. The suffix, `.npz` or `.mat`, determines the format.
-    - `spectrum`: a `Spectrum` (n vertices, k eigenvectors). The numbers in the file are in the unit of the
-        spectrum. The positions, normals, mask and descriptors of the spectrum are not written.
-    - `mesh`: the mesh of the spectrum (n vertices), or None. A `.npz` file does not contain the mesh.
+    - `spectrum`: a `Spectrum` (n vertices, k eigenvectors), whose positions, normals, mask and descriptors
+      are not written.
+    - `mesh`: the mesh of the spectrum (n vertices), or None.
 
     **Raises:** `InputError` for another suffix, a mesh with another number of vertices, or a file that cannot
     be written.
@@ -274,9 +271,7 @@ def check_spectrum_path(path: str | os.PathLike[str]) -> None:
 def read_functional_map(
     path: str | os.PathLike[str], spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> Float64[np.ndarray, "k_x k_y"]:
-    """Read a functional map from a `.mat` file.
-
-    The functional map is a pullback, which takes functions on Y to functions on X.
+    """Read a functional map, a pullback that takes functions on Y to functions on X, from a `.mat` file.
 
     **Arguments:**
 
@@ -289,8 +284,8 @@ def read_functional_map(
     this library only if the eigenbases of the file belong to surfaces of area 1. Otherwise, C must be
     multiplied by the factor that `make_spectrum` states.
 
-    **Raises:** `InputError` if the file cannot be read or contains no suitable matrix. `InputError` is also
-    raised if the matrix is too large for the spectra, or has entries that are not finite.
+    **Raises:** `InputError` if the file cannot be read or contains no suitable matrix, or if the matrix is
+    too large for the spectra or has entries that are not finite.
     """
     matrix = read_matrix(path, FUNCTIONAL_MAP)
     most = spectrum_x.eigenvalues.shape[0], spectrum_y.eigenvalues.shape[0]
@@ -315,13 +310,14 @@ def write_functional_map(
     **Arguments:**
 
     - `path`: the file to create or to replace, with the suffix `.mat`.
-    - `functional_map`: the pullback C (k_X, k_Y), which takes functions on Y to functions on X. C has no
-        unit. The eigenbases must belong to surfaces of area 1, as the spectra of this library do.
+    - `functional_map`: the pullback C (k_X, k_Y), without unit. The eigenbases must belong to surfaces of
+        area 1, as the spectra of this library do.
 
     **Raises:** `InputError` for another suffix, entries that are not finite real numbers, or a file that
     cannot be written.
     """
-    matrix = _real(functional_map, "entries", "functional map")
+    with naming("functional map"):
+        matrix = _real(functional_map, "entries")
     if not is_mat_file(path):
         raise InputError(f"{path}: functional maps are written as .mat: choose a name that ends in .mat.")
     write_variables(path, {FUNCTIONAL_MAP: matrix})

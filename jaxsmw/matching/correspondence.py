@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float, Int64
 from numpy.typing import ArrayLike
 
 from jaxsmw.core.refinement import Refinement
-from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
@@ -22,7 +21,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
 from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map
-from jaxsmw.matching.executor import SpectralPair, Start, embeddings, nearest_points, reverse_map
+from jaxsmw.matching.executor import SpectralPair, StageRun, Start, nearest_points
 from jaxsmw.matching.judge import Scored, estimate_error, overlap, wrong_probability
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -101,7 +100,7 @@ class Correspondence:
         **Raises:** `ArithmeticError` if a stage failed.
         """
         pair, outcome = prepared.given, scored.outcome
-        last = outcome.last.unpadded(len(pair.mesh_x.vertices))
+        last = outcome.last.refinement.unpadded(len(pair.mesh_x.vertices))
         if last.result != RESULTS.successful:
             cure = (
                 ' If the units of length differ, set scale="unknown" (--scale unknown).'
@@ -124,7 +123,7 @@ class Correspondence:
             spectrum_x=seen.x.reflect() if prepared.mirrored else seen.x,
             spectrum_y=seen.y,
             refinement=replace(last, pointwise_map=jax.device_put(pointwise_map.astype(np.int32))),
-            iterations=sum(int(refinement.iterations) for refinement in outcome.refinements),
+            iterations=sum(int(run.refinement.iterations) for run in outcome.runs),
             distortion=scored.distortion,
             suspicious=scored.suspicious,
             mirrored=prepared.mirrored,
@@ -146,6 +145,11 @@ class Correspondence:
     def mesh_y(self) -> Mesh:
         """The target Y."""
         return self.pair.mesh_y
+
+    @property
+    def matched_pair(self) -> Pair:
+        """The pair with the mirror image of X in place of X, if it was matched."""
+        return self.pair.mirrored() if self.mirrored else self.pair
 
     @property
     def functional_map(self) -> Float[np.ndarray, "k_out k_in"]:
@@ -187,9 +191,9 @@ class Correspondence:
         **Returns:** The match of every vertex of Y (n,), int64, as a 0-based vertex of X.
         """
         with self._precision():
-            found = reverse_map(self._refiner, self._spectra, self.refinement.state)
-        found = extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, found)
-        return self.pair.reversed().with_small_components(found)[0]
+            reverse = self._last.reverse_map()
+        reverse = extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, reverse)
+        return self.pair.reversed().with_small_components(reverse)[0]
 
     def _points_near(
         self,
@@ -351,11 +355,9 @@ class Correspondence:
         """Estimate the geodesic error of every match (m,) with other settings; see `expected_error`."""
         with self._precision():
             return estimate_error(
-                self.pair.mirrored() if self.mirrored else self.pair,
+                self.matched_pair,
                 self.pointwise_map,
-                self._spectra,
-                self._refiner,
-                self.refinement.state,
+                self._last,
                 settings,
                 self.preset.criteria.scores,
             )
@@ -367,21 +369,18 @@ class Correspondence:
         matched, because it is unreferenced or was trimmed, has the embedding of the nearest matched vertex.
         """
         with self._precision():
-            of_x, of_y = embeddings(self._refiner, self._spectra, self.refinement.state)
+            of_x, of_y = self._last.embeddings()
         return (
             extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, of_x),
             extend_from(np.asarray(self.spectrum_y.mask), self.mesh_y, of_y),
         )
 
-    @property
-    def _refiner(self) -> Refiner:
-        return self.preset.stages[-1].refiner
-
     @functools.cached_property
-    def _spectra(self) -> SpectralPair:
-        """The spectra that the last stage has seen: those of the mirror image of X if it was matched."""
+    def _last(self) -> StageRun:
+        """The last stage, which has seen the mirror image of X if it was matched."""
         spectrum_x = self.spectrum_x.reflect() if self.mirrored else self.spectrum_x
-        return SpectralPair(spectrum_x, self.spectrum_y, partial=self.pair.partial)
+        spectra = SpectralPair(spectrum_x, self.spectrum_y, partial=self.pair.partial)
+        return StageRun(self.preset.stages[-1], spectra, self.refinement)
 
     def _precision(self) -> AbstractContextManager[None]:
         """Return a context manager in which JAX uses the float type of the functional map."""

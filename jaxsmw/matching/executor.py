@@ -6,7 +6,7 @@ and come out have one entry per vertex of X.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -136,6 +136,58 @@ class Start(NamedTuple):
     origin: str = "stages"
     excluded: Bool[np.ndarray, " m"] | None = None
 
+    @property
+    def has_alternatives(self) -> bool:
+        """Whether alternative maps can exist. They are variants of the initial map from SHOT."""
+        return self.origin == "shot"
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether the map comes from a rigid alignment of shapes that differ in form, not in pose."""
+        return self.origin == "aligned"
+
+
+@dataclass(frozen=True, eq=False)
+class StageRun:
+    """A stage that has run on a pair, with the state from which further results can be computed.
+
+    **Attributes:**
+
+    - `stage`: the `Stage`.
+    - `spectra`: the spectra of the pair, without padding.
+    - `refinement`: the `Refinement`, whose vertices may be padded.
+    """
+
+    stage: Stage
+    spectra: SpectralPair
+    refinement: Refinement
+
+    @cached_property
+    def seen(self) -> SpectralPair:
+        """The spectra that the stage has seen."""
+        return self.spectra.seen_by(self.stage)
+
+    def reverse_map(self) -> Int64[np.ndarray, " n"]:
+        """Return the map Y -> X (n,) of all vertices, 0-based vertices of X, from the last state."""
+        reverse = compiled(recover_reverse)(*self._arguments)
+        return np.asarray(reverse)[: self.spectra.y.mask.shape[0]].astype(np.int64)
+
+    def embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
+        """Return the embeddings of X and Y in which the last search has compared vertices."""
+        x, y = (np.asarray(points) for points in compiled(_embeddings)(*self._arguments))
+        return x[: self.spectra.x.mask.shape[0]], y[: self.spectra.y.mask.shape[0]]
+
+    @property
+    def _arguments(self) -> tuple[Refiner, Problem, State]:
+        problem = Problem(*self.seen.padded.both, partial=self.spectra.partial)
+        return self.stage.refiner, problem, self.refinement.state
+
+
+def _embeddings(
+    refiner: Refiner, problem: Problem, state: State
+) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+    return refiner.embeddings(refiner.prepare(problem), state)
+
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
@@ -144,76 +196,61 @@ class Outcome:
     **Attributes:**
 
     - `initial_map`: the map from which the first stage started (m,), 0-based vertices of Y.
-    - `refinements`: one `Refinement` per stage, up to the first stage that failed.
+    - `runs`: one `StageRun` per stage, up to the first stage that failed.
     """
 
     initial_map: Int64[np.ndarray, " m"]
-    refinements: tuple[Refinement, ...] = ()
+    runs: tuple[StageRun, ...] = ()
 
     @cached_property
     def successful(self) -> bool:
         """Whether all stages succeeded."""
-        return all(bool(found.result == RESULTS.successful) for found in self.refinements)
+        return all(bool(run.refinement.result == RESULTS.successful) for run in self.runs)
 
     @cached_property
     def pointwise_map(self) -> Int64[np.ndarray, " m"]:
         """The map of the last stage that has run (m,), or the initial map if no stage has run."""
-        if not self.refinements:
+        if not self.runs:
             return self.initial_map
-        return np.asarray(self.last.pointwise_map)[: len(self.initial_map)].astype(np.int64)
+        padded = np.asarray(self.last.refinement.pointwise_map)
+        return padded[: len(self.initial_map)].astype(np.int64)
 
     @property
-    def last(self) -> Refinement:
-        """The refinement of the last stage that has run."""
-        return self.refinements[-1]
+    def last(self) -> StageRun:
+        """The last stage that has run."""
+        return self.runs[-1]
 
     @property
     def uncertainty(self) -> float:
         """The uncertainty of the last stage whose refiner computes one; 0 if there is none."""
-        known = [u for found in self.refinements if (u := found.state.uncertainty) is not None]
+        known = [u for run in self.runs if (u := run.refinement.state.uncertainty) is not None]
         return float(known[-1]) if known else 0.0
 
     def followed_by(self, later: Outcome) -> Outcome:
         """Return the outcome of these stages and later ones, which started from their map."""
-        return Outcome(self.initial_map, self.refinements + later.refinements)
+        return Outcome(self.initial_map, self.runs + later.runs)
 
 
-def run(
-    stages: Sequence[Stage], spectra: SpectralPair, starts: Iterable[Start], *, history: bool = False
-) -> Iterator[Outcome]:
-    """Run stages on one pair from each start.
+def run(stages: Sequence[Stage], spectra: SpectralPair, start: Start) -> Outcome:
+    """Run stages on one pair, in their order, until one of them fails.
 
-    The function does not wait for the last stage of a start, so that the device refines further starts while
-    the host looks at a finished one.
-
-    **Arguments:**
-
-    - `stages`: the stages, in the order in which they run. A start runs no stage after its first failure.
-    - `spectra`: the spectra and samples of the pair.
-    - `starts`: the starts.
-    - `history`: whether to record a `History` of each stage; see `jaxsmw.refine`.
-
-    **Returns:** An iterator over one `Outcome` per start, in the order of the starts.
+    The function does not wait for the last stage, so that the device refines further starts while the host
+    looks at a finished one.
     """
-    seen = [spectra.padded.seen_by(stage) for stage in stages]
-    return (_run_one(stages, seen, start, history) for start in starts)
-
-
-def _run_one(stages: Sequence[Stage], seen: Sequence[SpectralPair], start: Start, history: bool) -> Outcome:
-    refinements: list[Refinement] = []
+    runs: list[StageRun] = []
     matches = padded_map(start.pointwise_map)
-    for number, (stage, spectra) in enumerate(zip(stages, seen, strict=True)):
-        if number and refinements[-1].result != RESULTS.successful:
+    for stage in stages:
+        if runs and runs[-1].refinement.result != RESULTS.successful:
             break
-        if number == 0 and start.excluded is not None:
-            excluded = jnp.asarray(pad_rows(start.excluded, len(spectra.x.mask)))
-            spectra = replace(spectra, x=spectra.x.excluding(excluded))
-        x, y, samples, partial = spectra.x, spectra.y, spectra.samples, spectra.partial
-        settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
-        found = compiled(refine)(x, y, matches, samples=samples, **settings)
-        refinements.append(found)
-        matches = found.pointwise_map
-    return Outcome(start.pointwise_map, tuple(refinements))
+        seen = spectra.padded.seen_by(stage)
+        if not runs and start.excluded is not None:
+            excluded = jnp.asarray(pad_rows(start.excluded, len(seen.x.mask)))
+            seen = replace(seen, x=seen.x.excluding(excluded))
+        settings: RefineSettings = {**stage.settings, "partial": seen.partial}
+        refinement = compiled(refine)(*seen.both, matches, samples=seen.samples, **settings)
+        runs.append(StageRun(stage, spectra, refinement))
+        matches = refinement.pointwise_map
+    return Outcome(start.pointwise_map, tuple(runs))
 
 
 def run_batches(
@@ -233,39 +270,54 @@ def run_batches(
 
     **Returns:** One `Outcome` per task.
     """
-    spectra: dict[int, Spectrum] = {}
-    samples: dict[int, Int[Array, " s"] | None] = {}
-    for pair, _ in tasks:
-        for spectrum, of_side in zip((pair.x, pair.y), pair.samples or (None, None), strict=True):
-            spectra.setdefault(id(spectrum), spectrum)
-            samples.setdefault(id(spectrum), of_side)
-    row = {key: number for number, key in enumerate(spectra)}
-    pairs = [(row[id(pair.x)], row[id(pair.y)]) for pair, _ in tasks]
     maps = [np.asarray(start.pointwise_map) for _, start in tasks]
     outcomes = [Outcome(start.pointwise_map) for _, start in tasks]
     for stage in stages:
-        alone = [SpectralPair(spectrum, spectrum).seen_by(stage).x for spectrum in spectra.values()]
-        chosen = None
-        if stage.number_of_samples is not None:
-            chosen = [
-                of_shape[: stage.number_of_samples] for of_shape in samples.values() if of_shape is not None
+        seen = _seen_by(stage, [pair for pair, _ in tasks])
+        # Pairs with and without crease eigenvectors need different programs.
+        for creased in (True, False):
+            numbers = [
+                i for i, pair in enumerate(seen) if (pair.x.crease_eigenvectors is not None) == creased
             ]
-        refined = refine_pairs(
-            alone,
-            pairs,
-            maps,
-            samples=chosen,
-            batch_size=batch_size,
-            devices=devices,
-            **stage.settings,
-        )
-        for number, found in refined:
-            maps[number] = np.asarray(found.pointwise_map)
-            # After a failure, later stages still run for this pair, but their results are ignored.
-            if outcomes[number].successful:
-                before = outcomes[number]
-                outcomes[number] = Outcome(before.initial_map, (*before.refinements, found))
+            shapes = {id(spectrum): spectrum for i in numbers for spectrum in seen[i].both}
+            samples = {
+                id(spectrum): of_shape
+                for i in numbers
+                for spectrum, of_shape in zip(seen[i].both, seen[i].samples or (), strict=False)
+            }
+            row = {key: number for number, key in enumerate(shapes)}
+            refined = refine_pairs(
+                list(shapes.values()),
+                [(row[id(seen[i].x)], row[id(seen[i].y)]) for i in numbers],
+                [maps[i] for i in numbers],
+                samples=[samples[key] for key in shapes] if samples else None,
+                batch_size=batch_size,
+                devices=devices,
+                **stage.settings,
+            )
+            for number, refinement in refined:
+                i = numbers[number]
+                maps[i] = np.asarray(refinement.pointwise_map)
+                # After a failure, later stages still run for this pair, but their results are ignored.
+                if (before := outcomes[i]).successful:
+                    runs = (*before.runs, StageRun(stage, tasks[i][0], refinement))
+                    outcomes[i] = Outcome(before.initial_map, runs)
     return outcomes
+
+
+def _seen_by(stage: Stage, pairs: Sequence[SpectralPair]) -> list[SpectralPair]:
+    """Return the pairs as a stage sees them. Pairs that share a spectrum object still share it."""
+    spectra: dict[tuple[int, bool], Spectrum] = {}
+    restricted = []
+    for pair in pairs:
+        seen = pair.seen_by(stage)
+        creased = seen.x.crease_eigenvectors is not None
+        x, y = (
+            spectra.setdefault((id(given), creased), spectrum)
+            for given, spectrum in zip(pair.both, seen.both, strict=True)
+        )
+        restricted.append(replace(seen, x=x, y=y))
+    return restricted
 
 
 def padded_map(pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
@@ -274,9 +326,7 @@ def padded_map(pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
     return jax.device_put(padded.astype(np.int32))
 
 
-def compile_stage(
-    stage: Stage, number_x: int, number_y: int, *, partial: bool = False, history: bool = False
-) -> None:
+def compile_stage(stage: Stage, number_x: int, number_y: int, *, partial: bool = False) -> None:
     """Compile the program of a stage in the background. Both shapes must have its number of eigenvectors.
 
     **Arguments:**
@@ -284,7 +334,6 @@ def compile_stage(
     - `stage`: the stage.
     - `number_x`, `number_y`: the numbers of vertices of X and of Y.
     - `partial`: whether one of the shapes is a partial shape.
-    - `history`: whether the program records a `History`; see `jaxsmw.refine`.
     """
     sizes = program_size(number_x), program_size(number_y)
 
@@ -295,7 +344,7 @@ def compile_stage(
         x, y = (_outline(stage, size) for size in sizes)
         return (x, y, jnp.zeros(sizes[0], jnp.int32)), {"samples": samples}
 
-    settings: RefineSettings = {**stage.settings, "partial": partial, "history": history}
+    settings: RefineSettings = {**stage.settings, "partial": partial}
     compile_ahead(refine, arguments, **settings)
 
 
@@ -307,38 +356,6 @@ def _outline(stage: Stage, number_of_vertices: int) -> Spectrum:
     described = spectrum.with_descriptors(jnp.zeros((n, d)) if d else None)
     creased = described.with_crease_eigenvectors(jnp.zeros((n, c)) if c else None)
     return creased.with_positions(jnp.zeros((n, 3)), jnp.zeros((n, 3)))
-
-
-def reverse_map(refiner: Refiner, spectra: SpectralPair, state: State) -> Int64[np.ndarray, " n"]:
-    """Return the map Y -> X (n,) of all vertices, 0-based vertices of X, from the last state of a stage.
-
-    **Arguments:**
-
-    - `refiner`: the refiner of the stage.
-    - `spectra`: the spectra that the stage has seen, without padding; see `SpectralPair.seen_by`.
-    - `state`: the `State` of the refiner.
-    """
-    found = compiled(recover_reverse)(refiner, _problem(spectra), state)
-    return np.asarray(found)[: spectra.y.mask.shape[0]].astype(np.int64)
-
-
-def embeddings(
-    refiner: Refiner, spectra: SpectralPair, state: State
-) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
-    """Return the embeddings of X and Y in which a stage has compared vertices; see `reverse_map`."""
-    padded = compiled(_embeddings)(refiner, _problem(spectra), state)
-    x, y = (np.asarray(points) for points in padded)
-    return x[: spectra.x.mask.shape[0]], y[: spectra.y.mask.shape[0]]
-
-
-def _problem(spectra: SpectralPair) -> Problem:
-    return Problem(spectra.padded.x, spectra.padded.y, partial=spectra.partial)
-
-
-def _embeddings(
-    refiner: Refiner, problem: Problem, state: State
-) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-    return refiner.embeddings(refiner.prepare(problem), state)
 
 
 def nearest_rows(

@@ -11,16 +11,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from jaxsmw.core.refiner import Refiner, State
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import connected_components, extend_from
 from jaxsmw.geometry.sampling import coarse_edges
-from jaxsmw.matching.executor import Outcome, SpectralPair, reverse_map
+from jaxsmw.matching.executor import Outcome, SpectralPair, StageRun
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.settings import (
     ExpectedErrorSettings,
@@ -361,7 +360,7 @@ class Judge:
         if not suspicious and self.settings.suspicious_area < 1:
             largest = max(map(self.pair.mesh_x.average, self.faults(found.pointwise_map)), default=0)
             suspicious = bool(largest >= self.settings.suspicious_area)
-        return Scored(outcome, found.distortion, found.deformation, suspicious)
+        return replace(found, suspicious=suspicious)
 
     def measured(self, outcome: Outcome, *, suspicious: bool = False) -> Scored:
         """Compute what determines the `score` of an outcome."""
@@ -434,23 +433,16 @@ class Judge:
 def estimate_error(
     pair: Pair,
     pointwise_map: Int64[np.ndarray, " m"],
-    spectra: SpectralPair,
-    refiner: Refiner,
-    state: State,
+    last: StageRun,
     settings: ExpectedErrorSettings = ExpectedErrorSettings(),  # noqa: B008 (immutable)
     scores: ScoreSettings = ScoreSettings(),  # noqa: B008 (immutable)
 ) -> Float[np.ndarray, " m"]:
     """Estimate the geodesic error of every match of the last stage; see `expected_error`.
 
-    **Arguments:**
-
-    - `spectra`: the spectra that the last stage has seen; see `SpectralPair.seen_by`.
-    - `refiner`, `state`: the refiner of the last stage, and its `State`.
-
     **Returns:** The expected errors (m,), divided by the square root of Y's area. A vertex that was not
     matched has the value of the nearest matched vertex.
     """
-    known_x, known_y = (np.asarray(spectrum.mask) for spectrum in (spectra.x, spectra.y))
-    reverse = extend_from(known_y, pair.mesh_y, reverse_map(refiner, spectra, state))
-    expected = expected_error(pair, pointwise_map, reverse, spectra.x, spectra.y, settings, scores)
-    return extend_from(known_x, pair.mesh_x, expected)
+    x, y = last.seen.both
+    reverse = extend_from(np.asarray(y.mask), pair.mesh_y, last.reverse_map())
+    expected = expected_error(pair, pointwise_map, reverse, x, y, settings, scores)
+    return extend_from(np.asarray(x.mask), pair.mesh_x, expected)

@@ -128,10 +128,12 @@ def match(
     fewest = surfaces.fewest_vertices()
     if adapts:
         method = method.fitted(fewest)
+    if history:
+        method = method.with_history()
     automatic = isinstance(init, str) and init == "auto"
     # The check runs before the slow computation of the eigenbases.
     first_init = check_initial_map(pair, DEFAULT_INITIAL_MAP if automatic else init)
-    _compile_ahead(pair, method, history)
+    _compile_ahead(pair, method)
 
     seconds: dict[str, float] = {}
     step = functools.partial(timed, seconds=seconds)
@@ -153,7 +155,7 @@ def match(
     if method.number_of_descriptors:
         with step("descriptors"):
             prepared = prepared.describe(method.number_of_descriptors, required=not adapts)
-    correspondence = match_prepared(prepared, starts, method, history=history, step=step)
+    correspondence = match_prepared(prepared, starts, method, step=step)
     if correspondence.suspicious:
         warnings.warn(_warning(correspondence, landmarks=starts[0].origin == "landmarks"), stacklevel=2)
     if correspondence.left_out > SMALL_CLOSED:
@@ -174,7 +176,6 @@ def match_prepared(
     preset: Preset,
     *,
     outcomes: Sequence[Outcome] = (),
-    history: bool = False,
     step: Step = no_step,
 ) -> Correspondence:
     """Run all stages and the repair from each start, and return the better map.
@@ -184,8 +185,7 @@ def match_prepared(
     - `prepared`: the prepared pair. If it has no descriptors, the stages use none.
     - `starts`: the initial maps: one map, or `"shot"` and `"aligned"`.
     - `preset`: the stages and the repair.
-    - `outcomes`: the outcome of `preset.judged` for each start, if these stages have already run.
-    - `history`: whether to record a `History` of the last stage.
+    - `outcomes`: the outcome of `preset.before_final` for each start, if these stages have already run.
     - `step`: reports and measures the steps. By default, nothing is reported.
 
     **Returns:** The `Correspondence`.
@@ -197,7 +197,7 @@ def match_prepared(
     return_free_memory()
     with step("refinement"), one_blas_thread():
         repaired = [
-            refine_and_repair(prepared, start, preset, outcome=outcome, history=history)
+            refine_and_repair(prepared, start, preset, outcome=outcome)
             for start, outcome in itertools.zip_longest(starts, outcomes)
         ]
     successful = [pair for pair in zip(starts, repaired, strict=True) if pair[1].successful]
@@ -208,11 +208,11 @@ def match_prepared(
         start, scored = successful[int(shot >= preset.repair.aligned_preference * aligned)]
     last = step("final stages") if preset.final or preset.repair else nullcontext()
     with last, one_blas_thread():
-        if found := match_trimmed(prepared, preset, scored, history=history):
+        if found := match_trimmed(prepared, preset, scored):
             prepared, scored = found
         else:
-            scored = finish(prepared, start.origin, preset, scored, history=history)
-        jax.block_until_ready(scored.outcome.last)
+            scored = finish(prepared, start, preset, scored)
+        jax.block_until_ready(scored.outcome.last.refinement)
     return Correspondence.of(prepared, start, preset, scored)
 
 
@@ -222,20 +222,13 @@ def _mean_expected_error(prepared: PreparedPair, preset: Preset, scored: Scored)
     With a positive `area_weight`, the expected error would contain a factor that depends on the shapes, not
     on the quality of the map. (Entry R24 of docs/research_log.md)
     """
-    stage = preset.judged[-1]
-    expected = estimate_error(
-        prepared.given.mirrored() if prepared.mirrored else prepared.given,
-        scored.pointwise_map,
-        prepared.spectra.seen_by(stage),
-        stage.refiner,
-        scored.outcome.last.state,
-        ExpectedErrorSettings(area_weight=0.0),
-        preset.criteria.scores,
-    )
+    given = prepared.given.mirrored() if prepared.mirrored else prepared.given
+    settings = ExpectedErrorSettings(area_weight=0.0), preset.criteria.scores
+    expected = estimate_error(given, scored.pointwise_map, scored.outcome.last, *settings)
     return float(prepared.given.mesh_x.average(expected))
 
 
-def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> None:
+def _compile_ahead(pair: Pair, preset: Preset) -> None:
     """Compile in the background the programs of all stages, or of the trimmed stage of a partial pair.
 
     The other programs of a partial pair are not compiled, because its numbers of eigenvectors are not known
@@ -251,7 +244,7 @@ def _compile_ahead(pair: Pair, preset: Preset, history: bool) -> None:
         stages = [] if trimmed is None else [trimmed]
     numbers = [len(mesh.vertices) for mesh in pair.meshes]
     for stage in stages:
-        compile_stage(stage, *numbers, partial=pair.partial, history=history)
+        compile_stage(stage, *numbers, partial=pair.partial)
 
 
 def _omission(found: Correspondence) -> str:
@@ -281,9 +274,10 @@ def _warning(found: Correspondence, *, landmarks: bool) -> str:
     """Return the text of the warning that a map looks wrong. `landmarks` is True if landmarks were given."""
     pair, repair = found.pair, found.preset.repair
     settings = found.preset.criteria
-    matched = pair.mirrored() if found.mirrored else pair
-    reversed_ = orientation_reversal(matched, found.pointwise_map, found.spectrum_x, settings.scores)
-    cut_off = discontinuous_parts(matched, found.pointwise_map, settings.scores)
+    reversed_ = orientation_reversal(
+        found.matched_pair, found.pointwise_map, found.spectrum_x, settings.scores
+    )
+    cut_off = discontinuous_parts(found.matched_pair, found.pointwise_map, settings.scores)
     reversed_share, cut_off_share = (pair.mesh_x.average(fault) for fault in (reversed_, cut_off))
     cure = f"use {'more' if landmarks else 'a few'} landmarks as the initial map"
     if repair is None:

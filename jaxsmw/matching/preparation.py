@@ -368,8 +368,37 @@ class PreparedPair:
     eigensolver: Eigensolver = "auto"
 
     @classmethod
-    def of(cls, pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> PreparedPair:
-        """Return the prepared pair of meshes whose spectra are known.
+    def of(
+        cls,
+        pair: Pair,
+        x: PreparedShape,
+        y: PreparedShape,
+        *,
+        given: Pair | None = None,
+        mirrored: bool = False,
+        trimmed: bool = False,
+        laplacian: Laplacian = "auto",
+        eigensolver: Eigensolver = "auto",
+    ) -> PreparedPair:
+        """Return the prepared pair of two shapes, each in units in which its area is 1.
+
+        Two full shapes keep their own units. This compensates for a difference in size. The shapes of a
+        partial pair are scaled by one common factor, so that the larger shape has area 1. Unless the pair is
+        trimmed, their spectra are then cut at a common limit; see `common_range`. The shapes of a trimmed
+        pair cover nearly the same region, so they have about as many eigenvalues below any limit.
+
+        The arguments are the attributes. `given` is `pair` by default.
+        """
+        if pair.partial:
+            area_x, area_y = pair.areas
+            scaled = x.spectrum.scale(area_x), y.spectrum.scale(area_y)
+            of_x, of_y = scaled if trimmed else common_range(*scaled)
+            x, y = replace(x, spectrum=of_x), replace(y, spectrum=of_y)
+        return cls(given or pair, pair, x, y, mirrored, trimmed, laplacian, eigensolver)
+
+    @classmethod
+    def from_spectra(cls, pair: Pair, spectrum_x: Spectrum, spectrum_y: Spectrum) -> PreparedPair:
+        """Return the prepared pair of meshes whose spectra are known, in `Pair.units_of_length`.
 
         **Raises:** `InputError` if a spectrum and its mesh have different numbers of vertices.
         """
@@ -471,30 +500,7 @@ def prepare(
             'meshes, or set scale="unknown" (--scale unknown).'
         )
     x, y = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver, step=step)
-    prepared = pair_up(pair, x, y)
-    return replace(prepared, given=given or pair, laplacian=laplacian, eigensolver=eigensolver)
-
-
-def pair_up(pair: Pair, x: PreparedShape, y: PreparedShape, *, trimmed: bool = False) -> PreparedPair:
-    """Return the prepared pair of two prepared shapes.
-
-    Two full shapes keep their own units, in which each has area 1. This compensates for a difference in size.
-    The shapes of a partial pair are scaled by one common factor, so that the larger shape has area 1. Their
-    spectra are then cut at a common limit; see `common_range`.
-
-    **Arguments:**
-
-    - `pair`: the meshes X (m vertices) and Y (n vertices).
-    - `x`, `y`: the shapes, each a `PreparedShape` in units in which its area is 1.
-    - `trimmed`: whether the larger shape of a partial pair was trimmed. Both shapes then cover nearly the
-      same region, so they have about as many eigenvalues below any limit, and need no common limit.
-    """
-    if pair.partial:
-        area_x, area_y = pair.areas
-        scaled = x.spectrum.scale(area_x), y.spectrum.scale(area_y)
-        of_x, of_y = scaled if trimmed else common_range(*scaled)
-        x, y = replace(x, spectrum=of_x), replace(y, spectrum=of_y)
-    return PreparedPair(pair, pair, x, y, trimmed=trimmed)
+    return PreparedPair.of(pair, x, y, given=given, laplacian=laplacian, eigensolver=eigensolver)
 
 
 def paired_spectra(
@@ -507,7 +513,8 @@ def paired_spectra(
     """Compute the spectra of the two meshes of a pair in comparable units.
 
     Two full shapes are each scaled to area 1. The shapes of a partial pair are scaled by one common factor,
-    and their spectra are cut at a common limit; see `pair_up`.
+    and their spectra are cut at a common limit; see
+    `PreparedPair.of`.
 
     **Arguments:**
 
@@ -551,5 +558,7 @@ def describe(
     **Raises:** `InputError` if `number_of_descriptors` is not from 1 to 352, if a mesh is too coarse for SHOT
     at more than half of its vertices, or if a spectrum and its mesh have different numbers of vertices.
     """
-    prepared = PreparedPair.of(pair, spectrum_x, spectrum_y).describe(number_of_descriptors, required=True)
+    prepared = PreparedPair.from_spectra(pair, spectrum_x, spectrum_y).describe(
+        number_of_descriptors, required=True
+    )
     return prepared.x.spectrum, prepared.y.spectrum

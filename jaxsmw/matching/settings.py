@@ -90,41 +90,35 @@ class WrongProbabilitySettings:
 
 @dataclass(frozen=True)
 class AlternativeSettings:
-    """The settings of `jaxsmw.matching.search.alternatives`. Lengths are in units of the square root of the
-    area.
+    """The settings of the alternative maps, which docs/how_it_works.md explains.
 
-    The tables with numbers R1, R2, … are in `docs/research_log.md`.
+    Lengths are in units of the square root of the area. Tables R1, R2, … are in `docs/research_log.md`.
 
     **Attributes:**
 
-    - `samples`: the number of samples of each shape.
-    - `radii`: a tuple with one entry for each initial map from SHOT alone. Each entry is a tuple of radii,
-      which are positive integers in units of 0.06.
-    - `compared_pairings`: the largest number of pairings of extremities in the comparison of features. The
-      most plausible pairings are compared; see `jaxsmw.matching.search.proxies.plausible_pairings`.
-    - `pairings` (Tables R27 and R40): the number of initial maps from pairings of extremities.
-    - `distance_weight`: the weight of the distances to extremities in the search for initial maps. SHOT has
-      the weight 1.
-    - `position_weight`: the weight of the positions along the principal axes in the same search.
+    - `samples`: the number of samples of each shape, at least 1.
+    - `radii`: the radii of SHOT in units of 0.06, as one tuple of positive integers per initial map from SHOT
+      alone.
+    - `compared_pairings`: the largest number of pairings of extremities whose features are compared.
+    - `pairings` (Tables R27 and R40): the number of initial maps from pairings of extremities, at least 0.
+    - `distance_weight`: the weight of the distances to extremities in features. SHOT has the weight 1.
+    - `position_weight`: the weight of the positions along the principal axes in features.
     - `levels`, `descriptors`: the levels and the number of descriptors of the feature regression that refines
       the initial maps.
-    - `crease_eigenvectors` (Table R45): the number of crease eigenvectors in the second attempt, at least 0.
-      The second attempt refines the same initial maps with these further features. It runs if the first
-      attempt ends with a map that looks wrong, and the area-based shape difference of two full shapes is
-      below `RepairSettings.non_isometric`. With 0, there is no second attempt.
-    - `repaired`: the number of refined maps whose faults are repaired. For each fault of such a map, the map
-      is refined again without the faulty vertices.
-    - `fine_levels` (Table R40): the levels of a second refinement, which only promising maps receive. If
-      there are as many levels as in `levels`, no further program is compiled.
+    - `crease_eigenvectors` (Table R45): the number of crease eigenvectors in the second attempt. With 0,
+      there is no second attempt.
+    - `repaired`: the number of refined maps whose faults are repaired, at least 0.
+    - `fine_levels` (Table R40): the levels of the second refinement of promising maps. As many levels as in
+      `levels` need no further program.
     - `coarse_margin`: a map is promising if its score exceeds the best score by at most this number.
     - `promising`: the largest number of promising maps, at least 1.
     - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
     - `patch_radius` (Table R28): the radius of the patches on which the deformation is measured.
     - `different_distance`: two maps differ at a sample if the distance between its two matches along the
       surface exceeds this value. Between connected components, the Euclidean distance counts.
-    - `different_areas` (Table R27): a tuple of shares of X's area, each above 0. An alternative map must
-      differ from all earlier alternative maps on a minimum share. The entries of the tuple are the minimum
-      shares for the second map, the third map, and so on. The last entry also applies to all further maps.
+    - `different_areas` (Table R27): shares of X's area, each above 0. The second alternative map must differ
+      from all earlier ones on the first share, the third map on the second share, and so on. The last share
+      also applies to all further maps.
     - `margin` (Table R28): the largest difference of scores between the best map and a returned map, after
       the second refinement. Several maps are returned, because a wrong map can have the best score.
 
@@ -165,74 +159,57 @@ class RepairSettings:
     """The settings that determine when a map looks wrong, and how the map is repaired.
 
     The settings are passed as `Preset(first, repeated, repair=RepairSettings(...))` and take effect in
-    `jaxsmw.match`. A map is judged by its distortion and by its faults. The distortion is 1 for isometries
-    and larger for worse maps. There are two kinds of faults: vertices where the map reverses the orientation,
-    and parts of X that discontinuous edges separate from the rest.
-
-    Tables and entries R1, R2, … are in `docs/research_log.md`.
+    `jaxsmw.match`. docs/how_it_works.md explains distortions, faults, scores and the steps of the repair.
+    Tables and entries R1, R2, … are in `docs/research_log.md`. Areas are shares of X's area, from 0 to 1.
 
     **Attributes:**
 
     - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
-      value is suspicious and is repaired. Correct maps between poses of one body have a distortion below this
-      value.
+      value is suspicious and is repaired. Correct maps between poses of one body have smaller distortions.
     - `compared` (Table R40): a positive number, usually above 1. A map of two full shapes with a distortion
-      of at least this value is compared with alternative maps, even if it is not suspicious. If `compared` is
-      at least `suspicious`, only suspicious maps are compared.
-    - `suspicious_area` (Table R28): a share of X's area, from 0 to 1. A map is also suspicious if a fault
-      covers at least this share.
+      of at least this value is compared with alternative maps, even if it is not suspicious.
+    - `suspicious_area` (Table R28): a map is also suspicious if a fault covers at least this share.
     - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
       value. A value below `suspicious` has no effect. Between non-isometric shapes, some correct maps have
       distortions up to this value.
-    - `negligible_area`: a share of X's area, from 0 to 1. A fault that covers at most this share is not
-      repaired. Small faults, such as at fingertips, appear and disappear by chance.
-    - `excessive_area`: a share of X's area, from 0 to 1. A fault that covers at least this share is not
-      repaired. If most of a body is mapped upside down, the rest of the map does not suffice to find the
-      correct map.
-    - `rounds` (Table R5): the largest number of rounds of repair, at least 0. Each round runs the repeated
-      stages.
+    - `negligible_area`: faults up to this share are not repaired. Small faults, such as at fingertips, appear
+      and disappear by chance.
+    - `excessive_area`: faults from this share on are not repaired. If most of a body is mapped upside down,
+      the rest of the map does not suffice to find the correct map.
+    - `rounds` (Table R5): the largest number of rounds of repair, at least 0.
     - `finalists`: the largest number of alternative maps that are refined at all vertices, at least 0.
-    - `uncertainty_weight` (Table R28): the weight of the feature regression's uncertainty in the score, at
-      least 0. The logarithm of the distortion has the weight 1. Upside-down maps have a higher uncertainty
-      than correct maps, and mirrored maps have a higher distortion.
-    - `deformation_weight` (Table R28): the weight of the deformation in the score, at least 0. Upside-down
-      maps and mirrored maps have larger deformations than right maps.
-    - `non_isometric` (Table R29): a number of at least 0. If the final map of two full shapes has an
-      area-based shape difference of at least this value, the map is refined further, even if it looks right.
-      The difference is smaller between poses of one body.
-    - `passes` (Table R29): the number of usual passes, at least 0. In a usual pass, the repeated stages
-      run again. Maps between non-isometric shapes need further passes, because such maps
-      converge more slowly than maps between poses of one body.
+    - `uncertainty_weight`, `deformation_weight` (Table R28): the weights of the uncertainty and of the
+      deformation in the score, at least 0. The logarithm of the distortion has the weight 1.
+    - `non_isometric` (Table R29): a number of at least 0. Two full shapes whose map has an area-based shape
+      difference of at least this value are refined by further passes.
+    - `passes` (Table R29): the number of usual passes, at least 0.
     - `pass_tolerance` (Table R40): a number of at least 0. If all passes together increase the score without
       the deformation by more than this value, the map before the passes is kept.
     - `rival_margin` (entries R36 and R48): a number of at least 0. An outcome of repair whose score is worse
-      by at most this value is a rival of the map. If the map looks right, only outcomes that look right are
-      rivals. The passes also run from each rival. The rival replaces the map if its score after the passes is
-      better. If the map still looks wrong after repair, the score must be better by more than this value.
-    - `without_creases_from` (entry R47): a number of at least 0. If the area-based shape difference is at
-      least this value, the passes do not use crease eigenvectors.
-    - `coarse_from` (Table R32): a number of at least 0. If the area-based shape difference is at least this
-      value, coarse passes run first, and then a single usual pass. A value below `non_isometric` has the same
-      effect as `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always
-      run (entry R24).
+      by at most this value is a rival, from which the passes also run. To replace a map that still looks
+      wrong after repair, the score of a rival must be better by more than this value.
+    - `without_creases_from` (entry R47): a number of at least 0. From this area-based shape difference on,
+      the passes use no crease eigenvectors.
+    - `coarse_from` (Table R32): a number of at least 0. From this area-based shape difference on, coarse
+      passes and a single usual pass run instead. A value below `non_isometric` has the same effect as
+      `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always run
+      (entry R24).
     - `coarse_levels` (Table R32): the levels of the last repeated stage in each coarse pass, as one tuple per
-      pass. Tuples with the same length and the same maximum share a compiled program. If the refiner of this
-      stage has no levels, each coarse pass is the same as a usual pass.
+      pass. Tuples with the same length and the same maximum share a compiled program.
     - `aligned_preference` (entry R24): a number of at least 0. With `init="auto"`, asymmetric shapes are
       matched from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean
-      expected error is below this multiple of the other map's mean expected error. Both expected errors are
-      computed without `ExpectedErrorSettings.area_weight`, and before further passes.
+      expected error is below this multiple of the other map's. Both expected errors are computed with
+      `ExpectedErrorSettings(area_weight=0)`, and before further passes.
     - `cut_shortcuts` (Table R41): whether a mesh is cut before it is matched, where its surface is fused with
-      another part of itself, for example a hand with a hip. See `jaxsmw.geometry.cut_shortcuts`.
+      itself; see `jaxsmw.geometry.cut_shortcuts`.
     - `trims` (Table R46): the number of times that the larger shape of a partial pair is trimmed to the
-      region of the smaller shape and matched again by the last stage, at least 0.
+      region of the smaller shape and matched again, at least 0.
     - `trimmed_from` (Table R46): a positive number. A pair is trimmed if the larger area is at least this
       multiple of the smaller area. If the areas of two partial shapes are more similar, each shape often
       lacks a part of the other shape.
     - `trimmed_area` (Table R46): a positive number. The larger shape is trimmed to this multiple of the
       smaller area. The faces at the boundary of the kept region add to this area.
-    - `trimmed_levels` (Table R46): the levels of the last stage on a trimmed pair. If the refiner of this
-      stage has no levels, the stage is not changed.
+    - `trimmed_levels` (Table R46): the levels of the last stage on a trimmed pair, if its refiner has levels.
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
     - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
 

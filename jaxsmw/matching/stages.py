@@ -53,6 +53,7 @@ class Stage:
     - `ends_on_samples`: whether the stage matches the samples only; False by default. This argument must be
       False for the last stage.
     - `stop_when_unchanged`: whether refinement stops when an iteration changes no match; False by default.
+    - `history`: whether the stage records a `History`; False by default.
 
     **Raises:** `InputError` if `refiner` is not a `Refiner`, or if there are fewer samples than eigenvectors.
     `InputError` is also raised if `starts_on_samples` or `ends_on_samples` is True, but the stage has no
@@ -70,6 +71,7 @@ class Stage:
     starts_on_samples: bool = False
     ends_on_samples: bool = False
     stop_when_unchanged: bool = False
+    history: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.refiner, Refiner):
@@ -116,6 +118,7 @@ class Stage:
             starts_on_samples=self.starts_on_samples,
             ends_on_samples=self.ends_on_samples,
             stop_when_unchanged=self.stop_when_unchanged,
+            history=self.history,
         )
 
     def with_levels(self, levels: tuple[int, ...]) -> Stage:
@@ -223,9 +226,9 @@ class Preset:
             raise InputError(f"large is {self.large!r}: give a Preset or None.")
         _check_order(self.stages)
         if self.final:
-            if not self.judged:
+            if not self.before_final:
                 raise InputError("a preset of final stages has no map to judge: add stages before them.")
-            if self.judged[-1].ends_on_samples:
+            if self.before_final[-1].ends_on_samples:
                 raise InputError(
                     "the last stage before the final stages ends on samples, but its map is judged at all "
                     "vertices: use the default."
@@ -246,7 +249,7 @@ class Preset:
         return self.first + self.repeated + self.final
 
     @property
-    def judged(self) -> tuple[Stage, ...]:
+    def before_final(self) -> tuple[Stage, ...]:
         """The stages before the final stages, whose map is judged and repaired."""
         return self.first + self.repeated
 
@@ -263,6 +266,11 @@ class Preset:
         if self.large is not None and number_of_vertices >= _LARGE_FROM:
             return self.large.fitted(number_of_vertices)
         return replace(self, large=None)._with_stages(lambda stage: stage.fitted(number_of_vertices))
+
+    def with_history(self) -> Preset:
+        """Return the preset whose last stage records a `History`."""
+        last = self.stages[-1]
+        return self._with_stages(lambda stage: replace(stage, history=True) if stage is last else stage)
 
     def without_alternatives(self) -> Preset:
         """Return the preset whose repair tries no alternative maps."""

@@ -72,7 +72,7 @@ def initial_map(
     another mesh, a mesh that is too coarse for SHOT, or signatures that are not finite. `ArithmeticError` if
     the functional map of `"functional"` cannot be computed.
     """
-    start = make_start(PreparedPair.of(pair, spectrum_x, spectrum_y), init)
+    start = make_start(PreparedPair.from_spectra(pair, spectrum_x, spectrum_y), init)
     return extend_to_unreferenced(pair.mesh_x, start.pointwise_map)
 
 

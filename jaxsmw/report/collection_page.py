@@ -88,33 +88,28 @@ def write_collection_page(
     _check(names, faces, registered, template, edges, model)
     corners = np.asarray(faces, dtype=np.int64)
     first = Mesh(np.asarray(registered[template], dtype=np.float64), corners, names[template])
-    # If no model is given, a model is computed here only to align the shapes. Its modes are not shown.
+    # Without a model, one is computed here only to align the shapes. Its modes are not shown.
     shown_model = model or shape_model(registered, weights=first.vertex_areas, reference=template)
-    template_mesh = replace(first, vertices=shown_model.aligned[template])
-    some = [
-        i
-        for i in _some(len(registered), template)
-        # On a very bad shape, the template can collapse to a curve, which has no upright position.
-        if i == template or replace(first, vertices=shown_model.aligned[i]).area > 0
-    ]
+    aligned = [replace(first, vertices=positions) for positions in shown_model.aligned]
+    # On a very bad shape, the template can collapse to a curve, which has no upright position.
+    in_view = [i for i in _spread(len(aligned), template) if i == template or aligned[i].area > 0]
     if up is None:
         # The aligned shapes have a common upright axis, so the most frequent guess is used.
-        guesses = [guess_up(replace(first, vertices=shown_model.aligned[i])) for i in some]
-        up = Counter(guesses).most_common(1)[0][0]
-    standing = stand(template_mesh, up)
-    matrix, offset = placement(template_mesh, standing)
+        up = Counter(guess_up(aligned[i]) for i in in_view).most_common(1)[0][0]
+    standing = stand(aligned[template], up)
+    matrix, offset = placement(aligned[template], standing)
     to_page = np.linalg.inv(matrix)
-    chosen, chosen_faces = simplify(standing, MOST_VERTICES)
-    shapes = [(shape[chosen] - offset) @ to_page for shape in shown_model.aligned]
-    in_view = [replace(standing, vertices=shapes[i], faces=chosen_faces) for i in some]
+    kept, kept_faces = simplify(standing, MOST_VERTICES)
+    shapes = [(shape[kept] - offset) @ to_page for shape in shown_model.aligned]
+    seen = [replace(standing, vertices=shapes[i], faces=kept_faces) for i in in_view]
     data: dict[str, Any] = {
         "names": list(names),
         "template": int(template),
-        "faces": encode(chosen_faces, "<u4"),
-        "vertices": None if len(chosen) == len(first.vertices) else encode(chosen, "<u4"),
-        "colors": encode_colors(position_colors(standing)[chosen]),
+        "faces": encode(kept_faces, "<u4"),
+        "vertices": None if len(kept) == len(first.vertices) else encode(kept, "<u4"),
+        "colors": encode_colors(position_colors(standing)[kept]),
         "shapes": [encode_positions(shape) for shape in shapes],
-        "azimuth": choose_azimuth(in_view),
+        "azimuth": choose_azimuth(seen),
         "edges": [
             {
                 "source": edge.source,
@@ -126,14 +121,14 @@ def write_collection_page(
             for edge in edges
         ],
         "layout": layout(shown_model.aligned, shown_model.weights).tolist(),
-        "model": None if model is None else _encode_model(model, chosen, offset, to_page),
+        "model": None if model is None else _encode_model(model, kept, offset, to_page),
     }
     lead = (
         f"Every shape has the {len(first.vertices)} vertices of the template, {names[template]}. Equal "
         "colours mark the same point of the body on every shape."
     )
-    if len(chosen) < len(first.vertices):
-        lead += f" This page shows {len(chosen)} of the vertices."
+    if len(kept) < len(first.vertices):
+        lead += f" This page shows {len(kept)} of the vertices."
     fragments = {
         "title": escape(title),
         "lead": escape(lead),
@@ -239,7 +234,7 @@ def _check(
         )
 
 
-def _some(count: int, template: int) -> list[int]:
+def _spread(count: int, template: int) -> list[int]:
     """Return the indices of the template and of a few other shapes, which are spread evenly."""
     others = np.linspace(0, count - 1, min(count, _SHAPES_IN_VIEW)).round().astype(int).tolist()
     return list(dict.fromkeys([template, *others]))
@@ -247,7 +242,7 @@ def _some(count: int, template: int) -> list[int]:
 
 def _encode_model(
     model: ShapeModel,
-    chosen: Int64[np.ndarray, " q"],
+    kept: Int64[np.ndarray, " q"],
     offset: Float64[np.ndarray, " 3"],
     to_page: Float64[np.ndarray, "3 3"],
 ) -> dict[str, Any]:
@@ -256,9 +251,9 @@ def _encode_model(
     count = max(np.count_nonzero(shares >= _SMALLEST_SHARE), min(len(shares), 2))
     deviations = np.sqrt(model.variances[:count])
     return {
-        "mean": encode_positions((model.mean[chosen] - offset) @ to_page),
+        "mean": encode_positions((model.mean[kept] - offset) @ to_page),
         "modes": [
-            encode_positions(deviation * mode[chosen] @ to_page)
+            encode_positions(deviation * mode[kept] @ to_page)
             for deviation, mode in zip(deviations, model.modes, strict=False)
         ],
         "shares": shares[:count].tolist(),

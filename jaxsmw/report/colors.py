@@ -122,9 +122,9 @@ def error_colors(errors: Float[np.ndarray, " m"], limit: float = ERROR_LIMIT) ->
 
     Errors above `limit` have the last colour. Unknown errors (NaN) have the colour `PLAIN`.
     """
-    known = ~np.isnan(errors)
-    found = _on_scale(np.where(known, errors, 0), 0.0, limit, _ERROR_SCALE)
-    return np.where(known[:, None], found, PLAIN)
+    is_known = ~np.isnan(errors)
+    colors = _on_scale(np.where(is_known, errors, 0), 0.0, limit, _ERROR_SCALE)
+    return np.where(is_known[:, None], colors, PLAIN)
 
 
 def signed_colors(

@@ -61,8 +61,8 @@ def write_html(
 
 def _gradient(colors: Float64[np.ndarray, "n 3"]) -> str:
     """Return up to nine colours of a colour scale, as text for a CSS gradient."""
-    chosen = np.unique(np.linspace(0, len(colors) - 1, 9).round().astype(int))
-    return ", ".join(f"rgb({r} {g} {b})" for r, g, b in np.round(255 * colors[chosen]).astype(int))
+    stops = np.unique(np.linspace(0, len(colors) - 1, 9).round().astype(int))
+    return ", ".join(f"rgb({r} {g} {b})" for r, g, b in np.round(255 * colors[stops]).astype(int))
 
 
 def facts(values: Mapping[str, str]) -> str:

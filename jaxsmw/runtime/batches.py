@@ -262,12 +262,12 @@ def _take(tree: Tree, places: Int[Array, " batch"], mesh: Mesh) -> Tree:
 
 
 def _refine_batch(batch: _Batch, mesh: Mesh, settings: RefineSettings) -> Refinement:
-    def one(pair: _Batch) -> Refinement:
+    def refine_pair(pair: _Batch) -> Refinement:
         (spectrum_x, samples_x), (spectrum_y, samples_y), initial_map = pair
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
         return refine(spectrum_x, spectrum_y, initial_map, samples=samples, **settings)
 
-    each = partial(lax.map, one) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(one)
+    each = partial(lax.map, refine_pair) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(refine_pair)
     if mesh.size == 1:
         return each(batch)
     # `shard_map` is not used, because the solvers of optimistix do not run within it. The compiler still

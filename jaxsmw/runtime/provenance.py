@@ -145,10 +145,10 @@ def _check_origin(
     path = directory / "provenance.json"
     wanted = json.loads(json.dumps(provenance))
     if path.exists():
-        found = _read_provenance(path)
-        found.pop("noted", None)
-        for group in {**found, **wanted}:
-            before, now = found.get(group, {}), wanted.get(group, {})
+        stored = _read_provenance(path)
+        stored.pop("noted", None)
+        for group in {**stored, **wanted}:
+            before, now = stored.get(group, {}), wanted.get(group, {})
             for name in {**before, **now}:
                 if before.get(name) != now.get(name):
                     raise InputError(
@@ -168,9 +168,9 @@ def _check_origin(
 
 def _read_provenance(path: Path) -> dict[str, dict[str, Any]]:
     try:
-        found = json.loads(path.read_text("utf-8"))
+        stored = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict) or not all(isinstance(group, dict) for group in found.values()):
+        stored = None
+    if not isinstance(stored, dict) or not all(isinstance(group, dict) for group in stored.values()):
         raise InputError(f"{path}: the file is damaged: give another --output, or remove its directory.")
-    return found
+    return stored

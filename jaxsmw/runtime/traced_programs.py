@@ -138,12 +138,14 @@ def rebuild(structure: Structure, arrays: Sequence[Any]) -> Any:
             return tuple(values) if kind == "tuple" else list(values)
         if kind == "dict":
             return dict(zip(content[0], map(rebuilt, content[1:]), strict=True))
-        known = _known(content[0])
+        class_or_function = _named(content[0])
         if kind == "name":
-            return known
+            return class_or_function
         if kind == "named tuple":
-            return known(*map(rebuilt, content[1:]))
-        made = object.__new__(known)  # without `__init__`, because the fields have been checked before
+            return class_or_function(*map(rebuilt, content[1:]))
+        made = object.__new__(
+            class_or_function
+        )  # without `__init__`, because the fields have been checked before
         for name, value in zip(content[1], content[2:], strict=True):
             object.__setattr__(made, name, rebuilt(value))
         return made
@@ -151,25 +153,25 @@ def rebuild(structure: Structure, arrays: Sequence[Any]) -> Any:
     return rebuilt(structure)
 
 
-def _name(known: type | Callable) -> str:
+def _name(value: type | Callable) -> str:
     """Return the module and the name of a class or function; `UndescribedError` if they do not lead to it."""
-    module, name = getattr(known, "__module__", ""), getattr(known, "__qualname__", "")
+    module, name = getattr(value, "__module__", ""), getattr(value, "__qualname__", "")
     full = f"{module}:{name}"
     if (
         module.partition(".")[0] not in _PACKAGES
         or module.startswith(_NEVER_STORED)
         or "<locals>" in name
-        or _known(full) is not known
+        or _named(full) is not value
     ):
-        raise UndescribedError(f"{known!r} has no name in {' or '.join(_PACKAGES)}")
+        raise UndescribedError(f"{value!r} has no name in {' or '.join(_PACKAGES)}")
     return full
 
 
 @cache
-def _known(full: str) -> Any:
+def _named(full: str) -> Any:
     """Return the class or function with a name that `_name` returned; None if there is none."""
     module, _, name = full.partition(":")
-    found: Any = importlib.import_module(module)
+    value: Any = importlib.import_module(module)
     for part in name.split("."):
-        found = getattr(found, part, None)
-    return found
+        value = getattr(value, part, None)
+    return value

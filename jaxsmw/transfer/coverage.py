@@ -46,7 +46,7 @@ class UncoveredVertices:
     def __init__(self, mesh_x: Mesh, mesh_y: Mesh) -> None:
         self._mesh = mesh_x
         self._root = np.sqrt(mesh_y.area)
-        used = mesh_y.used_vertices
+        used = mesh_y.referenced_indices
         self._positions, self._areas = mesh_y.vertices[used], mesh_y.vertex_areas[used]
         self._first = True
 
@@ -80,24 +80,13 @@ def at_slits(mesh: Mesh, width: float) -> Bool[np.ndarray, " n"]:
     Two boundary vertices lie on opposite lips if their distance is at most `width`, each lies in front of the
     other's boundary, and their normals agree. Seams of duplicated vertices are not slits.
     """
-    n = len(mesh.vertices)
-    tails, heads, thirds = sides_of(mesh.faces)
-    numbers = np.minimum(tails, heads) * n + np.maximum(tails, heads)
-    at_boundary = np.isin(numbers, mesh.boundary_edges @ [n, 1])
-    tails, heads, thirds = tails[at_boundary], heads[at_boundary], thirds[at_boundary]
-    # The outward direction of a boundary edge is perpendicular to the edge, in the plane of its face.
-    along, inward = (mesh.vertices[ends] - mesh.vertices[tails] for ends in (heads, thirds))
-    along = unit_vectors(along)
-    outward = unit_vectors(along * (along * inward).sum(axis=1, keepdims=True) - inward)
-    sums = np.zeros((n, 3))
-    np.add.at(sums, tails, outward)
-    np.add.at(sums, heads, outward)
+    at_lips = np.zeros(len(mesh.vertices), bool)
     rows = np.unique(mesh.boundary_edges)
     # Vertices at one position belong to a seam, where the surface does not end.
     lowest = first_equal_rows(mesh.vertices[rows])
     rows = rows[np.bincount(lowest, minlength=len(rows))[lowest] == 1]
     if not len(rows):
-        return np.zeros(n, bool)
+        return at_lips
     # A limited number of neighbours bounds the memory.
     positions = mesh.vertices[rows]
     distances, others = KDTree(positions).query(
@@ -106,11 +95,29 @@ def at_slits(mesh: Mesh, width: float) -> Bool[np.ndarray, " n"]:
     near = np.isfinite(distances)
     first, second = np.repeat(rows, near.sum(axis=1)), rows[others[near]]
     between = mesh.vertices[second] - mesh.vertices[first]
-    normals = mesh.vertex_normals
-    facing = (sums[first] * sums[second]).sum(axis=1) < 0
-    facing &= (sums[first] * between).sum(axis=1) >= 0
-    facing &= (sums[second] * between).sum(axis=1) <= 0
+    outward, normals = _outward_directions(mesh), mesh.vertex_normals
+    facing = (outward[first] * outward[second]).sum(axis=1) < 0
+    facing &= (outward[first] * between).sum(axis=1) >= 0
+    facing &= (outward[second] * between).sum(axis=1) <= 0
     facing &= (normals[first] * normals[second]).sum(axis=1) > 0
-    found = np.zeros(n, bool)
-    found[np.concatenate([first[facing], second[facing]])] = True
-    return found
+    at_lips[np.concatenate([first[facing], second[facing]])] = True
+    return at_lips
+
+
+def _outward_directions(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
+    """Return at each vertex the sum of the outward directions of its boundary edges.
+
+    The outward direction of an edge is perpendicular to the edge, in the plane of its face.
+    """
+    n = len(mesh.vertices)
+    tails, heads, thirds = sides_of(mesh.faces)
+    numbers = np.minimum(tails, heads) * n + np.maximum(tails, heads)
+    at_boundary = np.isin(numbers, mesh.boundary_edges @ [n, 1])
+    tails, heads, thirds = tails[at_boundary], heads[at_boundary], thirds[at_boundary]
+    along, inward = (mesh.vertices[ends] - mesh.vertices[tails] for ends in (heads, thirds))
+    along = unit_vectors(along)
+    outward = unit_vectors(along * (along * inward).sum(axis=1, keepdims=True) - inward)
+    sums = np.zeros((n, 3))
+    np.add.at(sums, tails, outward)
+    np.add.at(sums, heads, outward)
+    return sums

@@ -314,7 +314,8 @@ def _deformed(
     normals = _normals(mesh_x.vertices, mesh_x)
     for of_round in _ROUNDS:
         loose = weights < areas
-        if not (covers if of_round.cover else is_first or loose.any()):
+        is_needed = covers if of_round.cover else is_first or loose.any()
+        if not is_needed:
             continue
         if of_round.pull:
             weights = np.where(loose, of_round.pull * areas, weights)
@@ -332,7 +333,8 @@ def _deformed(
             similarities = around.similarities(positions)
             flipped = _flipped_faces(mesh_x, normals, positions, similarities)
             # The first deformation uses transformations that are fitted to the map itself, which is noisy.
-            if not (of_round.pull or attraction or flipped.any() or is_first):
+            continues = of_round.pull or attraction or flipped.any() or is_first
+            if not continues:
                 break
             is_first = False
             near = np.zeros(len(weights))

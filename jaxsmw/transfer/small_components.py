@@ -91,11 +91,11 @@ def follow_surroundings(
     of_rows = Similarities(rotations[of_row], scales[of_row])
     positions[rows] = centers[of_row] + of_rows.of_vectors(mesh_x.vertices[rows] - parts.centers[of_row])
     similarities.rotations[rows], similarities.scales[rows] = of_rows
-    alone = ~paired[of_row]
-    matches[rows[alone]] = _nearest(mesh_y, mesh_y.used_vertices, positions[rows[alone]])
-    for number in np.flatnonzero(paired):
-        own, candidates = rows[of_row == number], others.rows[others.of_row == counterparts[number]]
-        matches[own] = _nearest(mesh_y, candidates, positions[own])
+    for counterpart in np.unique(counterparts[of_row]):
+        own = rows[counterparts[of_row] == counterpart]
+        is_paired = counterpart >= 0
+        candidates = others.rows[others.of_row == counterpart] if is_paired else mesh_y.referenced_indices
+        matches[own] = candidates[KDTree(mesh_y.vertices[candidates]).query(positions[own])[1]]
     # Welding leaves vertices without faces at the positions of vertices of small components.
     known = known | (matches >= 0)
     positions, similarities = _with_nearest(known, mesh_x, positions, similarities)
@@ -165,9 +165,3 @@ def _with_nearest(
     nearest = extend_from(known, mesh, np.arange(len(positions)))
     followed = Similarities(similarities.rotations[nearest], similarities.scales[nearest])
     return positions[nearest] + followed.of_vectors(mesh.vertices - mesh.vertices[nearest]), followed
-
-
-def _nearest(
-    mesh: Mesh, candidates: Int64[np.ndarray, " c"], points: Float64[np.ndarray, "p 3"]
-) -> Int64[np.ndarray, " p"]:
-    return candidates[KDTree(mesh.vertices[candidates]).query(points)[1]]

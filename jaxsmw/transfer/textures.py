@@ -65,14 +65,21 @@ def transfer_texture(
     lengths[apart] = distances
     best = _best_of_sides(surface, faces[shown], positions, start, near, lengths)
     at_corners = np.einsum("pk,pkx->px", weights[best], uv[surface.faces[found[best]]])
+    kept, number = _without_repetitions(faces[shown].ravel(), at_corners, uv)
+    corners[shown] = number.reshape(-1, 3)
+    return Texture(at_corners[kept], corners)
 
+
+def _without_repetitions(
+    vertices: Int64[np.ndarray, " c"], at_corners: Float64[np.ndarray, "c 2"], uv: Float64[np.ndarray, "u 2"]
+) -> tuple[Int64[np.ndarray, " t"], Int64[np.ndarray, " c"]]:
+    """Return a corner for each texture vertex, and the texture vertex of each corner."""
     grid = _SAME * max(float(np.ptp(uv, axis=0).max()), np.finfo(float).tiny)
     # The shift keeps regular coordinates, such as multiples of 1/8, away from the borders of grid cells.
     keys = np.floor((at_corners - uv.min(axis=0)) / grid + np.sqrt(0.1)).astype(np.int64)
-    keys = np.column_stack([faces[shown].ravel(), keys])
+    keys = np.column_stack([vertices, keys])
     _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    corners[shown] = number.reshape(-1, 3)
-    return Texture(at_corners[first], corners)
+    return first, number.ravel()
 
 
 def _best_of_sides(

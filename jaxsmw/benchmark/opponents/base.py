@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.util import find_spec
 
 import jax
 import numpy as np
@@ -87,6 +88,7 @@ class Method(abc.ABC):
     - `reference`: the publication and the settings of the method, as text that is printed with the results.
     - `number_of_eigenvectors`: the largest number of eigenvectors that the method uses.
     - `number_of_descriptors`: the largest number of descriptors that the method uses.
+    - `package`: the import name of the optional package that the method needs; an empty text for none.
     - `full_only`: whether the method matches only pairs of full shapes.
     - `partial_only`: whether the method matches only partial pairs.
     """
@@ -94,6 +96,7 @@ class Method(abc.ABC):
     reference: str
     number_of_eigenvectors: int
     number_of_descriptors: int = 0
+    package: str = ""
     full_only: bool = False
     partial_only: bool = False
 
@@ -103,6 +106,11 @@ class Method(abc.ABC):
 
         **Raises:** `ArithmeticError` if the method fails numerically.
         """
+
+    @property
+    def is_available(self) -> bool:
+        """Whether the package that the method needs is installed."""
+        return not self.package or find_spec(self.package) is not None
 
     def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
         """Return the map, and the seconds from the initial map to it; NaN if it was computed elsewhere."""

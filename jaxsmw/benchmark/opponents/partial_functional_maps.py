@@ -221,8 +221,8 @@ def partial_functional_map(
     finite = all_finite((functional_map, region, left))
     result = where(finite, RESULTS.successful, RESULTS.nonfinite_functional_map)
     result = diagnose(*spectra, pointwise_map.astype(jnp.int32), result)
-    found = decode(functional_map, *spectra)
-    return PartialMap(jnp.where(result == RESULTS.successful, found, -1), functional_map, region, result)
+    recovered = decode(functional_map, *spectra)
+    return PartialMap(jnp.where(result == RESULTS.successful, recovered, -1), functional_map, region, result)
 
 
 class _Energies(eqx.Module):

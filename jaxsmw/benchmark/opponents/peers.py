@@ -24,18 +24,12 @@ from jaxsmw.benchmark.opponents.baselines import ZOOMOUT
 _STEPS = (ZOOMOUT.number_of_eigenvectors - ZOOMOUT.first) // ZOOMOUT.step
 
 
-class Peer(HostMethod):
-    """The base class of methods that call another library's ZoomOut; `package` is the name of its import."""
-
-    number_of_eigenvectors = ZOOMOUT.number_of_eigenvectors
-    package: str
-
-
-class PyFM(Peer):
+class PyFM(HostMethod):
     """The ZoomOut implementation of pyFM."""
 
     reference = "pyFM's zoomout_refine, k = 20, 25, ..., 120, one job"
     package = "pyFM"
+    number_of_eigenvectors = ZOOMOUT.number_of_eigenvectors
 
     def match(
         self, initial_map: Int64[np.ndarray, " u"], x: HostShape, y: HostShape
@@ -60,11 +54,12 @@ class PyFM(Peer):
         return np.asarray(pointwise_map)
 
 
-class Geomfum(Peer):
+class Geomfum(HostMethod):
     """The ZoomOut implementation of geomfum."""
 
     reference = "geomfum's ZoomOut, k = 20, 25, ..., 120"
     package = "geomfum"
+    number_of_eigenvectors = ZOOMOUT.number_of_eigenvectors
 
     def match(
         self, initial_map: Int64[np.ndarray, " u"], x: HostShape, y: HostShape

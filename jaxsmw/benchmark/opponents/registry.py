@@ -7,28 +7,24 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING
 
 from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
     from jaxsmw.benchmark.opponents.base import Method
-    from jaxsmw.benchmark.opponents.peers import Peer
-
-MethodT = TypeVar("MethodT")
 
 
-class Methods(Mapping[str, MethodT], Generic[MethodT]):
+class Methods(Mapping[str, "Method"]):
     """A mapping from names to methods, made from a dictionary of the places where the methods are defined."""
 
     def __init__(self, places: Mapping[str, str]) -> None:
         self._places = places
 
-    def __getitem__(self, name: str) -> MethodT:
+    def __getitem__(self, name: str) -> Method:
         return resolve_name(f"{__package__}.{self._places[name]}")
 
     def __contains__(self, name: object) -> bool:
@@ -41,7 +37,7 @@ class Methods(Mapping[str, MethodT], Generic[MethodT]):
         return len(self._places)
 
 
-METHODS: Methods[Method] = Methods(
+METHODS = Methods(
     {
         "initial": "baselines:UNREFINED",
         "mwp": "baselines:MWP",
@@ -58,13 +54,13 @@ METHODS: Methods[Method] = Methods(
 )
 """The methods that need no other library, in the order of the rows of tables."""
 
-PEERS: Methods[Peer] = Methods({"pyfm-zoomout": "peers:PYFM", "geomfum-zoomout": "peers:GEOMFUM"})
+PEERS = Methods({"pyfm-zoomout": "peers:PYFM", "geomfum-zoomout": "peers:GEOMFUM"})
 """The methods of other libraries, which a benchmark can measure if the libraries are installed."""
 
 
 def known_methods() -> dict[str, Method]:
     """Return `METHODS` and the methods of other installed libraries."""
-    return {**METHODS, **{name: peer for name, peer in PEERS.items() if find_spec(peer.package)}}
+    return {**METHODS, **{name: peer for name, peer in PEERS.items() if peer.is_available}}
 
 
 def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
@@ -83,21 +79,21 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
     """
     from jaxsmw.benchmark.opponents.baselines import PublishedMaps
 
-    known, found = known_methods(), {}
+    available, methods = known_methods(), {}
     for name in dict.fromkeys(names):
-        if name in known:
-            found[name] = known[name]
+        if name in available:
+            methods[name] = available[name]
             continue
         # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
         if not os.path.isdir(name):
             raise InputError(
-                f"{name!r} is not a method: choose from {', '.join(known)}, or give a directory with maps "
-                "X_Y.map."
+                f"{name!r} is not a method: choose from {', '.join(available)}, or give a directory with "
+                "maps X_Y.map."
             )
         directory = Path(name).resolve()
-        if directory.name in {**known, **found}:
+        if directory.name in {**available, **methods}:
             raise InputError(
                 f"{directory}: another method already has the name {directory.name}: rename the directory."
             )
-        found[directory.name] = PublishedMaps(directory)
-    return found
+        methods[directory.name] = PublishedMaps(directory)
+    return methods

@@ -349,10 +349,9 @@ def _aligned(
 
     # The first matches compare only positions, normals and descriptors, because C is unknown.
     x, y = sampled[0]
-    known = slice(6)
     space = _ProductSpace(
-        np.hstack([turned(x, rotation)[:, known], x.weighted_descriptors]),
-        np.hstack([y.points[:, known], y.weighted_descriptors]),
+        np.hstack([turned(x, rotation)[:, :6], x.weighted_descriptors]),
+        np.hstack([y.points[:, :6], y.weighted_descriptors]),
     )
     matches = space.matches()
     for x, y in sampled:
@@ -372,14 +371,14 @@ def _refined(
         shells = surfaces[0].shell(level), surfaces[1].shell(level)
         both = list(zip(surfaces, shells, shells[::-1], matches, strict=True))
         if moved is None:
-            moved = [x.eigenvectors @ (x.dual.T @ y.positions[found]) for _, x, y, found in both]
+            moved = [x.eigenvectors @ (x.dual.T @ y.positions[images]) for _, x, y, images in both]
         moved = [
-            _as_rigid_as_possible(surface, x, y.positions[found], positions)
-            for (surface, x, y, found), positions in zip(both, moved, strict=True)
+            _as_rigid_as_possible(surface, x, y.positions[images], positions)
+            for (surface, x, y, images), positions in zip(both, moved, strict=True)
         ]
         points = []
-        for (surface, x, y, found), positions in zip(both, moved, strict=True):
-            mapped = x.eigenvectors @ _mapped(x, y, found)[:, 6:]
+        for (surface, x, y, images), positions in zip(both, moved, strict=True):
+            mapped = x.eigenvectors @ _mapped(x, y, images)[:, 6:]
             points.append(np.hstack([positions, _NORMALS * surface.normals(positions), mapped]))
         matches = _ProductSpace.of(shells, *points).matches()
     return matches

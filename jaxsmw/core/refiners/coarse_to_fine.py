@@ -25,12 +25,9 @@ def _whole_numbers(levels: Iterable[int]) -> tuple[int, ...]:
 
 
 class CoarseToFineState(State):
-    """The state of a coarse-to-fine refiner.
+    """The state of a coarse-to-fine refiner in the iteration of a number, counted from 0.
 
-    **Attributes:**
-
-    - `iteration`: the number of the iteration, counted from 0.
-    - `reverse_map`: the map Y -> X, for each vertex of Y to be matched, if `recover_both` has added it.
+    `recover_both` adds the `reverse_map` Y -> X, for each vertex of Y to be matched.
     """
 
     iteration: Int32[Array, ""]

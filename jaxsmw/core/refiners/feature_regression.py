@@ -164,14 +164,9 @@ class _Features(NamedTuple):
 
 
 class PreparedFeatures(Prepared):
-    """The result of `FeatureRegression.prepare`, computed once per problem.
+    """The features of the vertices to be matched (`x`, `y`) and of all vertices (`all_x`, `all_y`).
 
-    **Attributes:**
-
-    - `x`, `y`: the features of the vertices to be matched, which are the samples or all vertices.
-    - `all_x`, `all_y`: the features of all vertices.
-    - `patches`: the `Patches` of X and of Y, or None if the search uses no patches.
-    - `partial`: whether one shape is a part of the other.
+    `patches` are the `Patches` of X and of Y, or None if the search uses no patches.
     """
 
     x: _Features
@@ -185,12 +180,9 @@ class PreparedFeatures(Prepared):
 class Prediction(NamedTuple):
     """A linear prediction of features, for a nearest-neighbour search in the Mahalanobis distance.
 
-    **Attributes:**
-
-    - `queries`, `database`: the matrices (d_out, d_out) and (d_in, d_out) that take the features of query
-      vertices and of target vertices to the points of the search.
-    - `uncertainty`: half the log-determinant of the covariance of the residuals, without unit. Eigenvectors
-      that the iteration does not use are left out.
+    The matrices `queries` and `database` take the features of query vertices and of target vertices to the
+    points of the search. `uncertainty` is half the log-determinant of the covariance of the residuals,
+    without unit. Eigenvectors that the iteration does not use are left out.
     """
 
     queries: Float[Array, "d_out d_out"]
@@ -214,12 +206,7 @@ class Prediction(NamedTuple):
 
 
 class Regression(CoarseToFineState):
-    """The state of `FeatureRegression`.
-
-    **Attributes:**
-
-    - `forward`, `backward`: the `Prediction` of the features of X from Y, and of Y from X.
-    """
+    """The state of `FeatureRegression`: predictions of X from Y (`forward`) and of Y from X (`backward`)."""
 
     forward: Prediction
     backward: Prediction

@@ -245,16 +245,10 @@ class _Surface(NamedTuple):
 
 
 class PreparedSurfaces(Prepared):
-    """The result of `Registration.prepare`, computed once per problem.
+    """The vertices to be matched (`x`, `y`), and all vertices (`all_x`, `all_y`).
 
-    **Attributes:**
-
-    - `x`, `y`: the vertices to be matched, which are the samples or all vertices.
-    - `all_x`, `all_y`: all vertices. Positions are in units of the square root of the area.
-    - `samples`: the samples of X and of Y; None if all vertices are matched.
-    - `patches`, `reverse_patches`: the pairs of `Patches` for searches among the vertices of Y and of X; None
-      if these searches are exhaustive.
-    - `partial`: whether one shape is a part of the other.
+    `patches` and `reverse_patches` are the pairs of `Patches` for searches among the vertices of Y and of X;
+    None if these searches are exhaustive.
     """
 
     x: _Surface
@@ -270,16 +264,11 @@ class PreparedSurfaces(Prepared):
 class Deformation(NamedTuple):
     """A deformation of one surface onto another, as coefficients in the eigenvectors of the first surface.
 
-    The coefficients of inactive eigenvectors in `own` and `matched` are zero. Positions are in units of the
-    square root of the area.
-
-    **Attributes:**
-
-    - `own`: the coefficients (k_x, 3) of the surface's positions.
-    - `matched`: the coefficients (k_x, d) of the positions, normals and eigenfunctions of the matches.
-    - `moments`: the coefficients (k_x, 24) of 24 functions that heat flow has smoothed: positions, matched
-      positions, the products of positions with matched positions, and the products of normals with matched
-      normals.
+    `own` are the coefficients of its positions, and `matched` those of the positions, normals and
+    eigenfunctions of the matches, zero for inactive eigenvectors. `moments` are the coefficients of 24
+    functions that heat flow has smoothed: positions, matched positions, the products of positions with
+    matched positions, and the products of normals with matched normals. Positions are in units of the square
+    root of the area.
     """
 
     own: Float[Array, "k_x 3"]
@@ -329,12 +318,9 @@ def _split(rows: Float[Array, "r ..."], surfaces: Sequence[_Surface]) -> list[Fl
 
 
 class Registered(CoarseToFineState):
-    """The state of `Registration`.
+    """The state of `Registration`: the deformations of X onto Y (`forward`) and of Y onto X (`backward`).
 
-    **Attributes:**
-
-    - `forward`, `backward`: the `Deformation` of X onto Y, and of Y onto X.
-    - `descriptor_weight`: the weight of descriptors relative to positions, a scalar array.
+    `descriptor_weight` is the weight of descriptors relative to positions.
     """
 
     forward: Deformation

@@ -23,13 +23,9 @@ from jaxsmw.core.spectrum import Spectrum
 
 
 class PreparedWavelets(Prepared):
-    """The result of `WaveletPreservation.prepare`, computed once per problem.
+    """The result of `WaveletPreservation.prepare`. `solution` is the result of `Solution.prepare`.
 
-    **Attributes:**
-
-    - `wavelets`: a `WaveletProblem`.
-    - `solution`: the values that `Solution.prepare` returns.
-    - `patches`: the `Patches` of X and of Y, or None if the search uses no patches.
+    `patches` are the `Patches` of X and of Y, or None if the search uses no patches.
     """
 
     wavelets: WaveletProblem

@@ -68,13 +68,7 @@ class Solution(eqx.Module, Generic[PreparedT]):
 
 
 class PreparedFiltering(NamedTuple):
-    """The matrices that `Filtering` computes before the iterations.
-
-    **Attributes:**
-
-    - `kernel`: the `multiscale_kernel` of the filter bank on both shapes, (k_out, k_in), without unit.
-    - `dual_out`: the `dual_eigenvectors` of the shape that C maps to, (n_out, k_out), in units of length.
-    """
+    """The `multiscale_kernel` of the filter bank, and the `dual_eigenvectors` of the shape that C maps to."""
 
     kernel: Float[Array, "k_out k_in"]
     dual_out: Float[Array, "n_out k_out"]
@@ -157,15 +151,10 @@ class NearestOrthogonal(Solution[PreparedT]):
 class LeastSquares(Solution[None]):
     """The solution that minimises the wavelet-preservation energy exactly, for any frame.
 
-    Equation (5) of the MWP paper defines the energy. One Cholesky factorisation of the energy's gram matrix
-    (k_in, k_in) gives the minimiser C (k_out, k_in). The status code is `RESULTS.undetermined_functional_map`
-    if all filters are zero at an eigenvalue of the shape "in", and `RESULTS.singular_system` if the gram
-    matrix is singular to working precision.
-
-    **Arguments:**
-
-    - `norm`: the weights of the vertices of X in the energy, `"area"` (the default) or `"frobenius"`; see
-      `WaveletProblem.energy`.
+    One Cholesky factorisation of the energy's gram matrix gives the minimiser C (k_out, k_in) of equation (5)
+    of the MWP paper. The status code is `RESULTS.undetermined_functional_map` if all filters are zero at an
+    eigenvalue of the shape "in", and `RESULTS.singular_system` if the gram matrix is singular to working
+    precision. `norm` (`"area"` or `"frobenius"`) is that of `WaveletProblem.energy`.
 
     **Raises:** `ValueError` if `norm` is unknown.
     """

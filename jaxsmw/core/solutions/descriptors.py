@@ -14,13 +14,10 @@ from jaxsmw.core.spectrum import Spectrum
 
 
 class ProjectedDescriptors(eqx.Module):
-    """Functions on one shape, expressed in its eigenbasis.
+    """Functions f on one shape: their coefficients `Phi^+ f` (k, d), in the unit of f times length.
 
-    **Attributes:**
-
-    - `coefficients`: (k, d), the coefficients `Phi^+ f` of each function f, in the unit of f times length.
-    - `operators`: (d, k, k), one matrix `Phi^+ diag(f) Phi` per function f. This matrix multiplies other
-      functions by f (Nogneng and Ovsjanikov 2017). None if no operators were computed.
+    The `operators` (d, k, k) are the matrices `Phi^+ diag(f) Phi`, which multiply other functions by f
+    (Nogneng and Ovsjanikov 2017); None if they were not computed.
     """
 
     coefficients: Float[Array, "k d"]
@@ -48,10 +45,9 @@ class ProjectedDescriptors(eqx.Module):
 
 
 class DescriptorPair(eqx.Module):
-    """Corresponding functions on two shapes X and Y, such as descriptors, expressed in the eigenbases.
+    """Corresponding functions on X and Y, such as descriptors, for the terms of `RegularizedLeastSquares`.
 
-    `RegularizedLeastSquares` uses a `DescriptorPair` in its descriptor terms. `DescriptorPair.project`
-    computes a pair from the values of functions at the vertices.
+    `DescriptorPair.project` computes a pair from the values of functions at the vertices.
 
     **Attributes:**
 

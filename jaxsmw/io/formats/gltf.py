@@ -18,7 +18,7 @@ import numpy as np
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.arrays import first_equal_rows
 from jaxsmw.io.formats.polygons import Polygons, unique_name, unique_names
-from jaxsmw.io.formats.text import DAMAGED, excerpt
+from jaxsmw.io.formats.text import damaged, excerpt, export_again
 from jaxsmw.io.mesh_data import COLORS, Skin
 from jaxsmw.runtime.files import read_bytes
 from jaxsmw.wording import count_of
@@ -84,7 +84,7 @@ class _Scene:
             roots = document.list_of(document.item("scenes", document.json.get("scene", 0)), "nodes")
         else:
             children = [document.list_of(document.item("nodes", i), "children") for i in range(len(nodes))]
-            below = {str(child) for some in children for child in some}
+            below = {str(child) for of_node in children for child in of_node}
             roots = [i for i in range(len(nodes)) if str(i) not in below]
         in_scene: dict[int, tuple[dict[str, Any], np.ndarray]] = {}
         pending = [(root, np.eye(4)) for root in reversed(roots)]
@@ -92,7 +92,7 @@ class _Scene:
             number, above = pending.pop()
             node = document.item("nodes", number)
             if number in in_scene:
-                raise InputError(f"node {number} has several parents, {DAMAGED}")
+                raise damaged(f"node {number} has several parents")
             matrix = above @ self._matrix(node)
             in_scene[number] = node, matrix
             pending += [(child, matrix) for child in reversed(document.list_of(node, "children"))]
@@ -210,7 +210,7 @@ class _Scene:
             joints, _ = document.accessor(attributes[f"JOINTS_{number}"], (4,), n)
             weights = document.floats(attributes.get(f"WEIGHTS_{number}"), 4, n)
             if joints.dtype.kind != "u" or (joints[weights != 0] >= len(nodes)).any():
-                raise InputError(f"a vertex uses a joint that the skin does not have, {DAMAGED}")
+                raise damaged("a vertex uses a joint that the skin does not have")
             for node in nodes:
                 document.item("nodes", node)
             sets.append((np.array([*nodes, 0])[np.minimum(joints, len(nodes))], weights))
@@ -225,15 +225,13 @@ class _Scene:
             values, _ = self.document.accessor(primitive["indices"], (1,))
             indices = values[:, 0].astype(np.int64)
             if values.dtype.kind != "u" or (len(indices) and indices.max() >= n):
-                raise InputError(
-                    f"a triangle uses a vertex that does not exist among {count_of(n, 'vertex')}, {DAMAGED}"
-                )
+                raise damaged(f"a triangle uses a vertex that does not exist among {count_of(n, 'vertex')}")
         self.corners += len(indices) if mode == _TRIANGLES else 3 * len(indices)
         if self.corners > _MOST_CORNERS:
             raise InputError(f"describes more than {_MOST_CORNERS} corners of triangles: decimate the mesh.")
         if mode == _TRIANGLES:
             if len(indices) % 3:
-                raise InputError(f"has {len(indices)} corners, which do not form triangles, {DAMAGED}")
+                raise damaged(f"has {len(indices)} corners, which do not form triangles")
             return part.first + indices.reshape(-1, 3)
         i = np.arange(max(len(indices) - 2, 0))
         odd, first = (i % 2, i) if mode == _STRIP else (0, 0 * i)
@@ -344,7 +342,7 @@ def _without_copies(polygons: Polygons, record: dict[str, Any], document: _Docum
     if (texture < -1).any() or any(
         not np.array_equal(distinct, np.arange(len(distinct))) for distinct in (vertices, textures)
     ):
-        raise InputError(f"the record of duplicate vertices is not valid, {DAMAGED}")
+        raise damaged("the record of duplicate vertices is not valid")
     skin = polygons.skin
     return polygons._replace(
         vertices=polygons.vertices[first],
@@ -369,9 +367,7 @@ class _Document:
         try:
             self.json = json.loads(text.decode("utf-8-sig"), parse_constant=_refuse_constant)
         except (ValueError, RecursionError):
-            raise InputError(
-                "contains no valid JSON, so the file is not glTF or damaged: export the mesh again."
-            ) from None
+            raise export_again("contains no valid JSON, so the file is not glTF or damaged") from None
         asset = self.json.get("asset") if isinstance(self.json, dict) else None
         asset = asset if isinstance(asset, dict) else {}
         version, least = str(asset.get("version", "")), str(asset.get("minVersion", "2.0"))
@@ -392,25 +388,24 @@ class _Document:
                 f"has the version {version} of the GLB format: export the mesh again as glTF 2.0."
             )
         if length != len(data) or length < 20:
-            raise InputError(
-                f"declares {length} bytes, but has {len(data)}, so the file is truncated or damaged: export "
-                "the mesh again."
+            raise export_again(
+                f"declares {length} bytes, but has {len(data)}, so the file is truncated or damaged"
             )
         chunks, position = [], 12
         while position < length:
             size, kind = (int.from_bytes(data[i : i + 4], "little") for i in (position, position + 4))
             if position + 8 + size > length:
-                raise InputError(f"a chunk of the file declares {size} bytes, {DAMAGED}")
+                raise damaged(f"a chunk of the file declares {size} bytes")
             chunks.append((kind, data[position + 8 : position + 8 + size]))
             position += 8 + size
         if chunks[0][0] != _JSON:
-            raise InputError(f"does not begin with a JSON chunk, {DAMAGED}")
+            raise damaged("does not begin with a JSON chunk")
         if len(chunks) > 1 and chunks[1][0] == _BINARY:
             self.binary = chunks[1][1]
         return chunks[0][1]
 
     def refuse(self, key: str) -> NoReturn:
-        raise InputError(f"the value of {key!a} is not valid, {DAMAGED}")
+        raise damaged(f"the value of {key!a} is not valid")
 
     def list_of(self, parent: dict[str, Any], key: str) -> list[Any]:
         """Return the list under a key of an object, or an empty list if the key is missing."""
@@ -445,7 +440,7 @@ class _Document:
         items = self.list_of(self.json, key)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(items):
             number = index if isinstance(index, int) and abs(index) < 2**63 else excerpt(str(index)[:99])
-            raise InputError(f"uses {key}[{number}], but the length of {key} is {len(items)}, {DAMAGED}")
+            raise damaged(f"uses {key}[{number}], but the length of {key} is {len(items)}")
         if not isinstance(items[index], dict):
             self.refuse(key)
         return items[index]
@@ -461,11 +456,11 @@ class _Document:
             elif isinstance(uri, str):
                 content = _decoded(uri) if uri.startswith("data:") else self._external(uri)
             else:
-                raise InputError(f"has no contents for buffer {index}, {DAMAGED}")
+                raise damaged(f"has no contents for buffer {index}")
             if len(content) < length:
-                raise InputError(
-                    f"declares {length} bytes in buffer {index}, but the buffer has {len(content)}, so "
-                    "the file is truncated or damaged: export the mesh again."
+                raise export_again(
+                    f"declares {length} bytes in buffer {index}, but the buffer has {len(content)}, so the "
+                    "file is truncated or damaged"
                 )
             self.buffers[index] = content[:length]
         return self.buffers[index]
@@ -500,11 +495,11 @@ class _Document:
         size = np.dtype(kind).itemsize
         stride = self.integer(description, "byteStride", size * columns)
         if stride < size * columns or start + length > len(buffer):
-            raise InputError(f"buffer view {index} does not fit its buffer, {DAMAGED}")
+            raise damaged(f"buffer view {index} does not fit its buffer")
         if not count:
             return np.empty((0, columns), kind)
         if offset + stride * (count - 1) + size * columns > length:
-            raise InputError(f"an accessor needs more bytes than buffer view {index} has, {DAMAGED}")
+            raise damaged(f"an accessor needs more bytes than buffer view {index} has")
         rows = np.ndarray((count, columns), f"<{kind}", buffer, start + offset, (stride, size))
         return rows.astype(kind)
 
@@ -521,14 +516,14 @@ class _Document:
         width = COLUMNS.get(str(description.get("type")), 0)
         count = self.integer(description, "count")
         if kind is None or width not in columns:
-            raise InputError(f"accessor {index} does not have a suitable type, {DAMAGED}")
+            raise damaged(f"accessor {index} does not have a suitable type")
         if rows is not None and count != rows:
-            raise InputError(f"accessor {index} has {count} elements instead of {rows}, {DAMAGED}")
+            raise damaged(f"accessor {index} has {count} elements instead of {rows}")
         if "bufferView" in description:
             offset = self.integer(description, "byteOffset", 0)
             values = self.view(description["bufferView"], offset, count, kind, width)
         elif rows is None:  # limits memory: an accessor without data can state any number of elements
-            raise InputError(f"accessor {index} has no buffer view, {DAMAGED}")
+            raise damaged(f"accessor {index} has no buffer view")
         else:
             values = np.zeros((count, width), kind)
         if "sparse" in description:
@@ -541,11 +536,11 @@ class _Document:
         where, what = self.dict_of(sparse, "indices"), self.dict_of(sparse, "values")
         kind_of_index = TYPES.get(self.integer(where, "componentType"), "f4")
         if kind_of_index[0] != "u" or count > len(values):
-            raise InputError(f"a sparse accessor does not have valid indices, {DAMAGED}")
+            raise damaged("a sparse accessor does not have valid indices")
         offset = self.integer(where, "byteOffset", 0)
         indices = self.view(where.get("bufferView"), offset, count, kind_of_index, 1)[:, 0]
         if count and indices.max() >= len(values):
-            raise InputError(f"a sparse accessor replaces an element that does not exist, {DAMAGED}")
+            raise damaged("a sparse accessor replaces an element that does not exist")
         offset = self.integer(what, "byteOffset", 0)
         values[indices] = self.view(what.get("bufferView"), offset, count, kind, values.shape[1])
 
@@ -573,4 +568,4 @@ def _decoded(uri: str) -> bytes:
             raise ValueError
         return base64.b64decode(content, validate=True)
     except ValueError:
-        raise InputError(f"contains a data URI that is not valid base64, {DAMAGED}") from None
+        raise damaged("contains a data URI that is not valid base64") from None

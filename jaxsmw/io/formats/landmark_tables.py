@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.text import is_number
+from jaxsmw.io.formats.text import export_again, is_number
 from jaxsmw.io.landmarks import Landmarks, PointList, check_count
 from jaxsmw.wording import count_of
 
@@ -173,9 +173,7 @@ def parse_fcsv(text: str) -> Landmarks:
             columns.add_to(points, number, cells)
     system = stated.get("coordinatesystem")
     if system is not None and system not in SYSTEMS:
-        raise InputError(
-            f"the coordinate system {system[:40]!a} is neither LPS (1) nor RAS (0): export the markups again."
-        )
+        raise export_again(f"the coordinate system {system[:40]!a} is neither LPS (1) nor RAS (0)", "markups")
     return points.landmarks(
         None if system is None else SYSTEMS[system],
         notes=("The file states no coordinate system.",) if system is None else (),
@@ -201,9 +199,7 @@ def _fcsv_columns(stated: dict[str, str]) -> tuple[_Columns, list[str]]:
             "plain table to .csv."
         )
     if any(order.count(axis) != 1 for axis in "xyz") or order.count("label") > 1:
-        raise InputError(
-            "the line '# columns = …' does not name x, y and z once each: export the markups again."
-        )
+        raise export_again("the line '# columns = …' does not name x, y and z once each", "markups")
     name = order.index("label") if "label" in order else None
     return _Columns(len(order), [order.index(axis) for axis in "xyz"], name), order
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.text import is_number
+from jaxsmw.io.formats.text import export_again, is_number
 from jaxsmw.io.landmarks import Landmarks, PointList, check_count
 
 # These limits are far above what any file of points needs. They prevent a malicious file from using gigabytes
@@ -33,7 +33,7 @@ def _parse_xml(text: str, root: str, on_start: _OnStart, on_text: _OnText | None
     text. If the element has children, only the text after the last child is included.
     """
     if re.search(f"<[^<]{{{_LONGEST_TAG}}}", text):
-        raise InputError(f"has an element of more than {_LONGEST_TAG} characters: export the points again.")
+        raise export_again(f"has an element of more than {_LONGEST_TAG} characters", "points")
     # A point of MITK consists of five elements, each with a beginning and an end.
     check_count(max(text.count("<point "), text.count("<point>"), text.count("<") // 16))
     path: list[str] = []
@@ -43,7 +43,7 @@ def _parse_xml(text: str, root: str, on_start: _OnStart, on_text: _OnText | None
         if not path and name != root:
             raise InputError(f"is not a {root} file, because it begins with {name[:40]!a}: check the suffix.")
         if len(path) == _DEEPEST:
-            raise InputError(f"has more than {_DEEPEST} nested elements: export the points again.")
+            raise export_again(f"has more than {_DEEPEST} nested elements", "points")
         path.append(name)
         pieces.clear()
         on_start(path, attributes)
@@ -99,7 +99,7 @@ def _check_keys(point: dict[str, str], keys: Iterable[str], number: int) -> None
 
 
 def _refuse(number: int, fault: str) -> NoReturn:
-    raise InputError(f"point {number} {fault}: export the points again.")
+    raise export_again(f"point {number} {fault}", "points")
 
 
 def format_picked_points(landmarks: Landmarks) -> str:
@@ -161,6 +161,6 @@ def _index_to_world(
     words = [matrix.get(f"m_{row}_{column}", "") for row in range(3) for column in range(3)]
     words += [offset.get(axis, "") for axis in "xyz"]
     if not all(is_number(word) for word in words):
-        raise InputError("the Geometry3D lacks a number in IndexToWorld or Offset: export the points again.")
+        raise export_again("the Geometry3D lacks a number in IndexToWorld or Offset", "points")
     values = np.array(words, dtype=np.float64)
     return values[:9].reshape(3, 3), values[9:]

@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 from jaxsmw.choices import CoordinateSystem
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.landmark_tables import SYSTEMS
+from jaxsmw.io.formats.text import export_again
 from jaxsmw.io.landmarks import Landmarks, PointList
 from jaxsmw.wording import count_of
 
@@ -31,7 +32,7 @@ def parse_markups(text: str) -> Landmarks:
         unit, notes = None, (*notes, "The unit of the coordinates was ignored, because it is not text.")
     control_points = markup.get("controlPoints", [])
     if not isinstance(control_points, list):
-        raise InputError("controlPoints is not a list: export the markups again.")
+        raise export_again("controlPoints is not a list", "markups")
     points = PointList("control point")
     for number, point in enumerate(control_points, start=1):
         if not isinstance(point, dict):
@@ -67,10 +68,10 @@ def _parse_json(text: str) -> Any:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise InputError("states a property twice, so its meaning is not clear: export the markups again.")
-    return found
+    properties = dict(pairs)
+    if len(properties) < len(pairs):
+        raise export_again("states a property twice, so its meaning is not clear", "markups")
+    return properties
 
 
 def _single_list(document: Any) -> dict[str, Any]:
@@ -98,9 +99,9 @@ def _coordinate_system(markup: dict[str, Any]) -> tuple[CoordinateSystem, tuple[
         return "LPS", ("The file states no coordinate system, so LPS applies, the default of the format.",)
     stated = markup["coordinateSystem"]
     if not isinstance(stated, str) or stated not in SYSTEMS:
-        raise InputError(
-            f"the coordinate system {_excerpt(stated)} is neither LPS (1) nor RAS (0): export the markups "
-            "again."
+        raise export_again(
+            f"the coordinate system {_excerpt(stated)} is neither LPS (1) nor RAS (0)",
+            "markups",
         )
     return SYSTEMS[stated], ()
 
@@ -119,7 +120,7 @@ def _excerpt(value: Any) -> str:
 
 
 def _refuse(number: int, fault: str) -> NoReturn:
-    raise InputError(f"control point {number} {fault}: export the markups again.")
+    raise export_again(f"control point {number} {fault}", "markups")
 
 
 def format_markups(landmarks: Landmarks) -> str:

@@ -30,7 +30,7 @@ import scipy.io
 from jaxtyping import Float64
 from scipy.io.matlab import MatWriteError, matfile_version
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, naming
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, texture_or_note
 from jaxsmw.io.mesh_data import MeshData, Skin
 from jaxsmw.runtime.files import atomic_write, largest_contents, read_bytes
@@ -61,19 +61,15 @@ def is_mat_file(path: str | os.PathLike[str]) -> bool:
 def read_variables(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the variables of a `.mat` file of any size; see `parse_variables`. Messages name the file."""
     data = read_bytes(path, largest=None)
-    try:
+    with naming(path):
         return parse_variables(data)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def parse_variables(data: bytes) -> dict[str, Any]:
     """Parse the contents of a `.mat` file into a dictionary from the names of variables to their values.
 
-    Structs become dictionaries, and axes of length 1 are dropped.
-
-    **Raises:** `InputError` if the contents are damaged, or larger than both 1 GiB and four times the size of
-    the file (`jaxsmw.runtime.files.largest_contents`), or if format 7.3 needs pymatreader.
+    Structs become dictionaries, and axes of length 1 are dropped. Refuse contents that are larger than both
+    1 GiB and four times the size of the file (`jaxsmw.runtime.files.largest_contents`).
     """
     is_hdf5 = data.startswith((b"MATLAB 7.3", b"\x89HDF")) or data[124:126] in (b"\0\2", b"\2\0")
     try:
@@ -220,52 +216,43 @@ def _too_large() -> InputError:
 
 def find_structs(variables: Mapping[str, Any], *fields: str) -> dict[str, Mapping[str, Any]]:
     """Return all structs that have the given fields, under their full names such as `S.surface`."""
-    found: dict[str, Mapping[str, Any]] = {}
+    structs: dict[str, Mapping[str, Any]] = {}
     pending: list[tuple[str, Mapping[str, Any]]] = [("", variables)]
     while pending:
         name, struct = pending.pop(0)
         if all(field in struct for field in fields):
-            found[name] = struct
+            structs[name] = struct
         pending += [
             (f"{name}.{key}".lstrip("."), value) for key, value in struct.items() if isinstance(value, dict)
         ]
-    return found
+    return structs
 
 
 def read_matrix(
     path: str | os.PathLike[str], name: str, *, columns: int | None = None
 ) -> Float64[np.ndarray, "rows columns"]:
-    """Read a matrix of real numbers from a `.mat` file.
+    """Read a matrix of real numbers from a `.mat` file; `columns` is the necessary number of columns, if any.
 
-    If the file contains only one suitable matrix, the matrix may have any name. A matrix with a single row is
-    read as a column, because a list in MATLAB may be either a row or a column.
-
-    **Arguments:**
-
-    - `name`: the name of the matrix to read if the file contains several suitable matrices.
-    - `columns`: the number of columns of a suitable matrix, or None for any number.
-
-    **Raises:** `InputError` if the file cannot be read, or the matrix is missing or ambiguous.
+    If the file contains only one suitable matrix, the matrix may have any name. Otherwise, the matrix `name`
+    is read. A matrix with a single row is read as a column, because a list in MATLAB may be either.
     """
     variables = read_variables(path)
-    matrices = {key: value for key, value in variables.items() if _is_real(value)}
-    if columns == 1:
-        matrices = {key: value for key, value in matrices.items() if value.ndim == 1}
-    elif columns is not None:
-        matrices = {key: value for key, value in matrices.items() if value.shape[1:] == (columns,)}
+    # Axes of length 1 were dropped.
+    shapes = {None: None, 1: ()}.get(columns, (columns,))
+    matrices = {
+        key: value.astype(np.float64)
+        for key, value in variables.items()
+        if _is_real(value) and shapes in (None, value.shape[1:])
+    }
     what = "list of numbers" if columns == 1 else f"matrix of {columns} columns" if columns else "matrix"
-    if name in matrices:
-        chosen = matrices[name]
-    elif len(matrices) == 1:
-        (chosen,) = matrices.values()
-    elif matrices:
+    if not matrices:
+        contents = f"contains {', '.join(map(ascii, variables))}" if variables else "is empty"
+        raise InputError(f"{path}: {contents}, but no {what}: save the {what} as {name}.")
+    if len(matrices) > 1 and name not in matrices:
         raise InputError(
             f"{path}: contains more than one {what} ({', '.join(matrices)}): save the right one as {name}."
         )
-    else:
-        found = f"contains {', '.join(map(ascii, variables))}" if variables else "is empty"
-        raise InputError(f"{path}: {found}, but no {what}: save the {what} as {name}.")
-    matrix = chosen.astype(np.float64)
+    matrix = matrices.get(name, next(iter(matrices.values())))
     return matrix[:, None] if matrix.ndim == 1 else matrix
 
 
@@ -277,13 +264,19 @@ def _is_real(value: Any) -> bool:
 
 def write_variables(path: str | os.PathLike[str], variables: Mapping[str, Any]) -> None:
     """Write arrays, numbers and dictionaries, which become structs. Lists become columns."""
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        try:
-            scipy.io.savemat(file, dict(variables), do_compression=True, oned_as="column")
-        except MatWriteError:
-            raise InputError(
-                f"{path}: a variable is larger than 4 GiB, the limit of .mat files: write fewer eigenvectors."
-            ) from None
+    with atomic_write(path) as temporary, naming(path):
+        temporary.write_bytes(_saved(variables))
+
+
+def _saved(variables: Mapping[str, Any]) -> bytes:
+    file = io.BytesIO()
+    try:
+        scipy.io.savemat(file, dict(variables), do_compression=True, oned_as="column")
+    except MatWriteError:
+        raise InputError(
+            "a variable is larger than 4 GiB, the limit of .mat files: write a .npz file, or fewer numbers."
+        ) from None
+    return file.getvalue()
 
 
 def parse_mat(data: bytes) -> Polygons:
@@ -295,15 +288,15 @@ def parse_mat(data: bytes) -> Polygons:
         )
     name, surface = next(iter(structs.items()), ("", {}))
     columns = ("X", "Y", "Z") if "X" in surface else ("VERT",)
-    given = [field for field in ("TRIV", *columns) if field in surface]
-    for field in given:
+    fields = [field for field in ("TRIV", *columns) if field in surface]
+    for field in fields:
         if not _is_real(surface[field]):  # a conversion to float64 would drop imaginary parts
             raise InputError(
                 f"{f'{name}.{field}'.lstrip('.')} is not an array of real numbers: save real coordinates and "
                 "vertex indices."
             )
     vertices = faces = np.empty(0)
-    if len(given) == 1 + len(columns) and len({len(surface[field]) for field in columns}) == 1:
+    if len(fields) == 1 + len(columns) and len({len(surface[field]) for field in columns}) == 1:
         vertices = np.column_stack([surface[field] for field in columns]).astype(np.float64)
         faces = surface["TRIV"].astype(np.float64)
         faces = faces[None] if faces.shape == (3,) else faces  # one face
@@ -381,13 +374,6 @@ def format_mat(data: MeshData) -> Formatted:
         surface["texture"] = {"coordinates": data.texture[0], "corners": data.texture[1] + 1.0}
     if data.skin is not None:
         surface["skin"] = {"joints": _cells(data.skin[0]), "weights": data.skin[1]}
-    file = io.BytesIO()
-    try:
-        scipy.io.savemat(file, {"surface": surface}, do_compression=True, oned_as="column")
-    except MatWriteError:
-        raise InputError(
-            "an array is larger than 4 GiB, the limit of .mat files: write a .npz file."
-        ) from None
     notes = omissions(
         data,
         "MATLAB",
@@ -398,7 +384,7 @@ def format_mat(data: MeshData) -> Formatted:
         texture=True,
         skin=True,
     )
-    return file.getvalue(), notes
+    return _saved({"surface": surface}), notes
 
 
 def _cells(words: tuple[str, ...]) -> np.ndarray:

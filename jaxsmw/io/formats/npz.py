@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import IO, Any
 
 import numpy as np
 
@@ -79,10 +81,8 @@ def read_arrays(data: bytes) -> dict[str, np.ndarray]:
                     "write the file again, without other arrays."
                 )
             for member in members:
-                with file.open(member) as stream:
-                    check_header(stream, member.file_size)
-                with file.open(member) as stream:
-                    arrays[member.filename.removesuffix(".npy")] = np.lib.format.read_array(stream)
+                name = member.filename.removesuffix(".npy")
+                arrays[name] = _checked(partial(file.open, member), member.file_size)
     except InputError:
         raise
     except Exception:  # NumPy and zipfile can raise any exception for damaged files
@@ -90,13 +90,28 @@ def read_arrays(data: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
-def check_header(stream: Any, size: int) -> None:
-    """Raise `ValueError` if a header declares more than `size` bytes, a negative length or objects."""
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, kind = read(stream)
-    if kind.hasobject or math.prod(shape) * kind.itemsize > size or min(shape, default=0) < 0:
-        raise ValueError("the array is larger than its file")
+def read_array(data: bytes) -> np.ndarray:
+    """Return the array of a `.npy` file."""
+    try:
+        return _checked(partial(io.BytesIO, data), len(data))
+    except Exception:  # NumPy can raise any exception for damaged files
+        raise InputError(
+            "is not an array saved by NumPy, or contains pickled objects: save an array of numbers with "
+            "numpy.save."
+        ) from None
+
+
+def _checked(open_file: Callable[[], IO[bytes]], size: int) -> np.ndarray:
+    """Read an array. Refuse a header that declares more than `size` bytes, a negative length or objects."""
+    with open_file() as stream:
+        version = np.lib.format.read_magic(stream)
+        is_first = version == (1, 0)
+        read = np.lib.format.read_array_header_1_0 if is_first else np.lib.format.read_array_header_2_0
+        shape, _, kind = read(stream)
+        if kind.hasobject or math.prod(shape) * kind.itemsize > size or min(shape, default=0) < 0:
+            raise ValueError("the array is larger than its file")
+    with open_file() as stream:
+        return np.lib.format.read_array(stream)
 
 
 def format_npz(data: MeshData) -> Formatted:

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import Formatted, Polygons, is_color, omissions, texture_or_note
-from jaxsmw.io.formats.text import excerpt, numbers, polygon_lines, text
+from jaxsmw.io.formats.text import excerpt, export_again, numbers, polygon_lines, text
 from jaxsmw.io.mesh_data import COLORS, MeshData
 
 # A dictionary from each kind of label to the keyword of its lines in OBJ files. Such a line sets the label of
@@ -37,9 +37,9 @@ def parse_obj(data: bytes) -> Polygons:
     if not lines and re.search(r"^\s*surf\s", content, re.MULTILINE):
         raise InputError("contains free-form surfaces but no faces: export the mesh as triangles.")
     if ends_in_face and sizes[-1] < 3:
-        raise InputError("ends in the middle of a face, so the file is truncated: export the mesh again.")
+        raise export_again("ends in the middle of a face, so the file is truncated")
     if (corners == 0).any():
-        raise InputError("a face uses vertex 0, but OBJ files count from 1: export the mesh again.")
+        raise export_again("a face uses vertex 0, but OBJ files count from 1")
     face_at = cache(lambda: [match.start() for match in face.finditer(content)])  # found on demand
     written, corners = corners, _counted_backward(corners, sizes, vertex, face_at, content)
     outside = (corners < 1) | (corners > len(vertices))
@@ -102,25 +102,23 @@ def _texture(
     if not any(texts):
         return None
     if len(texts) != sizes.sum():
-        raise InputError("a corner of a face has no vertex: export the mesh again.")
-    known = np.array([bool(one) for one in texts])
-    wrong = next((one for one in texts if one and not re.fullmatch(r"[+-]?\d{1,15}", one, re.ASCII)), None)
-    if wrong is not None:
-        raise InputError(
-            f"{excerpt(wrong)} is written where a texture vertex should be: export the mesh again."
-        )
+        raise export_again("a corner of a face has no vertex")
+    for word in texts:
+        if word and not re.fullmatch(r"[+-]?\d{1,15}", word, re.ASCII):
+            raise export_again(f"{excerpt(word)} is written where a texture vertex should be")
+    has_texture = np.array([word != "" for word in texts])
     pattern = _lines("vt")
     written = [f"{line} 0" if len(line.split()) == 1 else line for line in pattern.findall(content)]
     coordinates = numbers(written, 2)
-    indices = np.array([int(one or 1) for one in texts])
+    indices = np.array([int(word or 1) for word in texts])
     indices = _counted_backward(indices, sizes, pattern, face_at, content)
-    outside = known & ((indices < 1) | (indices > len(coordinates)))
+    outside = has_texture & ((indices < 1) | (indices > len(coordinates)))
     if outside.any():
-        raise InputError(
-            f"a face uses texture vertex {texts[int(outside.argmax())]}, but the file has "
-            f"{len(coordinates)} vt lines: export the mesh again."
+        raise export_again(
+            f"a face uses texture vertex {texts[int(outside.argmax())]}, but the file has {len(coordinates)} "
+            "vt lines"
         )
-    return coordinates, np.where(known, indices - 1, -1)
+    return coordinates, np.where(has_texture, indices - 1, -1)
 
 
 def _labels(
@@ -129,15 +127,14 @@ def _labels(
     """Return the group, the object and the material of each face as labels, and the names of the labels."""
     labels, names_of = {}, {}
     for label, keyword in _LABELS.items():
-        found = list(_lines(keyword).finditer(content)) if f"{keyword} " in content else []
-        if not found:
+        lines = list(_lines(keyword).finditer(content)) if f"{keyword} " in content else []
+        if not lines:
             continue
-        above = np.searchsorted([match.start() for match in found], face_at())
-        written = [_NO_NAME] + [" ".join(_decoded(match[1]).split()) or _NO_NAME for match in found]
-        names = list(dict.fromkeys(written[i] for i in above.tolist()))
-        number = {name: i for i, name in enumerate(names)}
-        labels[label] = np.array([number[written[i]] for i in above.tolist()], np.int64)
-        names_of[label] = tuple(names)
+        above = np.searchsorted([line.start() for line in lines], face_at()).tolist()
+        written = [_NO_NAME] + [" ".join(_decoded(line[1]).split()) or _NO_NAME for line in lines]
+        number = {name: i for i, name in enumerate(dict.fromkeys(written[i] for i in above))}
+        labels[label] = np.array([number[written[i]] for i in above], np.int64)
+        names_of[label] = tuple(number)
     return labels, names_of
 
 
@@ -191,7 +188,7 @@ def _fits_faces(data: MeshData, name: str) -> bool:
         name in _LABELS
         and name in data.face_data
         and bool(names)
-        and all(one == " ".join(one.split()) and not re.search(r"[#\\]|^$", one) for one in names)
+        and all(line == " ".join(line.split()) and not re.search(r"[#\\]|^$", line) for line in names)
     )
 
 

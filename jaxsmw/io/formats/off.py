@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import Formatted, Polygons, are_vertices, is_color, omissions
-from jaxsmw.io.formats.text import filled_lines, numbers, polygon_lines
+from jaxsmw.io.formats.text import export_again, filled_lines, numbers, polygon_lines
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData
 from jaxsmw.wording import count_of
 
@@ -27,16 +27,13 @@ def parse_off(data: bytes) -> Polygons:
     lines = ([keyword[2]] if keyword[2] else []) + lines[1:]
     counts = re.match(r"\s*(\d{1,18})\s+(\d{1,18})(\s|$)", lines[0]) if lines else None
     if counts is None:
-        raise InputError(
-            "lacks valid numbers of vertices and faces after the keyword OFF: export the mesh again."
-        )
+        raise export_again("lacks valid numbers of vertices and faces after the keyword OFF")
     n, f = int(counts[1]), int(counts[2])
     lines = lines[1:]
     if len(lines) != n + f:
-        raise InputError(
+        raise export_again(
             f"the header declares {n} vertices and {f} faces, but is followed by "
-            f"{count_of(len(lines), 'line')}, so the file is truncated or its header is wrong: export the "
-            "mesh again."
+            f"{count_of(len(lines), 'line')}, so the file is truncated or its header is wrong"
         )
     vertices, rows = numbers(lines[:n], 3), lines[n:]
     corners, sizes = polygon_lines(rows)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import Polygons
-from jaxsmw.io.formats.text import excerpt, numbers, text
+from jaxsmw.io.formats.text import excerpt, export_again, filled_lines, numbers
 from jaxsmw.io.mesh_data import NORMALS
 from jaxsmw.wording import count_of
 
@@ -17,56 +16,47 @@ _KINDS = {"F": "f", "I": "i", "U": "u"}
 _NORMAL_FIELDS = ("normal_x", "normal_y", "normal_z")
 # Unpacked points are refused if they exceed both this number of bytes and four times their packed size.
 _LARGEST = 2**28
+_ENCODINGS = "ascii", "binary", "binary_compressed"
 # The name of padding fields, which contain no data.
 _PADDING = "_"
 
 
-class _Header(NamedTuple):
-    """The header of a file. `record` is the record type of a point."""
-
-    record: np.dtype
-    points: int
-    encoding: str
-
-
 def parse_pcd(data: bytes) -> Polygons:
     """Parse a text file, a binary file, or a file in the format `binary_compressed`."""
-    header, body = _header(data)
-    if header.encoding == "ascii":
-        table = _from_text(body, header)
+    record, points, encoding, body = _header(data)
+    if encoding == "ascii":
+        table = _from_text(body, record, points)
+    elif encoding == "binary_compressed":
+        table = _decompressed(body, record, points)
     else:
-        if header.encoding == "binary_compressed":
-            body = _decompress(body, header)
-        size = header.points * header.record.itemsize
+        size = points * record.itemsize
         if len(body) < size:
-            raise InputError(
-                f"the header declares {header.points} points, but the file ends earlier, so the file is "
-                "truncated: export the points again."
+            raise export_again(
+                f"the header declares {points} points, but the file ends earlier, so the file is truncated",
+                "points",
             )
-        table = np.frombuffer(body[:size], header.record)
+        table = np.frombuffer(body[:size], record)
+    columns = {name: table[name] for name in record.names or () if not name.startswith(_PADDING)}
     for axis in "xyz":
-        if axis not in (header.record.names or ()) or header.record[axis].shape != (1,):
+        if axis not in columns or columns[axis].shape[1:] != (1,):
             raise InputError(
                 f"has no field {axis} with one number for each point: export the points again, with x, y "
                 "and z."
             )
-    columns = {name: table[name] for name in table.dtype.names or () if not name.startswith(_PADDING)}
     vertices = np.stack([columns.pop(axis).reshape(-1) for axis in "xyz"], axis=1).astype(np.float64)
     if all(name in columns and columns[name].shape[1:] == (1,) for name in _NORMAL_FIELDS):
         columns[NORMALS] = np.stack([columns.pop(name).reshape(-1) for name in _NORMAL_FIELDS], axis=1)
-    return Polygons(vertices, np.empty(0), np.empty(0, np.int64), vertex_data=columns)
+    return Polygons(vertices, vertex_data=columns)
 
 
-def _header(data: bytes) -> tuple[_Header, bytes]:
-    """Parse the header, and return it with the rest of the file."""
+def _header(data: bytes) -> tuple[np.dtype, int, str, bytes]:
+    """Return the record type and the number of the points, the encoding, and the rest of the file."""
     entries: dict[str, list[str]] = {}
     offset = 0
     while "DATA" not in entries:
         end = data.find(b"\n", offset)
         if end < 0 or end > 2**16:
-            raise InputError(
-                "has no line DATA at the end of its header, so the file is damaged: export the points again."
-            )
+            raise export_again("has no line DATA at the end of its header, so the file is damaged", "points")
         words = data[offset:end].decode("latin-1").split()
         offset = end + 1
         if words and not words[0].startswith("#"):
@@ -94,32 +84,29 @@ def _header(data: bytes) -> tuple[_Header, bytes]:
         ):
             raise ValueError
     except (KeyError, TypeError, ValueError):
-        raise InputError(
-            f"the header is damaged (fields {excerpt(' '.join(names))}, data {excerpt(encoding)}): export "
-            "the points again."
+        raise export_again(
+            f"the header is damaged (fields {excerpt(' '.join(names))}, data {excerpt(encoding)})",
+            "points",
         ) from None
-    return _Header(record, points, encoding), data[offset:]
+    return record, points, encoding, data[offset:]
 
 
-_ENCODINGS = "ascii", "binary", "binary_compressed"
-
-
-def _from_text(body: bytes, header: _Header) -> np.ndarray:
+def _from_text(body: bytes, record: np.dtype, points: int) -> np.ndarray:
     """Return the points of a text file, as an array of records."""
-    lines = [line for line in text(body).split("\n") if line and not line.isspace()]
-    if len(lines) != header.points:
+    lines = filled_lines(body)
+    if len(lines) != points:
         raise InputError(
-            f"the header declares {header.points} points, but is followed by {len(lines)} lines, so the file "
-            "is truncated or its header is wrong: export the points again."
+            f"the header declares {points} points, but is followed by {len(lines)} lines, so the file is "
+            "truncated or its header is wrong: export the points again."
         )
-    names = header.record.names or ()
-    declared, written = header.record.itemsize, len(lines[0].split()) if lines else 0
+    names = record.names or ()
+    declared, written = record.itemsize, len(lines[0].split()) if lines else 0
     if written * 8 < declared:  # no number takes more than 8 bytes
         raise InputError(
             f"the header declares {declared} bytes for each point, but the first point has "
             f"{count_of(written, 'number')}: export the points again."
         )
-    widths = [math.prod(header.record[name].shape) for name in names]
+    widths = [math.prod(record[name].shape) for name in names]
     values = np.split(numbers(lines, sum(widths)), np.cumsum(widths)[:-1], axis=1)
     table = np.empty(len(lines), [(name, "f8", (width,)) for name, width in zip(names, widths, strict=True)])
     for name, columns in zip(names, values, strict=True):
@@ -127,12 +114,12 @@ def _from_text(body: bytes, header: _Header) -> np.ndarray:
     return table
 
 
-def _decompress(body: bytes, header: _Header) -> bytes:
-    """Return the records of a compressed file, which stores all values of a field one after another."""
-    packed, size = (int(n) for n in np.frombuffer(body[:8].ljust(8, b"\0"), "<u4"))
-    expected = header.points * header.record.itemsize
+def _decompressed(body: bytes, record: np.dtype, points: int) -> np.ndarray:
+    """Return the points of a compressed file, which stores all values of a field one after another."""
+    packed, size = np.frombuffer(body[:8].ljust(8, b"\0"), "<u4").tolist()
+    expected = points * record.itemsize
     if len(body) < 8 + packed:
-        raise InputError("ends within the compressed points, so it is truncated: export the points again.")
+        raise export_again("ends within the compressed points, so it is truncated", "points")
     if size != expected:
         raise InputError(
             f"declares {size} bytes of compressed points where the header requires {expected}, so the file "
@@ -143,23 +130,20 @@ def _decompress(body: bytes, header: _Header) -> bytes:
             f"contains {size >> 20} MiB of compressed points: export the points again without compression."
         )
     fields = lzf_decompressed(body[8 : 8 + packed], size)
-    table, offset = np.empty(header.points, header.record), 0
-    for name in header.record.names or ():
-        kind = header.record[name]
-        table[name] = np.frombuffer(fields, kind, header.points, offset)
-        offset += header.points * kind.itemsize
-    return table.tobytes()
+    table, offset = np.empty(points, record), 0
+    for name in record.names or ():
+        table[name] = np.frombuffer(fields, record[name], points, offset)
+        offset += points * record[name].itemsize
+    return table
 
 
 def lzf_decompressed(packed: bytes, size: int) -> bytes:
-    """Decompress data in the LZF format of Marc Lehmann's LibLZF.
+    """Decompress data in the LZF format of Marc Lehmann's LibLZF to exactly `size` bytes.
 
     After a control byte c below 32, c + 1 literal bytes follow. Any other control byte means a copy of
     earlier output. The upper three bits of the control byte are the length minus 2. If these bits are all
     set, the next byte is added to the length. The lower five bits and the following byte are the distance
     minus 1.
-
-    **Raises:** `InputError` if the data is damaged, or does not unpack to `size` bytes.
     """
     out, at = bytearray(), 0
     try:
@@ -184,5 +168,5 @@ def lzf_decompressed(packed: bytes, size: int) -> bytes:
     except IndexError:
         out = bytearray()
     if len(out) != size or at != len(packed):
-        raise InputError("contains damaged compressed points: export the points again.")
+        raise export_again("contains damaged compressed points", "points")
     return bytes(out)

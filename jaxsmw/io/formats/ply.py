@@ -17,16 +17,24 @@ from jaxsmw.io.formats.polygons import (
     is_texture_of_vertices,
     omissions,
     texture_or_note,
+    width_of,
 )
-from jaxsmw.io.formats.text import excerpt, is_number
+from jaxsmw.io.formats.text import damaged, excerpt, export_again, is_number
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, texture_at_corners, texture_of_corners
 
-_PLY_TYPES = {
+_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"int64": "i8", "uint64": "u8", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+    **{"float": "f4", "double": "f8"},
 }
-_PLY_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_TYPE_NAMES = {kind: name for name, kind in _TYPES.items()}
+# Newer programs name the number of bits.
+_TYPES |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+_TYPES |= {"int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"}
+_BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+# Properties that become the columns of one array.
+_COLUMNS_OF = {COLORS: ("red", "green", "blue", "alpha"), NORMALS: ("nx", "ny", "nz")}
+_TEXTURES = ("s", "t"), ("u", "v"), ("texture_u", "texture_v")
+_CORNERS = "vertex_indices", "vertex_index"
 
 
 class _Property(NamedTuple):
@@ -44,8 +52,8 @@ class _Property(NamedTuple):
 class _Column(NamedTuple):
     """The values of a property in all rows, one row after another, and the number of values in each row."""
 
-    values: np.ndarray
-    sizes: np.ndarray
+    values: np.ndarray = np.empty(0)
+    sizes: np.ndarray = np.empty(0, np.int64)
 
 
 def parse_ply(data: bytes) -> Polygons:
@@ -56,59 +64,37 @@ def parse_ply(data: bytes) -> Polygons:
     newline = first[1]
     last = re.search(newline + rb"end_header[ \t]*" + newline, data)
     if last is None:
-        raise InputError(
-            "the header has no end_header line, so the file is truncated or damaged: export the mesh again."
-        )
+        raise export_again("the header has no end_header line, so the file is truncated or damaged")
     header = data[first.end() : last.start()].decode("latin-1").split(newline.decode())
     encoding, elements = _ply_header(header)
     body = data[last.end() :]
     if encoding == "ascii":
-        # Text is converted to a binary body of float64 numbers, so one parser serves both encodings.
-        words = body.split()
-        try:
-            if re.search(rb"[^\s\w.+-]|_", body):  # NumPy would read 1_0 as 10
-                raise ValueError
-            body = np.array(words, dtype=np.float64).tobytes()
-        except ValueError:
-            texts = (word.decode("latin-1") for word in words)
-            culprit = excerpt(next(text for text in texts if not is_number(text, finite=False)))
-            raise InputError(
-                f"{culprit} is written where a number should be: export the mesh again."
-            ) from None
-
+        body = _binary(body)
     tables, offset = {}, 0
     for name, (count, properties) in elements.items():
         try:
             tables[name], offset = _ply_table(body, offset, count, properties)
         except EOFError:
-            raise InputError(
+            raise export_again(
                 f"the header declares {count} rows of {excerpt(name)}, but the file ends within these rows, "
-                "so the file is truncated or its header is wrong: export the mesh again."
+                "so the file is truncated or its header is wrong"
             ) from None
     if body[offset:].strip(b"\0 \t\r\n"):
-        raise InputError(
-            "continues after the last declared row, so the header is wrong: export the mesh again."
-        )
+        raise export_again("continues after the last declared row, so the header is wrong")
 
     vertex, face, strips = (tables.get(name, {}) for name in ("vertex", "face", "tristrips"))
     position = [vertex[axis].values for axis in "xyz" if axis in vertex and (vertex[axis].sizes == 1).all()]
     if len(position) < 3:
-        raise InputError("has no properties x, y and z for its vertices: export the mesh again.")
-    corners, strip = (table.get("vertex_indices", table.get("vertex_index")) for table in (face, strips))
-    if corners is None:
-        if elements.get("face", (0, {}))[0]:
-            raise InputError("has no faces with vertex_indices: export the mesh again as a triangle mesh.")
-        corners = _Column(np.empty(0), np.empty(0, np.int64))  # a point cloud, or strips only
-    vertices = np.stack(position, axis=1, dtype=np.float64)
-    of_corners = face.get(TEXTURE_OF_CORNERS)
-    vertex_data, face_data = (
-        _numbers_of(tables.get(name, {}), elements.get(name, (0, {}))[1]) for name in ("vertex", "face")
-    )
-    for name in ("vertex_indices", "vertex_index", TEXTURE_OF_CORNERS):
-        face_data.pop(name, None)
-    texture, notes = texture_or_note(lambda: _texture(of_corners, corners, vertex_data))
+        raise export_again("has no properties x, y and z for its vertices")
+    corners, strip = (next((table[c] for c in _CORNERS if c in table), None) for table in (face, strips))
+    if corners is None and elements.get("face", (0, {}))[0]:
+        raise InputError("has no faces with vertex_indices: export the mesh again as a triangle mesh.")
+    corners = corners or _Column()  # a point cloud, or strips only
+    vertex_data = _numbers_of(vertex, elements["vertex"][1], {*"xyz"})
+    face_data = _numbers_of(face, elements.get("face", (0, {}))[1], {*_CORNERS, TEXTURE_OF_CORNERS})
+    texture, notes = texture_or_note(lambda: _texture(face.get(TEXTURE_OF_CORNERS), corners, vertex_data))
     polygons = Polygons(
-        vertices,
+        np.stack(position, axis=1, dtype=np.float64),
         *corners,
         notes=notes,
         vertex_data=_grouped(vertex_data),
@@ -117,6 +103,19 @@ def parse_ply(data: bytes) -> Polygons:
         lines=elements.get("edge", (0, {}))[0],
     )
     return polygons if strip is None else _with_strips(polygons, strip)
+
+
+def _binary(body: bytes) -> bytes:
+    """Convert text to a binary body of float64 numbers, so that one parser serves both encodings."""
+    words = body.split()
+    try:
+        if re.search(rb"[^\s\w.+-]|_", body):  # NumPy would read 1_0 as 10
+            raise ValueError
+        return np.array(words, dtype=np.float64).tobytes()
+    except ValueError:
+        texts = (word.decode("latin-1") for word in words)
+        culprit = excerpt(next(text for text in texts if not is_number(text, finite=False)))
+        raise export_again(f"{culprit} is written where a number should be") from None
 
 
 def _with_strips(polygons: Polygons, strips: _Column) -> Polygons:
@@ -138,50 +137,41 @@ def _with_strips(polygons: Polygons, strips: _Column) -> Polygons:
     )
 
 
-# Properties that become the columns of one array.
-_COLUMNS_OF = {COLORS: ("red", "green", "blue", "alpha"), NORMALS: ("nx", "ny", "nz")}
-_TEXTURES = ("s", "t"), ("u", "v"), ("texture_u", "texture_v")
-
-
-def _numbers_of(table: Mapping[str, _Column], properties: Mapping[str, _Property]) -> dict[str, np.ndarray]:
-    """Return the properties with equally many numbers in all rows, in the declared types, except x, y, z."""
-    found = {}
-    for name, column in table.items():
-        width = int(column.sizes[0]) if len(column.sizes) else 0
-        if width and (column.sizes == width).all() and name not in ("x", "y", "z"):
-            with np.errstate(all="ignore"):
-                values = column.values.astype(properties[name].declared)
+def _numbers_of(
+    table: Mapping[str, _Column], properties: Mapping[str, _Property], others: set[str]
+) -> dict[str, np.ndarray]:
+    """Return the properties with equally many numbers in all rows, in the declared types, except `others`."""
+    data = {}
+    for name, (values, sizes) in table.items():
+        width = int(sizes[0]) if len(sizes) else 0
+        if width and (sizes == width).all() and name not in others:
+            declared = values.astype(properties[name].declared)
             # Text can contain numbers that the declared type cannot hold.
-            if not np.array_equal(values, column.values, equal_nan=True) and values.dtype.kind != "f":
-                values = column.values
-            found[name] = values if width == 1 else values.reshape(-1, width)
-    return found
+            if declared.dtype.kind == "f" or np.array_equal(declared, values, equal_nan=True):
+                values = declared
+            data[name] = values if width == 1 else values.reshape(-1, width)
+    return data
 
 
 def _grouped(data: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Join the components of colours and normals, and numbered properties such as a_0 and a_1, to arrays."""
-    columns: dict[str, list[str]] = {}
-    for group, components in _COLUMNS_OF.items():
-        if all(name in data for name in components[:3]):
-            columns[group] = [name for name in components if name in data]
+    groups = {group: names for group, names in _COLUMNS_OF.items() if {*names[:3]} <= data.keys()}
     for name in data:
         stem = name.removesuffix("_0")
-        if stem != name and stem and f"{stem}_1" in data and stem not in data:
-            numbered = (f"{stem}_{i}" for i in range(len(data)))
-            columns[stem] = [one for one in numbered if one in data]
-    grouped = {}
-    for group, names in columns.items():
-        if group not in data and len({data[name].dtype for name in names}) == 1:
-            grouped[group] = names
-    first = {names[0]: group for group, names in grouped.items()}
-    others = {name for names in grouped.values() for name in names[1:]}
-    return {
-        first.get(name, name): np.stack([data[one] for one in grouped[first[name]]], axis=1)
-        if name in first
-        else values
-        for name, values in data.items()
-        if name not in others
-    }
+        if stem not in ("", name) and f"{stem}_1" in data:
+            groups[stem] = tuple(f"{stem}_{i}" for i in range(len(data)))
+    for group, names in groups.items():
+        columns = {name: data[name] for name in names if name in data}
+        if group in data or len({values.dtype for values in columns.values()}) > 1:
+            continue
+        joined = np.stack(list(columns.values()), axis=1)
+        first, *rest = columns
+        data = {
+            group if name == first else name: joined if name == first else values
+            for name, values in data.items()
+            if name not in rest
+        }
+    return data
 
 
 def _texture(
@@ -190,38 +180,36 @@ def _texture(
     """Return the texture from `texcoord` of the faces or vertices, or from properties such as `s` and `t`."""
     corners = faces.values
     if of_corners is not None and of_corners.sizes.any():
-        given = of_corners.sizes > 0
-        width = int(of_corners.sizes[given][0] // max(faces.sizes[given][0], 1))
-        if width not in (2, 3) or (of_corners.sizes[given] != width * faces.sizes[given]).any():
-            raise InputError(
-                "a face does not have two texture coordinates for each corner: export the mesh again."
-            )
+        has_texture = of_corners.sizes > 0
+        sizes, of_faces = of_corners.sizes[has_texture], faces.sizes[has_texture]
+        width = int(sizes[0] // max(of_faces[0], 1))
+        if width not in (2, 3) or (sizes != width * of_faces).any():
+            raise export_again("a face does not have two texture coordinates for each corner")
         at_corners = np.full((len(corners), 2), np.nan)
-        at_corners[np.repeat(given, faces.sizes)] = of_corners.values.reshape(-1, width)[:, :2]
+        at_corners[np.repeat(has_texture, faces.sizes)] = of_corners.values.reshape(-1, width)[:, :2]
         return texture_of_corners(corners, at_corners)
     whole = (corners >= 0) & (corners == np.floor(corners))
     for names in ((TEXTURE_OF_CORNERS,), *_TEXTURES):
         columns = [vertex_data[name] for name in names if name in vertex_data]
-        found = np.column_stack(columns) if columns else np.empty((0, 0))
-        if len(columns) == len(names) and found.shape[1] == 2 and (whole & (corners < len(found))).all():
+        coordinates = np.column_stack(columns) if len(columns) == len(names) else np.empty((0, 0))
+        if coordinates.shape[1] == 2 and (whole & (corners < len(coordinates))).all():
             for name in names:
                 del vertex_data[name]
-            return found, corners.astype(np.int64)
+            return coordinates, corners.astype(np.int64)
     return None
 
 
 def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _Property]]]]:
     """Return the encoding, and a dictionary from element names to row counts and properties."""
     formats = [line.split()[1:] for line in lines if re.match(r"format(\s|$)", line)]
-    if len(formats) != 1 or formats[0] not in [[encoding, "1.0"] for encoding in _PLY_BYTE_ORDERS]:
-        raise InputError(
-            f"the header does not name exactly one of the formats {', '.join(_PLY_BYTE_ORDERS)} in version "
-            "1.0: export the mesh again."
+    if len(formats) != 1 or formats[0] not in [[encoding, "1.0"] for encoding in _BYTE_ORDERS]:
+        raise export_again(
+            f"the header does not name exactly one of the formats {', '.join(_BYTE_ORDERS)} in version 1.0"
         )
     encoding = formats[0][0]
 
     def number(name: str) -> np.dtype:
-        return np.dtype(np.float64 if encoding == "ascii" else _PLY_BYTE_ORDERS[encoding] + _PLY_TYPES[name])
+        return np.dtype(np.float64 if encoding == "ascii" else _BYTE_ORDERS[encoding] + _TYPES[name])
 
     elements: dict[str, tuple[int, dict[str, _Property]]] = {}
     properties: dict[str, _Property] | None = None
@@ -233,20 +221,18 @@ def _ply_header(lines: list[str]) -> tuple[str, dict[str, tuple[int, dict[str, _
                 properties = {}
                 elements[name] = int(count), properties
             case ["property", "list", length, kind, name] if (
-                _PLY_TYPES.get(length, "f")[0] in "iu"
-                and kind in _PLY_TYPES
+                _TYPES.get(length, "f")[0] in "iu"
+                and kind in _TYPES
                 and properties is not None
                 and name not in properties
             ):
-                properties[name] = _Property(number(kind), number(length), np.dtype(_PLY_TYPES[kind]))
+                properties[name] = _Property(number(kind), number(length), np.dtype(_TYPES[kind]))
             case ["property", kind, name] if (
-                kind in _PLY_TYPES and properties is not None and name not in properties
+                kind in _TYPES and properties is not None and name not in properties
             ):
-                properties[name] = _Property(number(kind), None, np.dtype(_PLY_TYPES[kind]))
+                properties[name] = _Property(number(kind), None, np.dtype(_TYPES[kind]))
             case _:
-                raise InputError(
-                    f"the header contains the invalid line {excerpt(line)}: export the mesh again."
-                )
+                raise export_again(f"the header contains the invalid line {excerpt(line)}")
     return encoding, elements
 
 
@@ -258,7 +244,7 @@ def _ply_table(
     if count * shortest > len(body) - offset:
         raise EOFError
     if not count or not properties:
-        return {name: _Column(np.empty(0), np.empty(0, np.int64)) for name in properties}, offset
+        return {name: _Column() for name in properties}, offset
 
     # In most files, all lists of a property have the same length. NumPy then reads all rows together, as one
     # array of records.
@@ -300,9 +286,7 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
                 raise EOFError
             written = np.frombuffer(body, length, 1, start)[0]
             if not 0 <= written <= len(body) or written % 1:
-                raise InputError(
-                    f"a list declares {written:.15g} numbers, so the file is damaged: export the mesh again."
-                )
+                raise damaged(f"a list declares {written:.15g} numbers")
             size = int(written)
         spans.append((offset, size))
         offset += size * kind.itemsize
@@ -311,27 +295,18 @@ def _ply_row(body: bytes, offset: int, properties: dict[str, _Property]) -> tupl
     return spans, offset
 
 
-_TYPE_NAMES = {
-    **{"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"},
-    **{"f4": "float", "f8": "double"},
-}
-
-
 def format_ply(data: MeshData) -> Formatted:
     """Format a little-endian binary file. The columns of an array a become the properties a_0, a_1, …."""
-    vertex_columns = dict(zip("xyz", data.mesh.vertices.T, strict=True))
-    extra, lost_of_vertices = _columns(
-        data.vertex_data, {*vertex_columns, *(n for pair in _TEXTURES for n in pair)}
-    )
-    if is_texture_of_vertices(data) and data.texture is not None:
-        extra = dict(zip(("s", "t"), data.texture[0].T, strict=True)) | extra
-    face_extra, lost_of_faces = _columns(
-        data.face_data, {"vertex_indices", "vertex_index", TEXTURE_OF_CORNERS}
-    )
-    vertices, vertex_lines = _table(vertex_columns | extra, len(data.mesh.vertices))
+    columns = dict(zip("xyz", data.mesh.vertices.T, strict=True))
     lists: dict[str, np.ndarray] = {"vertex_indices": data.faces.astype("<i4")}
-    if data.texture is not None and not is_texture_of_vertices(data):
+    if data.texture is not None and is_texture_of_vertices(data):
+        columns |= dict(zip(("s", "t"), data.texture[0].T, strict=True))
+    elif data.texture is not None:
         lists[TEXTURE_OF_CORNERS] = texture_at_corners(data.texture)
+    reserved = {*"xyz", *(name for pair in _TEXTURES for name in pair)}
+    extra, lost_of_vertices = _columns(data.vertex_data, reserved)
+    face_extra, lost_of_faces = _columns(data.face_data, {*_CORNERS, TEXTURE_OF_CORNERS})
+    vertices, vertex_lines = _table(columns | extra, len(data.mesh.vertices), {})
     faces, face_lines = _table(face_extra, len(data.faces), lists)
     header = [
         *("ply", "format binary_little_endian 1.0"),
@@ -353,11 +328,11 @@ def _columns(data: Mapping[str, np.ndarray], reserved: set[str]) -> tuple[dict[s
     columns: dict[str, np.ndarray] = {}
     lost = set()
     for name, values in data.items():
-        known: tuple[str, ...] = _COLUMNS_OF.get(name, ())
-        count = 1 if values.ndim == 1 else values.shape[1]
+        components: tuple[str, ...] = _COLUMNS_OF.get(name, ())
+        count = width_of(values)
         names = [name] if values.ndim == 1 else [f"{name}_{i}" for i in range(count)]
-        if values.ndim == 2 and 3 <= count <= len(known) and (name != COLORS or is_color(name, values)):
-            names = list(known[:count])
+        if values.ndim == 2 and 3 <= count <= len(components) and (name != COLORS or is_color(name, values)):
+            names = list(components[:count])
         stored = _storable(values)
         if stored is None or not re.fullmatch(r"[!-~]+", name) or {*names} & (reserved | {*columns}):
             lost.add(name)
@@ -370,21 +345,19 @@ def _storable(values: np.ndarray) -> np.ndarray | None:
     """Return values in a type of PLY that represents them, or None."""
     if values.dtype.str[1:] in _TYPE_NAMES:
         return values
-    for kind in (np.int32, np.float64):
-        limits = np.iinfo(np.int32) if kind is np.int32 else None
-        low, high = (limits.min, limits.max) if limits else (-(2**53), 2**53)
+    for kind, low, high in ((np.int32, -(2**31), 2**31 - 1), (np.float64, -(2**53), 2**53)):
         if values.min() >= low and values.max() <= high:
             return values.astype(kind)
     return None
 
 
 def _table(
-    columns: Mapping[str, np.ndarray], count: int, lists: Mapping[str, np.ndarray] | None = None
+    columns: Mapping[str, np.ndarray], count: int, lists: Mapping[str, np.ndarray]
 ) -> tuple[np.ndarray, list[str]]:
     """Return the records of an element, and the lines of the header that declare its properties."""
     fields: list[tuple] = []
     lines = []
-    for name, values in (lists or {}).items():
+    for name, values in lists.items():
         kind = values.dtype.newbyteorder("<")
         fields += [(f"length of {name}", "u1"), (name, kind, values.shape[1])]
         lines.append(f"property list uchar {_TYPE_NAMES[kind.str[1:]]} {name}")
@@ -392,7 +365,7 @@ def _table(
         fields.append((name, values.dtype.newbyteorder("<")))
         lines.append(f"property {_TYPE_NAMES[values.dtype.str[1:]]} {name}")
     records = np.empty(count, fields)
-    for name, values in (lists or {}).items():
+    for name, values in lists.items():
         records[f"length of {name}"], records[name] = values.shape[1], values
     for name, values in columns.items():
         records[name] = values

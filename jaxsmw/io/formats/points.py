@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import re
 
 import numpy as np
 from jaxtyping import Float64, Shaped
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.npz import check_header
+from jaxsmw.io.formats.npz import read_array
 from jaxsmw.io.formats.polygons import Polygons
 from jaxsmw.io.formats.text import filled_lines, is_number, numbers
 from jaxsmw.io.mesh_data import NORMALS
@@ -56,13 +55,7 @@ def _words(line: str) -> list[str]:
 
 def parse_npy(data: bytes) -> Polygons:
     """Parse an array with one row per point, whose columns are x, y, z, and perhaps the normal."""
-    try:
-        check_header(io.BytesIO(data), len(data))
-        table = np.lib.format.read_array(io.BytesIO(data))
-    except Exception:  # NumPy can raise any exception for damaged files
-        raise InputError(
-            "is damaged, or not a .npy file of numbers without pickled objects: write the file again."
-        ) from None
+    table = read_array(data)
     if table.ndim != 2 or table.shape[1] < 3 or table.dtype.kind not in "iuf":
         raise InputError(
             f"contains an array of {table.dtype.name} of shape {table.shape}: save numbers of shape (number "

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.text import DAMAGED
+from jaxsmw.io.formats.text import damaged
 from jaxsmw.io.mesh_data import COLORS, MeshData, Skin
 from jaxsmw.wording import count_of
 
@@ -63,7 +63,7 @@ def triangles_of(
             f"face {at} has {count_of(int(sizes[at]), 'corner')}, but needs at least three: remove the face."
         )
     if (sizes[is_strip] < 3).any():
-        raise InputError(f"a triangle strip has fewer than three corners, {DAMAGED}")
+        raise damaged("a triangle strip has fewer than three corners")
     per_face = sizes - 2
     face = np.repeat(np.arange(len(sizes)), per_face)
     start = (np.cumsum(sizes) - sizes)[face]

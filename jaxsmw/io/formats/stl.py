@@ -6,11 +6,10 @@ import re
 
 import numpy as np
 
-from jaxsmw.errors import InputError
 from jaxsmw.geometry.arrays import first_equal_rows
 from jaxsmw.geometry.mesh import coincident_vertices
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions
-from jaxsmw.io.formats.text import numbers, text
+from jaxsmw.io.formats.text import export_again, numbers, text
 from jaxsmw.io.mesh_data import MeshData
 from jaxsmw.wording import count_of
 
@@ -40,19 +39,19 @@ def parse_stl(data: bytes) -> Polygons:
         )
         facets = len(re.findall(r"\bendfacet\b", content))
         if len(corners) != 3 * facets:
-            raise InputError(
+            raise export_again(
                 f"has {count_of(facets, 'complete facet')} and {count_of(len(corners), 'corner')}, but must "
-                "have three corners per facet, so the file is truncated or damaged: export the mesh again."
+                "have three corners per facet, so the file is truncated or damaged"
             )
         if "endsolid" not in content:
             notes.append("The file does not end with endsolid, so triangles may be missing.")
     elif len(data) >= header:
-        raise InputError(
+        raise export_again(
             f"the header declares {count} triangles, which does not fit the file's {len(data)} bytes, so the "
-            "file is truncated or not in the STL format: export the mesh again."
+            "file is truncated or not in the STL format"
         )
     else:
-        raise InputError("is neither a text nor a binary STL file: export the mesh again.")
+        raise export_again("is neither a text nor a binary STL file")
     equal = first_equal_rows(corners)
     same = equal
     if np.isfinite(corners).all():

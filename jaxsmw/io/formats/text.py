@@ -11,9 +11,18 @@ from jaxtyping import Float64, Int64
 from jaxsmw.errors import InputError
 from jaxsmw.wording import count_of
 
-DAMAGED = "so the file is damaged: export the mesh again."
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 _NOT_FINITE = re.compile(r"[+-]?(nan|inf|infinity)", re.ASCII | re.IGNORECASE)
+
+
+def export_again(fault: str, what: str = "mesh") -> InputError:
+    """Return the error for a file that its program should write again."""
+    return InputError(f"{fault}: export the {what} again.")
+
+
+def damaged(fault: str) -> InputError:
+    """Return the error for a mesh file that contradicts itself or its format."""
+    return export_again(f"{fault}, so the file is damaged")
 
 
 def is_number(word: str, *, finite: bool = True) -> bool:
@@ -47,9 +56,9 @@ def numbers(lines: list[str], columns: int) -> Float64[np.ndarray, "lines column
         return np.loadtxt(lines, usecols=range(columns), comments=None, ndmin=2)
     except ValueError:
         culprit = next((line for line in lines if not _starts_with_numbers(line, columns)), lines[0])
-        raise InputError(
+        raise export_again(
             f"{excerpt(culprit)} is written where {count_of(columns, 'number')} should be, so the file is "
-            "damaged or its header is wrong: export the mesh again."
+            "damaged or its header is wrong"
         ) from None
 
 
@@ -74,8 +83,8 @@ def numbers_of(words: list[str], kind: str) -> np.ndarray:
         return values.astype(kind)
     except (ValueError, OverflowError):
         culprit = next((word for word in words if not is_number(word, finite=False)), words[0])
-        raise InputError(
-            f"{excerpt(culprit)} is written among numbers of the type {np.dtype(kind).name}, {DAMAGED}"
+        raise damaged(
+            f"{excerpt(culprit)} is written among numbers of the type {np.dtype(kind).name}"
         ) from None
 
 
@@ -90,9 +99,9 @@ def polygon_lines(lines: list[str]) -> tuple[Float64[np.ndarray, " corners"], In
     longest = max(map(len, lines), default=0)
     possible = (sizes >= 0) & (sizes <= longest) & (np.floor(sizes) == sizes)
     if not possible.all():
-        raise InputError(
+        raise export_again(
             f"{excerpt(lines[int(possible.argmin())])} does not begin with the number of corners of a face, "
-            "so the file is damaged or its header is wrong: export the mesh again."
+            "so the file is damaged or its header is wrong"
         )
     sizes = sizes.astype(np.int64)
     starts = np.cumsum(sizes) - sizes

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from typing import NoReturn
 from urllib.parse import quote, unquote
 
 import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, width_of
-from jaxsmw.io.formats.text import DAMAGED, excerpt, numbers_of
+from jaxsmw.io.formats.text import damaged, excerpt, export_again, numbers_of
 from jaxsmw.io.formats.vtk_cells import (
     LINE,
     POLYGON,
@@ -54,14 +55,14 @@ class _Reader:
         self.position = 0
         version = re.match(r"# vtk DataFile Version (\d)\.\d+\s*$", self.raw_line() or "", re.IGNORECASE)
         if version is None:
-            raise InputError("does not begin with '# vtk DataFile Version': export the mesh again.")
+            raise export_again("does not begin with '# vtk DataFile Version'")
         self.major = int(version[1])
         if not 1 <= self.major <= 5:
             raise InputError(f"has the unknown version {version[1]}: save the mesh in version 5.1 or older.")
         self.raw_line()  # the title
         encoding = (self.raw_line() or "").strip().upper()
         if encoding not in ("ASCII", "BINARY"):
-            raise InputError(f"{excerpt(encoding)} is written where ASCII or BINARY should be, {DAMAGED}")
+            raise damaged(f"{excerpt(encoding)} is written where ASCII or BINARY should be")
         self.binary = encoding == "BINARY"
         self.points: np.ndarray | None = None
         self.cells: dict[str, Cells] = {}
@@ -78,13 +79,12 @@ class _Reader:
         cells = joined([self.cells[keyword] for keyword in (*_KINDS, "CELLS") if keyword in self.cells])
         if self.kinds is not None:
             if len(self.kinds) != len(cells.sizes):
-                raise InputError(
-                    f"has {count_of(len(cells.sizes), 'cell')}, but {len(self.kinds)} types of cells, "
-                    f"{DAMAGED}"
+                raise damaged(
+                    f"has {count_of(len(cells.sizes), 'cell')}, but {len(self.kinds)} types of cells"
                 )
             cells = cells._replace(kinds=self.kinds)
         elif "CELLS" in self.cells:
-            raise InputError(f"contains CELLS without CELL_TYPES, {DAMAGED}")
+            raise damaged("contains CELLS without CELL_TYPES")
         return polygons_of(
             self.points, cells, self.arrays["POINT_DATA"], self.arrays["CELL_DATA"], self.coordinates
         )
@@ -119,31 +119,29 @@ class _Reader:
 
     def attribute(self, words: list[str]) -> None:
         """Read an attribute of the points or of the cells."""
-        data = self.arrays[self.section]
         match words:
             case ["SCALARS", name, kind, *columns] if len(columns) < 2:
                 table = (self.line() or "").split()
                 if table[:1] != ["LOOKUP_TABLE"]:
                     self.refuse(table)
                 values = self.take(self.rows, _count(*columns) if columns else 1, kind)
-                add_array(data, unquote(name), values)
             case ["COLOR_SCALARS", name, columns]:
                 values = self.take(self.rows, _count(columns), "unsigned_char" if self.binary else "float")
                 if not self.binary:  # text files contain floats from 0 to 1
                     values = np.rint(255 * np.clip(np.nan_to_num(values), 0, 1)).astype(np.uint8)
-                add_array(data, unquote(name), values)
             case ["LOOKUP_TABLE", _, size]:
                 self.take(_count(size), 4, "unsigned_char" if self.binary else "float")
+                return
             case ["TEXTURE_COORDINATES", name, columns, kind]:
                 values = self.take(self.rows, _count(columns), kind)
                 if self.section == "POINT_DATA" and values.shape[1] >= 2:
                     self.coordinates = values
-                else:
-                    add_array(data, unquote(name), values)
+                    return
             case [keyword, name, kind] if keyword in _COLUMNS:
-                add_array(data, unquote(name), self.take(self.rows, _COLUMNS[keyword], kind))
+                values = self.take(self.rows, _COLUMNS[keyword], kind)
             case _:
                 self.refuse(words)
+        add_array(self.arrays[self.section], unquote(name), values)
 
     def field_array(self) -> None:
         """Read an array of a FIELD. Arrays of strings are skipped."""
@@ -157,10 +155,10 @@ class _Reader:
             case words:
                 self.refuse(words)
 
-    def refuse(self, words: list[str]) -> None:
+    def refuse(self, words: list[str]) -> NoReturn:
         if not words:
-            raise InputError("ends early, so the file is truncated: export the mesh again.")
-        raise InputError(f"contains the invalid line {excerpt(' '.join(words))}, {DAMAGED}")
+            raise export_again("ends early, so the file is truncated")
+        raise damaged(f"contains the invalid line {excerpt(' '.join(words))}")
 
     def raw_line(self) -> str | None:
         """Return the next line, or None at the end of the file."""
@@ -203,18 +201,17 @@ class _Reader:
             self.truncated(count)
         words: list[str] = []
         while len(words) < count:
-            line = self.raw_line()
-            if line is None:
+            if (line := self.raw_line()) is None:
                 self.truncated(count)
-            words += (line or "").split()
+            words += line.split()
         if len(words) > count:
-            raise InputError(f"continues after {count_of(count, 'number')}, {DAMAGED}")
+            raise damaged(f"continues after {count_of(count, 'number')}")
         return numbers_of(words, "u1" if kind == "bit" else kind)
 
-    def truncated(self, count: int) -> None:
-        raise InputError(
+    def truncated(self, count: int) -> NoReturn:
+        raise export_again(
             f"declares {count_of(count, 'number')}, but the file ends within them, so the file is truncated "
-            "or damaged: export the mesh again."
+            "or damaged"
         )
 
     def skip_strings(self, count: int) -> None:
@@ -254,9 +251,8 @@ class _Reader:
             starts.append(position)
             position += int(stream[position]) + 1
         if position != size or len(starts) != count:
-            raise InputError(
-                f"declares {count_of(count, 'cell')} in {count_of(size, 'number')}, which contain other "
-                f"cells, {DAMAGED}"
+            raise damaged(
+                f"declares {count_of(count, 'cell')} in {count_of(size, 'number')}, which contain other cells"
             )
         is_corner = np.ones(size, dtype=bool)
         is_corner[starts] = False
@@ -265,7 +261,7 @@ class _Reader:
 
 def _count(word: str) -> int:
     if not re.fullmatch(r"\d{1,18}", word, re.ASCII):
-        raise InputError(f"{excerpt(word)} is written where a count should be, {DAMAGED}")
+        raise damaged(f"{excerpt(word)} is written where a count should be")
     return int(word)
 
 

@@ -16,7 +16,7 @@ from jaxsmw.io.formats.polygons import (
     is_texture_of_vertices,
     unique_name,
 )
-from jaxsmw.io.formats.text import DAMAGED, excerpt
+from jaxsmw.io.formats.text import damaged, excerpt, export_again
 from jaxsmw.io.mesh_data import MeshData, texture_at_corners, texture_of_corners
 from jaxsmw.wording import count_of
 
@@ -41,9 +41,9 @@ def cells_of(kind: int, offsets: np.ndarray, corners: np.ndarray) -> Cells:
     offsets = offsets.astype(np.int64)
     sizes = np.diff(offsets)
     if len(offsets) and (offsets[0] != 0 or offsets[-1] != len(corners) or (sizes < 0).any()):
-        raise InputError(f"the offsets of the cells do not fit {count_of(len(corners), 'corner')}, {DAMAGED}")
+        raise damaged(f"the offsets of the cells do not fit {count_of(len(corners), 'corner')}")
     if not len(offsets) and len(corners):
-        raise InputError(f"the cells have {count_of(len(corners), 'corner')}, but no offsets, {DAMAGED}")
+        raise damaged(f"the cells have {count_of(len(corners), 'corner')}, but no offsets")
     return Cells(np.full(len(sizes), kind), sizes, corners)
 
 
@@ -61,7 +61,7 @@ def check_array(types: Mapping[str, str], name: str, columns: int) -> str:
             f"contains numbers of the unknown type {excerpt(name)}: save the mesh with floats and integers."
         )
     if not 1 <= columns <= _MOST_COLUMNS:
-        raise InputError(f"declares an array with {count_of(columns, 'column')}, {DAMAGED}")
+        raise damaged(f"declares an array with {count_of(columns, 'column')}")
     return types[name]
 
 
@@ -79,14 +79,14 @@ def polygons_of(
     for data, count, what in ((point_data, len(points), "point"), (cell_data, len(cells.sizes), "cell")):
         for name, values in data.items():
             if len(values) != count:
-                raise InputError(
+                raise export_again(
                     f"the array {name[:40]!a} has {count_of(len(values), 'row')}, but the file has "
-                    f"{count_of(count, what)}: export the mesh again."
+                    f"{count_of(count, what)}"
                 )
-    known = np.isin(cells.kinds, _POINTS + _LINES + _SURFACE)
-    if not known.all():
+    is_supported = np.isin(cells.kinds, _POINTS + _LINES + _SURFACE)
+    if not is_supported.all():
         raise InputError(
-            f"contains cells of type {cells.kinds[int(known.argmin())]}, which are not triangles or "
+            f"contains cells of type {cells.kinds[int(is_supported.argmin())]}, which are not triangles or "
             "polygons: extract the surface first."
         )
     used = np.isin(cells.kinds, _SURFACE)

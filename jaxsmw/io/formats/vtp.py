@@ -8,6 +8,7 @@ import lzma
 import re
 import zlib
 from collections.abc import Sequence
+from itertools import pairwise
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, unique_name, width_of
-from jaxsmw.io.formats.text import DAMAGED, excerpt, numbers_of
+from jaxsmw.io.formats.text import damaged, excerpt, export_again, numbers_of
 from jaxsmw.io.formats.vtk_cells import (
     LINE,
     POLYGON,
@@ -48,17 +49,19 @@ def parse_vtp(data: bytes) -> Polygons:
     file = _Reader(data)
     pieces = file.root.findall("PolyData/Piece")
     if not pieces:
-        raise InputError("contains no piece of PolyData: export the mesh again.")
+        raise export_again("contains no piece of PolyData")
     points, cells, point_data, cell_data, textures = zip(*map(file.piece, pieces), strict=True)
     first = np.cumsum([0, *map(len, points[:-1])])
-    shifted = [one._replace(corners=one.corners + at) for one, at in zip(cells, first, strict=True)]
-    known = [texture for texture in textures if texture is not None]
+    shifted = [
+        of_piece._replace(corners=of_piece.corners + at) for of_piece, at in zip(cells, first, strict=True)
+    ]
+    coordinates = [texture for texture in textures if texture is not None]
     return polygons_of(
         np.concatenate(points),
         joined(shifted),
         _common(point_data),
         _common(cell_data),
-        np.concatenate(known) if len(known) == len(pieces) else None,
+        np.concatenate(coordinates) if len(coordinates) == len(pieces) else None,
     )
 
 
@@ -85,7 +88,7 @@ class _Reader:
                 raise ValueError  # refuses declarations of entities, which can expand without limit
             self.root = ElementTree.fromstring(xml)
         except (ElementTree.ParseError, LookupError, ValueError):
-            raise InputError("is not a complete XML file: export the mesh again.") from None
+            raise export_again("is not a complete XML file") from None
         if self.root.tag != "VTKFile" or self.root.get("type") != "PolyData":
             raise InputError("is not a VTK file of the type PolyData: extract the surface and save it again.")
         version = self.root.get("version", "0.1")
@@ -96,7 +99,7 @@ class _Reader:
         order, header = self.root.get("byte_order", "LittleEndian"), self.root.get("header_type", "UInt32")
         self.compressor = self.root.get("compressor", "")
         if order not in orders or header not in headers:
-            raise InputError(f"has the unknown byte order {order!a} or header type {header!a}, {DAMAGED}")
+            raise damaged(f"has the unknown byte order {order!a} or header type {header!a}")
         if self.compressor and self.compressor not in _COMPRESSORS:
             raise InputError(
                 f"is compressed with {excerpt(self.compressor)}, which is not supported: save it with "
@@ -111,7 +114,7 @@ class _Reader:
         n = _integer(piece, "NumberOfPoints", 0)
         position = piece.find("Points/DataArray")
         if position is None:
-            raise InputError(f"a piece has no points, {DAMAGED}")
+            raise damaged("a piece has no points")
         points = self.array(position, n, 3).astype(np.float64)
         cells = joined([self.cells(piece, kind) for kind in _KINDS])
         point_data, texture = self.data(piece, "PointData", n)
@@ -122,29 +125,31 @@ class _Reader:
         self, piece: ElementTree.Element, tag: str, count: int
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Return the arrays on the points or cells of a piece, and the texture coordinates of the points."""
-        found: dict[str, np.ndarray] = {}
+        arrays: dict[str, np.ndarray] = {}
         section, coordinates = piece.find(tag), None
-        for element in () if section is None else section.findall("DataArray"):
+        if section is None:
+            return arrays, coordinates
+        texture = section.get("TCoords") if tag == "PointData" else None
+        for element in section.findall("DataArray"):
             values = self.array(element, count, _integer(element, "NumberOfComponents", 1))
             name = element.get("Name", "")
-            is_texture = tag == "PointData" and section is not None and name == section.get("TCoords", "\0")
-            if is_texture and values.shape[1] >= 2 and coordinates is None:
+            if name == texture and values.shape[1] >= 2 and coordinates is None:
                 coordinates = values
             else:
-                add_array(found, name, values)
-        return found, coordinates
+                add_array(arrays, name, values)
+        return arrays, coordinates
 
     def cells(self, piece: ElementTree.Element, tag: str) -> Cells:
         """Return the cells of one kind that a piece contains."""
         count = _integer(piece, f"NumberOf{tag}", 0)
-        arrays = {one.get("Name"): one for one in piece.findall(f"{tag}/DataArray")}
+        arrays = {element.get("Name"): element for element in piece.findall(f"{tag}/DataArray")}
         if not count:
             return cells_of(_KINDS[tag], np.zeros(1), np.empty(0, np.int64))
         if not {"offsets", "connectivity"} <= set(arrays):
-            raise InputError(f"the {tag} have no offsets or no connectivity, {DAMAGED}")
+            raise damaged(f"the {tag} have no offsets or no connectivity")
         ends = self.array(arrays["offsets"], count, 1)[:, 0]
         if not 0 <= ends[-1] < 2**53:
-            raise InputError(f"the offsets of the {tag} are not valid, {DAMAGED}")
+            raise damaged(f"the offsets of the {tag} are not valid")
         corners = self.array(arrays["connectivity"], int(ends[-1]), 1)[:, 0]
         return cells_of(_KINDS[tag], np.concatenate([[0], ends.astype(np.int64)]), corners.astype(np.int64))
 
@@ -160,11 +165,11 @@ class _Reader:
             content = self.appended[_integer(element, "offset", 0) :]
             values = self.decode(content, self.is_raw, count, kind)
         else:
-            raise InputError(f"has an array in the unknown format {excerpt(form)}, {DAMAGED}")
+            raise damaged(f"has an array in the unknown format {excerpt(form)}")
         if len(values) != count:
-            raise InputError(
+            raise damaged(
                 f"the array {element.get('Name', '')[:40]!a} has {count_of(len(values), 'number')} instead "
-                f"of {count}, {DAMAGED}"
+                f"of {count}"
             )
         return values.reshape(rows, columns)
 
@@ -172,28 +177,28 @@ class _Reader:
         """Decode numbers from raw bytes or base64, which begin with their size and can be compressed."""
         expected = count * np.dtype(kind).itemsize
         if expected > self.budget:
-            raise InputError(f"declares {count_of(count, 'number')}, more than the file contains, {DAMAGED}")
+            raise damaged(f"declares {count_of(count, 'number')}, more than the file contains")
         self.budget -= expected
-        stream = _Stream(content, is_raw)
         size = self.header.itemsize
         if not self.compressor:
-            written = stream.take(size + expected)
+            written, _ = _taken(content, size + expected, is_raw)
             if np.frombuffer(written, self.header, 1)[0] != expected:
-                raise InputError(f"an array does not have {count_of(count, 'number')}, {DAMAGED}")
+                raise damaged(f"an array does not have {count_of(count, 'number')}")
             unpacked = written[size:]
         else:
-            blocks, block, last = np.frombuffer(stream.peek(3 * size), self.header).tolist()
+            head, _ = _taken(content, 3 * size, is_raw)
+            blocks, block, last = np.frombuffer(head, self.header).tolist()
             total = (blocks - 1) * block + (last or block) if blocks else 0
             if total != expected:
-                raise InputError(f"an array does not have {count_of(count, 'number')}, {DAMAGED}")
-            sizes = np.frombuffer(stream.take((3 + blocks) * size), self.header)[3:].tolist()
-            packed = stream.take(sum(sizes))
-            parts, start = [], 0
-            for number, length in enumerate(sizes):
-                wanted = last or block if number == blocks - 1 else block
-                parts.append(self.unpack(packed[start : start + length], wanted))
-                start += length
-            unpacked = b"".join(parts)
+                raise damaged(f"an array does not have {count_of(count, 'number')}")
+            head, content = _taken(content, (3 + blocks) * size, is_raw)
+            sizes = np.frombuffer(head, self.header)[3:].tolist()
+            packed, _ = _taken(content, sum(sizes), is_raw)
+            ends = np.cumsum([0, *sizes]).tolist()
+            unpacked = b"".join(
+                self.unpack(packed[start:end], last or block if number == blocks - 1 else block)
+                for number, (start, end) in enumerate(pairwise(ends))
+            )
         return np.frombuffer(unpacked, self.order + kind).astype(kind)
 
     def unpack(self, packed: bytes, size: int) -> bytes:
@@ -208,7 +213,7 @@ class _Reader:
         except (zlib.error, lzma.LZMAError, EOFError):
             unpacked = b""
         if len(unpacked) != size:
-            raise InputError(f"a compressed array cannot be unpacked, {DAMAGED}")
+            raise damaged("a compressed array cannot be unpacked")
         return unpacked
 
 
@@ -227,39 +232,27 @@ def _unpack_lz4(packed: bytes, size: int) -> bytes:
         return b""
 
 
-class _Stream:
-    """A stream of raw bytes, or of bytes in several consecutive base64 texts."""
+def _taken(content: bytes, size: int, is_raw: bool) -> tuple[bytes, bytes]:
+    """Return the first `size` bytes of raw content or of base64 text, and the content behind them.
 
-    def __init__(self, content: bytes, is_raw: bool) -> None:
-        self.content, self.is_raw, self.position = content, is_raw, 0
-
-    def peek(self, size: int) -> bytes:
-        start = self.position
-        found = self.take(size)
-        self.position = start
-        return found
-
-    def take(self, size: int) -> bytes:
-        """Return the next `size` bytes. Base64 text is read to the end of a group of four characters."""
-        length = size if self.is_raw else (size + 2) // 3 * 4
-        part = self.content[self.position : self.position + length]
-        self.position += length
-        if not self.is_raw:
-            try:
-                part = base64.b64decode(part, validate=True)
-            except binascii.Error:
-                part = b""
-        if len(part) < size:
-            raise InputError(
-                "an array ends early, so the file is truncated or damaged: export the mesh again."
-            )
-        return part[:size]
+    Base64 text is read to the end of a group of four characters.
+    """
+    length = size if is_raw else (size + 2) // 3 * 4
+    part = content[:length]
+    if not is_raw:
+        try:
+            part = base64.b64decode(part, validate=True)
+        except binascii.Error:
+            part = b""
+    if len(part) < size:
+        raise export_again("an array ends early, so the file is truncated or damaged")
+    return part[:size], content[length:]
 
 
 def _integer(element: ElementTree.Element, name: str, default: int) -> int:
     word = element.get(name, str(default)).strip()
     if not re.fullmatch(r"\d{1,18}", word, re.ASCII):
-        raise InputError(f"{excerpt(word)} is written where the number {name} should be, {DAMAGED}")
+        raise damaged(f"{excerpt(word)} is written where the number {name} should be")
     return int(word)
 
 

@@ -35,21 +35,11 @@ class _Candidate(NamedTuple):
 
 
 class Alternatives:
-    """Alternative maps of a pair, computed and compared on proxies.
+    """Alternative maps of a pair, computed and compared on proxies of about a thousand samples.
 
-    Each shape is reduced to about a thousand samples. A feature regression with few eigenvectors refines many
-    initial maps of these samples. Five refinements of samples take about as long as one refinement at all
-    vertices. An initial map is the result of a nearest-neighbour search in features. There are three kinds of
-    features:
-
-    - SHOT with several radii. Each choice of radii gives one map.
-    - SHOT and the distances to extremities, such as the ends of limbs. A pairing assigns extremities of X to
-      extremities of Y. Each of the most plausible pairings gives one map.
-    - SHOT and the positions along the principal axes of inertia. Four rotations align the principal axes of X
-      with those of Y, and each rotation gives one map.
-
-    For a partial pair, only the first kind is used, because the extremities and axes of a part differ from
-    those of the full shape.
+    docs/how_it_works.md lists the initial maps. A feature regression with few eigenvectors refines them. Five
+    refinements of samples take about as long as one refinement at all vertices. For a partial pair, only SHOT
+    gives initial maps, because the extremities and axes of a part differ from those of the full shape.
 
     **Arguments:**
 
@@ -255,7 +245,7 @@ class Alternatives:
         starts = (Start(start, excluded=fault) for start, fault in zip(initial, faults, strict=False))
         candidates = []
         # All refinements are started first. The host scores a finished refinement while the others run.
-        for outcome in list(run([fitted], self._spectra, starts)):
+        for outcome in [run([fitted], self._spectra, start) for start in starts]:
             if outcome.successful:
                 found = outcome.pointwise_map
                 score = self._judge.score_map(self._extended(found), outcome.uncertainty)

@@ -15,7 +15,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, shot_descriptors
-from jaxsmw.matching.executor import SpectralPair, Start, reverse_map, run
+from jaxsmw.matching.executor import SpectralPair, Start, run
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import principal_components
 from jaxsmw.matching.search.proxies import Proxy, distance_error
@@ -165,9 +165,8 @@ class Hands:
         **Returns:** The refined map (s,) and its reverse map (t,).
         """
         spectra = SpectralPair(x.shape.sampled_spectrum(x.components), y.shape.sampled_spectrum(y.components))
-        (found,) = run([_STAGE], spectra, [Start(_nearest(x.shot, y.shot))])
-        seen = spectra.seen_by(_STAGE)
-        return found.pointwise_map, reverse_map(_STAGE.refiner, seen, found.last.state)
+        outcome = run([_STAGE], spectra, Start(_nearest(x.shot, y.shot)))
+        return outcome.pointwise_map, outcome.last.reverse_map()
 
 
 def _proxy(argument: tuple[Mesh, Spectrum]) -> Proxy:

@@ -27,52 +27,32 @@ def refine_and_repair(
     preset: Preset,
     *,
     outcome: Outcome | None = None,
-    history: bool = False,
 ) -> Scored:
     """Run the first and the repeated stages of a preset from a start, and repair a map that looks wrong.
 
-    If the initial map exchanges symmetric limbs, refinement does not correct this error, because both limbs
-    have the same shape. If the preset has repair, the outcome is checked for orientation reversal and
-    discontinuities (`jaxsmw.matching.judge`). If the outcome looks wrong, repair takes the following two
-    steps.
-
-    1. Alternatives: `jaxsmw.matching.search.alternatives` refines many initial maps on a thousand samples.
-       The repeated stages then refine the best of these maps, at most `finalists`. The outcome with the best
-       score is kept, which can also be the outcome of the original initial map. If the kept outcome looks
-       right, repair ends. Only the initial map `"shot"` has alternatives.
-    2. Rounds: each round runs the repeated stages again. Each round repairs one kind of fault of the previous
-       map, orientation reversal or discontinuities. The first functional map of the round is computed without
-       the vertices that have this fault. If a map has both kinds of fault, the first round repairs the
-       orientation reversal, and further rounds alternate between the two kinds. If the second-best outcome of
-       step 1 has faults, this outcome is repaired as well. The outcome with the best score is used.
-
-    If the map of two near-isometric full shapes still looks wrong, both steps run a second time. The
-    alternatives are then refined with crease eigenvectors as well (Table R45). The better outcome is kept.
-
-    Some wrong maps look right. For two full shapes with the initial map `"shot"`, alternatives are therefore
-    computed if the distortion of the outcome is at least `compared`. Only alternatives that differ from the
-    map, and precede all similar maps in the order of their scores, are then refined at all vertices.
-
-    Maps between non-isometric shapes need further passes; see `refine_further`.
+    docs/how_it_works.md explains the steps. Alternative maps are tried first, and only for the initial map
+    `"shot"`. Rounds of repair follow if the best map still looks wrong. If the map of two near-isometric full
+    shapes looks wrong after that, both steps run again with crease eigenvectors. Some wrong maps look right.
+    For two full shapes, a map whose distortion is at least `compared` is therefore compared with alternative
+    maps as well.
 
     **Arguments:**
 
     - `prepared`: the prepared pair.
     - `start`: the initial map.
     - `preset`: the stages and the repair. Without repair, the outcome is judged but not repaired.
-    - `outcome`: the outcome of the stages if they have already run, such as a result of `run` in batches.
-    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
+    - `outcome`: the outcome of the stages if they have already run, such as a result of `run_batches`.
 
     **Raises:** `InputError` if alternative maps cannot be computed.
     """
-    judge, repair = _judge(prepared, preset.judged, preset), preset.repair
+    judge, repair = _judge(prepared, preset.before_final, preset), preset.repair
     if outcome is None:
-        (outcome,) = run(preset.judged, prepared.spectra, [start], history=history)
+        outcome = run(preset.before_final, prepared.spectra, start)
     best = judge.judged(outcome)
     if repair is None or not best.successful:
         return best
-    repeater = _Repeater(prepared.spectra, preset.repeated, judge, history)
-    has_alternatives = start.origin == "shot" and repair.finalists > 0
+    repeater = _Repeater(prepared.spectra, preset.repeated, judge)
+    has_alternatives = start.has_alternatives and repair.finalists > 0
     compares = has_alternatives and not prepared.pair.partial
     if best.suspicious:
         logger.info(
@@ -102,39 +82,32 @@ def refine_and_repair(
     return replace(best, rivals=proxies.different(best, best.rivals))
 
 
-def refine_further(
-    prepared: PreparedPair, origin: str, preset: Preset, scored: Scored, *, history: bool = False
-) -> Scored:
-    """Refine the map between non-isometric shapes further, because such maps converge slowly.
+def refine_further(prepared: PreparedPair, start: Start, preset: Preset, scored: Scored) -> Scored:
+    """Run further passes for non-isometric shapes, because their maps converge slowly.
 
-    In each pass, the repeated stages run again. `RepairSettings` explains how many passes run, which passes
-    are coarse, and which passes use crease eigenvectors. The passes also run from the `rivals` of the map. A
-    rival replaces the map if its score after the passes is better. If the map is suspicious, the score must
-    be better by more than `rival_margin`.
+    docs/how_it_works.md explains the passes, which also run from the `rivals` of the map.
 
     **Arguments:**
 
     - `prepared`: the prepared pair.
-    - `origin`: the origin of the initial map; see `Start`.
+    - `start`: the initial map.
     - `preset`: the stages and the repair. Without repair, no pass runs.
     - `scored`: a result of `refine_and_repair`.
-    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
 
-    **Returns:** The map after the last pass. The attribute `suspicious` is copied from the given map. The
-    given map is returned if no pass runs, if a pass fails, or if the passes make the score (without the
-    deformation) worse by more than `pass_tolerance`.
+    **Returns:** The map after the last pass, as suspicious as the given map. The given map is returned if no
+    pass runs, if a pass fails, or if the passes worsen the score by more than `pass_tolerance`.
     """
     repair = preset.repair
     if repair is None or not scored.successful:
         return scored
-    judge = _judge(prepared, preset.judged, preset)
+    judge = _judge(prepared, preset.before_final, preset)
     change = judge.area_change(scored)
     # Rigidly aligned full shapes differ in form, not in pose. Coarse passes lower the errors of such pairs
     # even if the area-based shape difference is small. (Entry R24)
-    aligned = origin == "aligned" and not prepared.pair.partial
+    aligned = start.is_rigid and not prepared.pair.partial
     if change < repair.non_isometric and not aligned:
         return scored
-    repeater = _Repeater(prepared.spectra, preset.repeated, judge, history)
+    repeater = _Repeater(prepared.spectra, preset.repeated, judge)
     if change >= repair.without_creases_from:
         repeater = replace(repeater, spectra=_without_creases(repeater.spectra))
     passes = [repeater] * repair.passes
@@ -164,19 +137,16 @@ def refine_further(
     return replace(after, suspicious=scored.suspicious)
 
 
-def finish(
-    prepared: PreparedPair, origin: str, preset: Preset, scored: Scored, *, history: bool = False
-) -> Scored:
+def finish(prepared: PreparedPair, start: Start, preset: Preset, scored: Scored) -> Scored:
     """Refine a map further, and run the final stages of the preset; see `refine_further`.
 
     **Returns:** The map after the last stage, with its distortion. The attribute `suspicious` is copied from
     the given map.
     """
-    scored = refine_further(prepared, origin, preset, scored, history=history)
+    scored = refine_further(prepared, start, preset, scored)
     if not (preset.final and scored.successful):
         return scored
-    start = Start(scored.pointwise_map)
-    (after,) = run(preset.final, prepared.spectra, [start], history=history)
+    after = run(preset.final, prepared.spectra, Start(scored.pointwise_map))
     outcome = scored.outcome.followed_by(after)
     return _judge(prepared, preset.final, preset).measured(outcome, suspicious=scored.suspicious)
 
@@ -205,7 +175,6 @@ class _Repeater:
     spectra: SpectralPair
     stages: tuple[Stage, ...]
     judge: Judge
-    history: bool
 
     def coarse(self, levels: tuple[int, ...]) -> _Repeater:
         """Return a repeater whose last stage has the given levels."""
@@ -215,9 +184,9 @@ class _Repeater:
     def repeated(self, outcome: Outcome, excluded: Bool[np.ndarray, " m"] | None = None) -> Outcome:
         """Run the repeated stages from the map of an outcome, without a mask of vertices of X (m,)."""
         start = Start(outcome.pointwise_map, excluded=excluded)
-        (again,) = run(self.stages, self.spectra, [start], history=self.history)
-        first = max(0, len(outcome.refinements) - len(self.stages))
-        return Outcome(outcome.initial_map, outcome.refinements[:first]).followed_by(again)
+        again = run(self.stages, self.spectra, start)
+        first = max(0, len(outcome.runs) - len(self.stages))
+        return Outcome(outcome.initial_map, outcome.runs[:first]).followed_by(again)
 
     def repaired(
         self, known: Sequence[Scored], alternatives: Iterable[Int64[np.ndarray, " m"]] = ()

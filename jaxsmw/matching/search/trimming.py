@@ -13,10 +13,10 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
 from jaxsmw.geometry.scans import in_small_components
-from jaxsmw.matching.executor import Start, reverse_map, run
+from jaxsmw.matching.executor import Start, run
 from jaxsmw.matching.judge import Judge, Scored, detours
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedPair, pair_up, prepare_shapes
+from jaxsmw.matching.preparation import PreparedPair, prepare_shapes
 from jaxsmw.matching.stages import Preset, Sizes, Stage
 
 logger = logging.getLogger("jaxsmw")
@@ -79,20 +79,18 @@ def trimmed_stage(pair: Pair, preset: Preset) -> Stage | None:
 
 
 def match_trimmed(
-    prepared: PreparedPair, preset: Preset, scored: Scored, *, history: bool = False
+    prepared: PreparedPair, preset: Preset, scored: Scored
 ) -> tuple[PreparedPair, Scored] | None:
     """Trim the larger shape of a partial pair, and match the pair again by the last stage.
 
-    The eigenfunctions of a part differ from those of the full shape. After trimming, both shapes cover nearly
-    the same region of the body, so their eigenfunctions are similar. The last stage of the preset then runs
-    on the trimmed pair, with `trimmed_levels`. (Table R46)
+    After trimming, both shapes cover nearly the same region, so their eigenfunctions are similar; see
+    docs/how_it_works.md. The last stage of the preset runs with `trimmed_levels`. (Table R46)
 
     **Arguments:**
 
     - `prepared`: the prepared pair.
     - `preset`: the stages and the repair.
-    - `scored`: the map of `preset.judged`, after repair.
-    - `history`: whether each refinement records its iterations; see `jaxsmw.refine`.
+    - `scored`: the map of `preset.before_final`, after repair.
 
     **Returns:** The trimmed pair and its map, or None if the pair is not trimmed. The attribute `suspicious`
     is copied from the given map.
@@ -100,15 +98,14 @@ def match_trimmed(
     following = trimmed_stage(prepared.pair, preset)
     if following is None or not scored.successful:
         return None
-    trimmed_match, last, given = None, preset.judged[-1], prepared.pair
+    trimmed_match, given = None, prepared.pair
     for _ in range(preset.criteria.trims):
-        reverse = _reverse_map(prepared, last, scored)
+        reverse = extend_to_unreferenced(prepared.pair.mesh_y, scored.outcome.last.reverse_map())
         pair = trimmed(given, _everywhere(prepared, scored), reverse, preset.criteria.trimmed_area)
-        again = _matched_again(prepared, pair, following, preset, scored, history)
+        again = _matched_again(prepared, pair, following, preset, scored)
         if again is None:
             break
-        (prepared, scored), last = again, following
-        trimmed_match = again
+        prepared, scored = trimmed_match = again
     return trimmed_match
 
 
@@ -116,14 +113,8 @@ def _everywhere(prepared: PreparedPair, scored: Scored) -> Int64[np.ndarray, " m
     return extend_to_unreferenced(prepared.pair.mesh_x, scored.pointwise_map)
 
 
-def _reverse_map(prepared: PreparedPair, last: Stage, scored: Scored) -> Int64[np.ndarray, " n"]:
-    """Return the map Y -> X (n,) from the state of the last stage."""
-    found = reverse_map(last.refiner, prepared.spectra.seen_by(last), scored.outcome.last.state)
-    return extend_to_unreferenced(prepared.pair.mesh_y, found)
-
-
 def _matched_again(
-    prepared: PreparedPair, pair: Pair, stage: Stage, preset: Preset, scored: Scored, history: bool
+    prepared: PreparedPair, pair: Pair, stage: Stage, preset: Preset, scored: Scored
 ) -> tuple[PreparedPair, Scored] | None:
     """Run a stage on a trimmed pair from a map. Return None after a failure."""
     logger.info("the larger shape is trimmed and matched again ...")
@@ -135,10 +126,10 @@ def _matched_again(
         return None
     nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
     start = Start(nearest[_everywhere(prepared, scored)])
-    (again,) = run([stage], trimmed_pair.spectra, [start], history=history)
+    again = run([stage], trimmed_pair.spectra, start)
     if not again.successful:
         return None
-    judge = Judge(pair, trimmed_pair.spectra.seen_by(stage), preset.criteria)
+    judge = Judge(pair, again.last.seen, preset.criteria)
     outcome = scored.outcome.followed_by(again)
     return trimmed_pair, judge.measured(outcome, suspicious=scored.suspicious)
 
@@ -158,8 +149,15 @@ def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage) -> Prepare
         replace(shape, spectrum=_with_columns_of(before.spectrum, shape.spectrum))
         for shape, before in zip(shapes, prepared.shapes, strict=True)
     )
-    x, y = pair_up(pair, *kept, trimmed=True).shapes
-    again = replace(prepared, pair=pair, x=x, y=y, trimmed=True)
+    again = PreparedPair.of(
+        pair,
+        *kept,
+        given=prepared.given,
+        mirrored=prepared.mirrored,
+        trimmed=True,
+        laplacian=laplacian,
+        eigensolver=eigensolver,
+    )
     if stage.number_of_descriptors and not prepared.trimmed:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the given meshes have already caused the same warnings
