@@ -107,7 +107,7 @@ class Neighborhoods:
     def averaging(self) -> csr_array:
         """The matrix (n, n) that averages each vertex with its weighted neighbours."""
         totals = self.laplacian.diagonal()
-        inverse = diags_array(ratio(1, totals))
+        inverse = diags_array(ratio(1.0, totals))
         return csr_array(diags_array(np.ones(len(totals))) - 0.5 * inverse @ self.laplacian)
 
     def _averaged(self, values: Float64[np.ndarray, "n ..."]) -> Float64[np.ndarray, "n ..."]:
