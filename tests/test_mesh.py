@@ -1054,7 +1054,7 @@ def read_plainly(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return numbers[: 3 * n].reshape(n, 3), numbers[3 * n :].reshape(f, 4)[:, 1:].astype(int)
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_real_shapes_keep_vertices_and_faces(shared):
     paths = sorted((shared / "data").rglob("*.off"))
     assert len(paths) > 200
