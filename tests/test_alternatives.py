@@ -316,14 +316,14 @@ def test_the_difference_of_two_maps_is_a_share_of_the_area(pair):
 def test_further_alternatives_differ_from_all_maps_before_them(unchecked):
     """The maps 0, 1 and 2 are variants of one map, and so are 3 and 4. Map 5 differs from 0 by too little."""
     places = np.array([0.0, 0.05, 0.11, 0.5, 0.53, 0.02])
-    candidates = [SimpleNamespace(found=number) for number in range(6)]
+    candidates = [SimpleNamespace(matches=number) for number in range(6)]
     for areas, expected in (((0.03, 0.03, 0.2), [0, 1, 2, 3]), ((0.03, 0.2), [0, 1, 3]), ((0.4,), [0, 3])):
         settings = replace(REPAIR, alternatives=replace(REPAIR.alternatives, different_areas=areas))
         alternatives = SimpleNamespace(
             settings=settings, _difference=lambda one, other: abs(places[one] - places[other])
         )
         chosen = Alternatives._distinct(alternatives, candidates)
-        assert [one.found for one in chosen] == expected
+        assert [one.matches for one in chosen] == expected
 
 
 @pytest.mark.sampled

@@ -52,7 +52,7 @@ def check_kind(name: str, value: object, *kinds: type) -> None:
     raise TypeError(f"the {name} is {shown}, but {needed} is needed")
 
 
-def check_pointwise_map(name: str, pointwise_map: Array | np.ndarray, number_of_vertices: int) -> None:
+def check_matches(name: str, pointwise_map: Array | np.ndarray, number_of_vertices: int) -> None:
     """Check that a map has one integer per vertex of X.
 
     **Raises:** `ValueError` if the map has another shape; `TypeError` if it is not an array of integers.

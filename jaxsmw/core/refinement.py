@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Int32
 
 from jaxsmw.choices import ITERATIONS
-from jaxsmw.core.checks import all_finite, check_kind, check_pointwise_map, counts_iterations
+from jaxsmw.core.checks import all_finite, check_kind, check_matches, counts_iterations
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, Samples, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where
@@ -295,7 +295,7 @@ def _check_arguments(
 ) -> None:
     check_kind("refiner", refiner, Refiner)
     check_spectra(spectrum_x, spectrum_y)
-    check_pointwise_map("initial map", pointwise_map, len(spectrum_x.mask))
+    check_matches("initial map", pointwise_map, len(spectrum_x.mask))
     if samples is not None:
         if not isinstance(samples, tuple) or len(samples) != 2:
             raise ValueError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
 from typing import Generic, TypeVar
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
 
 Samples = tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
 """The indices of the samples of X (s_x,) and of Y (s_y,): the vertices on which a refiner iterates."""
@@ -178,6 +180,22 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def levels(self) -> tuple[int, ...]:
         """The number of eigenvectors in each iteration; empty if every iteration uses all eigenvectors."""
         return ()
+
+    def with_levels(self, levels: tuple[int, ...]) -> Refiner[PreparedT, StateT]:
+        """Return the refiner with other levels. By default, `levels` must be a field of the refiner.
+
+        **Raises:** `InputError` if the refiner has no levels.
+        """
+        if not self.levels:
+            raise InputError(f"{type(self).__name__} has no levels: use FeatureRegression or Registration.")
+        return dataclasses.replace(self, levels=levels)  # type: ignore[call-arg]
+
+    def with_traced_levels(self) -> Refiner[PreparedT, StateT]:
+        """Return the refiner with levels as an array, so that refiners with other levels share its program.
+
+        By default, the refiner is not changed.
+        """
+        return self
 
     @property
     def convention(self) -> Convention:

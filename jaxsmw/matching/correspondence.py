@@ -247,9 +247,9 @@ class Correspondence:
         """
         queries, database = self._embeddings()
         used = self.mesh_x.referenced_vertices
-        found = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.referenced_vertices)
-        found = extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, found)
-        return self.pair.with_small_components(found)[0]
+        matches = one_to_one_map(queries, database, mask_x=used, mask_y=self.mesh_y.referenced_vertices)
+        matches = extend_from(np.asarray(self.spectrum_x.mask), self.mesh_x, matches)
+        return self.pair.with_small_components(matches)[0]
 
     def soft_map(self, temperature: float = 0.3, *, iterations: int = 100, tolerance: float = 0.1) -> SoftMap:
         """Compute a soft map that spreads the area of X over Y; see `jaxsmw.learning.sinkhorn`.
@@ -285,7 +285,7 @@ class Correspondence:
                 "positive temperature, such as 0.3, and at least 1 iteration."
             )
         with self._precision():
-            found = compiled(sinkhorn)(
+            soft_map = compiled(sinkhorn)(
                 *jax.device_put(self._embeddings()),
                 query_areas=self.spectrum_x.vertex_areas,
                 database_areas=self.spectrum_y.vertex_areas,
@@ -293,14 +293,14 @@ class Correspondence:
                 iterations=iterations,
                 tolerance=jnp.asarray(float(tolerance)),
             )
-        if not found.converged:
+        if not soft_map.converged:
             warnings.warn(
                 f"the soft map has not converged: after {iterations} iterations, the share of misplaced area "
-                f"is {float(found.residual):.3g}, which exceeds the tolerance {tolerance:g}: allow more "
+                f"is {float(soft_map.residual):.3g}, which exceeds the tolerance {tolerance:g}: allow more "
                 "iterations, a higher temperature or a larger tolerance.",
                 stacklevel=2,
             )
-        return found
+        return soft_map
 
     def expected_error(self) -> Float[np.ndarray, " m"]:
         """Estimate the geodesic error of every match (m,), divided by the square root of Y's area.

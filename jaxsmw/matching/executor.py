@@ -1,7 +1,7 @@
 """Runs stages: pads the spectra of a pair, and runs one compiled program per stage, or batches of pairs.
 
-Only this module pads shapes, so that all shapes of similar sizes share compiled programs. All maps that go in
-and come out have one entry per vertex of X.
+Shapes of similar sizes are padded to one size, so that they share compiled programs. Only this module and
+`jaxsmw.runtime.batches` pad shapes. All maps that go in and come out have one entry per vertex of X.
 """
 
 from __future__ import annotations
@@ -372,8 +372,8 @@ def nearest_rows(
     def padded(rows: np.ndarray) -> Array:
         return jax.device_put(pad_rows(rows, padded_size(len(rows))))
 
-    found = compiled(nearest_neighbor)(padded(queries), padded(database), database_mask=padded(mask))
-    return np.asarray(found)[: len(queries)].astype(np.int64)
+    nearest = compiled(nearest_neighbor)(padded(queries), padded(database), database_mask=padded(mask))
+    return np.asarray(nearest)[: len(queries)].astype(np.int64)
 
 
 def nearest_points(
@@ -402,6 +402,6 @@ def nearest_points(
         rows,
         candidates,
     )
-    found = compiled(nearest_point_on_candidates)(*jax.device_put(padded))
-    nearest, weights = (np.asarray(values)[: len(queries)] for values in found)
+    points = compiled(nearest_point_on_candidates)(*jax.device_put(padded))
+    nearest, weights = (np.asarray(values)[: len(queries)] for values in points)
     return nearest.astype(np.int64), weights.astype(np.float64)

@@ -355,12 +355,12 @@ class Judge:
 
     def judged(self, outcome: Outcome) -> Scored:
         """Measure an outcome, and decide whether it is suspicious. A failed outcome is suspicious."""
-        found = self.measured(outcome)
-        suspicious = not found.distortion < self.settings.suspicious
+        scored = self.measured(outcome)
+        suspicious = not scored.distortion < self.settings.suspicious
         if not suspicious and self.settings.suspicious_area < 1:
-            largest = max(map(self.pair.mesh_x.average, self.faults(found.pointwise_map)), default=0)
+            largest = max(map(self.pair.mesh_x.average, self.faults(scored.pointwise_map)), default=0)
             suspicious = bool(largest >= self.settings.suspicious_area)
-        return replace(found, suspicious=suspicious)
+        return replace(scored, suspicious=suspicious)
 
     def measured(self, outcome: Outcome, *, suspicious: bool = False) -> Scored:
         """Compute what determines the `score` of an outcome."""

@@ -200,7 +200,9 @@ def match_prepared(
             refine_and_repair(prepared, start, preset, outcome=outcome)
             for start, outcome in itertools.zip_longest(starts, outcomes)
         ]
-    successful = [pair for pair in zip(starts, repaired, strict=True) if pair[1].successful]
+    successful = [
+        (start, scored) for start, scored in zip(starts, repaired, strict=True) if scored.successful
+    ]
     start, scored = successful[0] if successful else (starts[0], repaired[0])
     if len(successful) > 1 and preset.repair is not None:
         with step("expected error"):
@@ -208,8 +210,8 @@ def match_prepared(
         start, scored = successful[int(shot >= preset.repair.aligned_preference * aligned)]
     last = step("final stages") if preset.final or preset.repair else nullcontext()
     with last, one_blas_thread():
-        if found := match_trimmed(prepared, preset, scored):
-            prepared, scored = found
+        if trimmed := match_trimmed(prepared, preset, scored):
+            prepared, scored = trimmed
         else:
             scored = finish(prepared, start, preset, scored)
         jax.block_until_ready(scored.outcome.last.refinement)
@@ -247,12 +249,12 @@ def _compile_ahead(pair: Pair, preset: Preset) -> None:
         compile_stage(stage, *numbers, partial=pair.partial)
 
 
-def _omission(found: Correspondence) -> str:
+def _omission(correspondence: Correspondence) -> str:
     """Return the text of the warning that small components have no counterpart."""
     return (
-        f"{found.pair.name}: {found.left_out:.0%} of the source's area lies in small components that have no "
-        "counterpart on the target, so they only move with their surroundings. If they are parts of one "
-        "surface, join them, for example by welding (weld=True, --weld)."
+        f"{correspondence.pair.name}: {correspondence.left_out:.0%} of the source's area lies in small "
+        "components that have no counterpart on the target, so they only move with their surroundings. If "
+        "they are parts of one surface, join them, for example by welding (weld=True, --weld)."
     )
 
 
@@ -270,14 +272,14 @@ def _doubt(pair: Pair, decision: Decision) -> str:
 _MOSTLY = 0.5
 
 
-def _warning(found: Correspondence, *, landmarks: bool) -> str:
+def _warning(correspondence: Correspondence, *, landmarks: bool) -> str:
     """Return the text of the warning that a map looks wrong. `landmarks` is True if landmarks were given."""
-    pair, repair = found.pair, found.preset.repair
-    settings = found.preset.criteria
+    pair, repair = correspondence.pair, correspondence.preset.repair
+    settings = correspondence.preset.criteria
     reversed_ = orientation_reversal(
-        found.matched_pair, found.pointwise_map, found.spectrum_x, settings.scores
+        correspondence.matched_pair, correspondence.pointwise_map, correspondence.spectrum_x, settings.scores
     )
-    cut_off = discontinuous_parts(found.matched_pair, found.pointwise_map, settings.scores)
+    cut_off = discontinuous_parts(correspondence.matched_pair, correspondence.pointwise_map, settings.scores)
     reversed_share, cut_off_share = (pair.mesh_x.average(fault) for fault in (reversed_, cut_off))
     cure = f"use {'more' if landmarks else 'a few'} landmarks as the initial map"
     if repair is None:
@@ -285,7 +287,7 @@ def _warning(found: Correspondence, *, landmarks: bool) -> str:
     if reversed_share > _MOSTLY:
         cure += (
             '; if both meshes are of the same hand, set mirror="no" (--mirror no)'
-            if found.mirrored
+            if correspondence.mirrored
             else '; if one mesh is a mirror image of the other, set mirror="yes" (--mirror yes)'
         )
     if pair.partial:
@@ -297,11 +299,11 @@ def _warning(found: Correspondence, *, landmarks: bool) -> str:
         cure += "; if one mesh is a partial shape, set partial=True (--partial)"
     return (
         f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down. The map has "
-        f"distortion {found.distortion:.3f}, reverses the orientation of {reversed_share:.0%} of the "
-        f"source's area, and separates {cut_off_share:.0%} of the source's area by discontinuities. Correct "
-        f"maps between poses of one body have distortions up to {settings.suspicious}. Correct maps can have "
-        "larger distortions between non-isometric shapes, with topological noise, or if one shape is "
-        "mirrored. "
+        f"distortion {correspondence.distortion:.3f}, reverses the orientation of {reversed_share:.0%} of "
+        f"the source's area, and separates {cut_off_share:.0%} of the source's area by discontinuities. "
+        f"Correct maps between poses of one body have distortions up to {settings.suspicious}. Correct maps "
+        "can have larger distortions between non-isometric shapes, with topological noise, or if one shape "
+        "is mirrored. "
         "Look at the map with the option --report or, in Python, with jaxsmw.report.summary.write_report. If "
         f"the map is wrong, {cure}."
     )

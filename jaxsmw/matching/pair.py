@@ -171,16 +171,16 @@ def _known_scale(mesh_x: Mesh, mesh_y: Mesh, partial: bool, scale: float | Scale
         return 1.0
     if isinstance(scale, str):
         check_choice(scale, Scale, "a scale")
-        found = estimate_scale(mesh_x, mesh_y)
-        logger.info("scale: lengths on %s are multiplied by %.4g", mesh_x.name, found.scale)
-        if found.uncertain:
+        estimate = estimate_scale(mesh_x, mesh_y)
+        logger.info("scale: lengths on %s are multiplied by %.4g", mesh_x.name, estimate.scale)
+        if estimate.uncertain:
             warnings.warn(
-                f"{mesh_x.name} to {mesh_y.name}: the estimated scale {found.scale:.3g} is uncertain, "
+                f"{mesh_x.name} to {mesh_y.name}: the estimated scale {estimate.scale:.3g} is uncertain, "
                 "because few points of the two shapes resemble each other. If the unit of length is known, "
                 "give the scale as a number.",
                 stacklevel=4,
             )
-        return found.scale
+        return estimate.scale
     check_number("scale", scale, positive=True)
     if not 1e-100 <= scale <= 1e100:  # areas would overflow
         raise InputError(f"scale is {scale!r}: give a number from 1e-100 to 1e100.")

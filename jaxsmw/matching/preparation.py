@@ -102,11 +102,11 @@ class PreparedShape:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the shape as arrays, for a file."""
-        found = {name: np.asarray(value) for name, value in vars(self.spectrum).items() if value is not None}
-        found |= {"mesh_vertices": self.mesh.vertices, "mesh_faces": self.mesh.faces}
+        arrays = {name: np.asarray(value) for name, value in vars(self.spectrum).items() if value is not None}
+        arrays |= {"mesh_vertices": self.mesh.vertices, "mesh_faces": self.mesh.faces}
         if self.samples is not None:
-            found["samples"] = np.asarray(self.samples)
-        return found
+            arrays["samples"] = np.asarray(self.samples)
+        return arrays
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], name: str) -> PreparedShape:
@@ -154,10 +154,10 @@ def prepare_shapes(
         shapes = [_shape(mesh, *of_mesh) for mesh, of_mesh in zip(meshes, pairs, strict=True)]
     if samples:
         with step("samples"):
-            found = each(lambda mesh: farthest_point_samples(mesh, samples))
+            vertices = each(lambda mesh: farthest_point_samples(mesh, samples))
         shapes = [
             replace(shape, samples=jax.device_put(chosen))
-            for shape, chosen in zip(shapes, found, strict=True)
+            for shape, chosen in zip(shapes, vertices, strict=True)
         ]
     if creases:
         with step("crease eigenvectors"):

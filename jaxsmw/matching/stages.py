@@ -10,7 +10,6 @@ from typing import NamedTuple, get_args
 from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS, PresetName
 from jaxsmw.core.refinement import RefineSettings, check_samples_use
 from jaxsmw.core.refiner import Refiner
-from jaxsmw.core.refiners.coarse_to_fine import CoarseToFine
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -111,9 +110,8 @@ class Stage:
 
         The levels of the refiner are an array, so stages with equally many levels share a compiled program.
         """
-        refiner = self.refiner
         return RefineSettings(
-            refiner=refiner.with_traced_levels() if isinstance(refiner, CoarseToFine) else refiner,
+            refiner=self.refiner.with_traced_levels(),
             iterations=self.iterations,
             starts_on_samples=self.starts_on_samples,
             ends_on_samples=self.ends_on_samples,
@@ -133,11 +131,7 @@ class Stage:
         **Raises:** `InputError` if the refiner has no levels, or if there are fewer samples than
         eigenvectors.
         """
-        if not isinstance(self.refiner, CoarseToFine):
-            raise InputError(
-                f"{type(self.refiner).__name__} has no levels: use FeatureRegression or Registration."
-            )
-        refiner = replace(self.refiner, levels=levels)
+        refiner = self.refiner.with_levels(levels)
         return replace(self, refiner=refiner, number_of_eigenvectors=_FROM_REFINER, iterations=_FROM_REFINER)
 
     def coarsened(self, levels: tuple[int, ...]) -> Stage:

@@ -236,13 +236,13 @@ _ELSEWHERE = 100.0
 
 def _landmark_features(prepared: PreparedPair, landmarks: Int[np.ndarray, "l 2"]) -> _Features:
     """Append the weighted geodesic distances to all landmarks to SHOT."""
-    found = []
+    features = []
     units = prepared.pair.units_of_length
     for shape, vertices, unit, shot in zip(prepared.shapes, landmarks.T, units, prepared.shot, strict=True):
         distances = geodesic_distances(shape.mesh, vertices.astype(np.int64)).T / unit
         distances = _LANDMARK_WEIGHT * np.where(np.isfinite(distances), distances, _ELSEWHERE)
-        found.append(np.hstack([shot, shape.at_compared(distances)]))
-    return found[0], found[1]
+        features.append(np.hstack([shot, shape.at_compared(distances)]))
+    return features[0], features[1]
 
 
 def _check_landmarks(pair: Pair, landmarks: np.ndarray) -> None:
@@ -270,14 +270,14 @@ def _check_landmarks(pair: Pair, landmarks: np.ndarray) -> None:
 def nearest_map(prepared: PreparedPair, features: _Features) -> Int64[np.ndarray, " m"]:
     """Compute a pointwise map of all vertices of X (m,) by nearest-neighbour search in feature space.
 
-    **Raises:** `ArithmeticError` if some of the found rows are not the nearest; see `_check_nearest`.
+    **Raises:** `ArithmeticError` if some of the nearest rows are not the nearest; see `_check_nearest`.
     """
     x, y = prepared.shapes
     dtype, mask = y.spectrum.eigenvectors.dtype, np.asarray(y.compared_spectrum.mask)
     of_x, of_y = (of_shape.astype(dtype) for of_shape in features)
-    found = nearest_rows(of_x, of_y, mask)
-    _check_nearest(*features, np.flatnonzero(mask), found)
-    return x.everywhere(found if y.compared is None else y.compared.vertices[found])
+    nearest = nearest_rows(of_x, of_y, mask)
+    _check_nearest(*features, np.flatnonzero(mask), nearest)
+    return x.everywhere(nearest if y.compared is None else y.compared.vertices[nearest])
 
 
 # The number of queries that `_check_nearest` checks, and the tolerance relative to the squared norms.
@@ -288,7 +288,7 @@ def _check_nearest(
     queries: Float[np.ndarray, "a d"],
     database: Float[np.ndarray, "b d"],
     usable: Int64[np.ndarray, " u"],
-    found: Int64[np.ndarray, " a"],
+    nearest: Int64[np.ndarray, " a"],
 ) -> None:
     """Check a few results of a nearest-neighbour search in float64, because all maps depend on this search.
 
@@ -304,9 +304,9 @@ def _check_nearest(
     if not (np.isfinite(sizes).all() and np.isfinite(size).all()):
         return
     squared = size[:, None] - 2 * few @ all_rows.T + sizes
-    reached = ((few - database[found[rows]].astype(np.float64)) ** 2).sum(axis=1)
+    reached = ((few - database[nearest[rows]].astype(np.float64)) ** 2).sum(axis=1)
     tolerance = _TOLERANCE * (size + sizes.max())
-    if not (np.isin(found[rows], usable).all() and (reached <= squared.min(axis=1) + tolerance).all()):
+    if not (np.isin(nearest[rows], usable).all() and (reached <= squared.min(axis=1) + tolerance).all()):
         raise ArithmeticError(
             "JAX returned wrong nearest neighbours, so numerical results of this installation cannot be "
             "trusted: install jax and jaxlib again, and unset XLA_FLAGS and JAX_PLATFORMS."

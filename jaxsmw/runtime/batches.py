@@ -15,7 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, Int32, Shaped
 
-from jaxsmw.core.checks import check_pointwise_map
+from jaxsmw.core.checks import check_matches
 from jaxsmw.core.refinement import Refinement, RefineSettings, refine
 from jaxsmw.core.search import BLOCK, queries_per_block
 from jaxsmw.core.spectrum import Spectrum
@@ -193,7 +193,7 @@ def _check_pairs(
                 f"pair {position} is {tuple(pair)}, but there are {len(spectra)} shapes: give the indices of "
                 "two shapes, counted from 0"
             )
-        check_pointwise_map(f"initial map of pair {position}", pointwise_map, len(spectra[pair[0]].mask))
+        check_matches(f"initial map of pair {position}", pointwise_map, len(spectra[pair[0]].mask))
 
 
 class _Sizes(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import operator
 from collections.abc import Iterable
 from typing import Generic, TypeVar, get_args
@@ -70,11 +71,12 @@ class CoarseToFine(Refiner[PreparedT, CoarseStateT], Generic[PreparedT, CoarseSt
         """Always True."""
         return True
 
-    def with_traced_levels(self) -> CoarseToFine[PreparedT, CoarseStateT]:
-        """Return the refiner with an array of levels, which JAX traces.
+    def with_levels(self, levels: tuple[int, ...]) -> CoarseToFine[PreparedT, CoarseStateT]:
+        """Return the refiner with other levels."""
+        return dataclasses.replace(self, levels=levels)
 
-        Refiners with the same number of levels then share a compiled program.
-        """
+    def with_traced_levels(self) -> CoarseToFine[PreparedT, CoarseStateT]:
+        """Return the refiner with levels as an array."""
         return eqx.tree_at(lambda refiner: refiner.levels, self, np.array(self.levels, np.int32))
 
     def active_eigenvectors(

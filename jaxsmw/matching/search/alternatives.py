@@ -31,7 +31,7 @@ class _Candidate(NamedTuple):
     """A refined map of samples, and its score; see `Judge.score`."""
 
     score: float
-    found: SampleMap
+    matches: SampleMap
 
 
 class Alternatives:
@@ -127,11 +127,11 @@ class Alternatives:
         coarse = sorted(coarse + repaired, key=lambda candidate: candidate.score)
         promising = islice(self._distinct(_within(chosen.coarse_margin, coarse)), chosen.promising)
         finer = self._stage.with_levels(chosen.fine_levels)
-        fine = self._refined(finer, [candidate.found for candidate in promising])
+        fine = self._refined(finer, [candidate.matches for candidate in promising])
         for candidate in self._distinct(_within(chosen.margin, fine)):
-            if only_better and self._difference(candidate.found, usual) < chosen.different_areas[0]:
+            if only_better and self._difference(candidate.matches, usual) < chosen.different_areas[0]:
                 return
-            yield self._extended(candidate.found)
+            yield self._extended(candidate.matches)
 
     def _distinct(self, candidates: Sequence[_Candidate]) -> Iterator[_Candidate]:
         """Choose candidates that differ from each other, and yield them.
@@ -149,7 +149,8 @@ class Alternatives:
                 return
             yield chosen
             differences = [
-                (other, min(area, self._difference(other.found, chosen.found))) for other, area in differences
+                (other, min(area, self._difference(other.matches, chosen.matches)))
+                for other, area in differences
             ]
 
     def _difference(self, first: SampleMap, second: SampleMap) -> float:
@@ -159,8 +160,8 @@ class Alternatives:
         """For each fault of each candidate, refine the map of samples without the faulty ones."""
         starts, faults = [], []
         for candidate in candidates:
-            for fault in self._judge.faults(self._extended(candidate.found)):
-                starts.append(candidate.found)
+            for fault in self._judge.faults(self._extended(candidate.matches)):
+                starts.append(candidate.matches)
                 faults.append(fault[self.x.samples.vertices])
         return self._refined(stage, starts, faults)
 
@@ -247,16 +248,16 @@ class Alternatives:
         # All refinements are started first. The host scores a finished refinement while the others run.
         for outcome in [run([fitted], self._spectra, start) for start in starts]:
             if outcome.successful:
-                found = outcome.pointwise_map
-                score = self._judge.score_map(self._extended(found), outcome.uncertainty)
-                candidates.append(_Candidate(score, found))
+                matches = outcome.pointwise_map
+                score = self._judge.score_map(self._extended(matches), outcome.uncertainty)
+                candidates.append(_Candidate(score, matches))
         return sorted(candidates, key=lambda candidate: candidate.score)
 
     def _reduced(self, pointwise_map: Int64[np.ndarray, " m"]) -> SampleMap:
         return self.y.samples.nearest[pointwise_map[self.x.samples.vertices]]
 
-    def _extended(self, found: SampleMap) -> Int64[np.ndarray, " m"]:
-        return self.y.samples.vertices[found][self.x.samples.nearest]
+    def _extended(self, matches: SampleMap) -> Int64[np.ndarray, " m"]:
+        return self.y.samples.vertices[matches][self.x.samples.nearest]
 
 
 def _within(margin: float, candidates: Sequence[_Candidate]) -> list[_Candidate]:

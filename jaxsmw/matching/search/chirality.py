@@ -108,9 +108,9 @@ class Hands:
         shot = _shot(shape, _ASYMMETRY_RADII)
         # All descriptors have the same norm, so the nearest descriptor has the largest inner product.
         mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
-        found = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
-        random = np.random.default_rng(0).permutation(len(found))
-        return distance_error(shape, shape, found) / distance_error(shape, shape, random)
+        matches = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
+        random = np.random.default_rng(0).permutation(len(matches))
+        return distance_error(shape, shape, matches) / distance_error(shape, shape, random)
 
     def evidence(self) -> float:
         """Compare a coarse map of X with a coarse map of the mirror image of X.

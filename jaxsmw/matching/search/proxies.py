@@ -74,15 +74,15 @@ class Proxy:
         return np.where(np.isfinite(along), along, cdist(self.positions, self.positions))
 
 
-def distance_error(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"]) -> float:
+def distance_error(x: Proxy, y: Proxy, matches: Int64[np.ndarray, " s"]) -> float:
     """Return the mean absolute difference between distances on X and distances of the matches on Y.
 
     **Arguments:**
 
     - `x`, `y`: the proxies of X (s samples) and Y (t samples).
-    - `found`: the matches of the samples of X (s,), as 0-based indices of samples of Y.
+    - `matches`: the matches of the samples of X (s,), as 0-based indices of samples of Y.
     """
-    return float(x.areas @ np.abs(x.distances - y.distances[np.ix_(found, found)]) @ x.areas)
+    return float(x.areas @ np.abs(x.distances - y.distances[np.ix_(matches, matches)]) @ x.areas)
 
 
 def map_difference(
@@ -101,7 +101,7 @@ def map_difference(
     return float(x.areas @ (y.distances[first, second] > distance))
 
 
-def deformation(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"], radius: float) -> float:
+def deformation(x: Proxy, y: Proxy, matches: Int64[np.ndarray, " s"], radius: float) -> float:
     """Measure how far a map deviates from a rigid motion on each patch of X.
 
     The patch of a sample consists of all samples at a geodesic distance below `radius`. A rotation and a
@@ -116,14 +116,14 @@ def deformation(x: Proxy, y: Proxy, found: Int64[np.ndarray, " s"], radius: floa
     **Arguments:**
 
     - `x`, `y`: the proxies of X (s samples) and Y (t samples).
-    - `found`: the matches of the samples of X (s,), as 0-based indices of samples of Y.
+    - `matches`: the matches of the samples of X (s,), as 0-based indices of samples of Y.
     - `radius`: the radius of the patches, in the unit of the distances.
 
     **Returns:** The deformation, from 0 for a rigid motion to at most 1.
     """
     weights = (x.distances < radius) * x.areas
     weights /= weights.sum(axis=1, keepdims=True)
-    source, target = x.positions, y.positions[found]
+    source, target = x.positions, y.positions[matches]
     products = np.einsum("sa,sb->sab", source, target).reshape(-1, 9)
     squares = np.sum(source**2 + target**2, axis=1, keepdims=True)
     columns = weights @ np.hstack([source, target, products, squares])

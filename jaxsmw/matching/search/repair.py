@@ -71,8 +71,8 @@ def refine_and_repair(
     proxies = Alternatives(prepared, repair)
     judge = replace(judge, measure_deformation=proxies.deformation)
     repeater, usual = replace(repeater, judge=judge), best.pointwise_map
-    found = proxies.best(usual, only_better=not best.suspicious)
-    best = repeater.repaired([judge.measured(best.outcome, suspicious=best.suspicious)], found)
+    alternatives = proxies.best(usual, only_better=not best.suspicious)
+    best = repeater.repaired([judge.measured(best.outcome, suspicious=best.suspicious)], alternatives)
     tries_again = best.suspicious and proxies.has_creases and not prepared.pair.partial
     # Between shapes that differ more, crease eigenvectors make some maps worse. (Table R45)
     if tries_again and judge.area_change(best) < repair.non_isometric:
