@@ -67,7 +67,7 @@ class Alternatives:
     def _judge(self) -> Judge:
         # If the judge were an attribute, both objects would refer to each other. Python frees such objects
         # late, and with them all arrays of the pair.
-        return Judge(self.pair, self._judged_spectra, self.settings, self.deformation)
+        return Judge(self.pair, self._judged_spectra, self.settings.judge, self.deformation)
 
     def _proxy(self, side: tuple[PreparedShape, float]) -> Proxy:
         shape, unit = side
