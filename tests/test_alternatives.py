@@ -25,7 +25,7 @@ from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.alternatives import Alternatives
 from jaxsmw.matching.search.proxies import Proxy, deformation, distance_error, map_difference
 from jaxsmw.matching.search.repair import refine_and_repair
-from jaxsmw.matching.settings import AlternativeSettings
+from jaxsmw.matching.settings import AlternativeSettings, JudgeSettings
 from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
 from jaxsmw.matching.starts import make_start
 
@@ -205,7 +205,8 @@ def test_maps_that_look_right_are_compared(
 
     monkeypatch.setattr(Alternatives, "best", best)
     monkeypatch.setattr(Judge, "score", lambda self, scored: -float(len(scored.outcome.runs) == 1))
-    settings = replace(REPAIR, suspicious=100.0, suspicious_area=1.0, compared=compared, finalists=finalists)
+    judge = JudgeSettings(suspicious=100.0, suspicious_area=1.0)
+    settings = replace(REPAIR, judge=judge, compared=compared, finalists=finalists)
     pair = prepared(mesh_x, mesh_y, partial=is_partial)
     start = make_start(pair, "shot")._replace(origin=init)
     found = refine_and_repair(pair, start, replace(TWO_STAGES, repair=settings))
@@ -258,7 +259,11 @@ def test_a_second_attempt_uses_crease_eigenvectors(
     monkeypatch.setattr(Alternatives, "best", best)
     monkeypatch.setattr(Judge, "score", lambda self, scored: score * (len(scored.outcome.runs) == 1))
     settings = replace(
-        REPAIR, suspicious=0.1, doubtful=0.1, non_isometric=non_isometric, finalists=1, rounds=0
+        REPAIR,
+        judge=JudgeSettings(suspicious=0.1, doubtful=0.1),
+        non_isometric=non_isometric,
+        finalists=1,
+        rounds=0,
     )
     pair = prepared(mesh_x, mesh_y, partial=is_partial, creases=creases)
     found = refine_and_repair(pair, make_start(pair, "shot"), replace(TWO_STAGES, repair=settings))

@@ -22,7 +22,7 @@ from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search import repair
 from jaxsmw.matching.search.repair import refine_and_repair, refine_further
-from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.settings import JudgeSettings, RepairSettings
 from jaxsmw.matching.stages import PRESETS, Preset, Stage
 from jaxsmw.report.summary import summarize
 
@@ -141,11 +141,12 @@ def test_the_map_of_the_best_score_is_chosen(body, mirrored, identity, monkeypat
 
 def test_a_large_fault_makes_a_map_suspicious(body, swapped, identity):
     """Swapped arms are a fault even if distortions of any size are accepted."""
-    lenient = replace(REPAIR, suspicious=100.0, doubtful=100.0)
+    lenient = JudgeSettings(suspicious=100.0, doubtful=100.0)
+    generous = replace(lenient, suspicious_area=1.0)
     stages = (Stage(FeatureRegression((40,))),)
-    wrong, found = outcome(body, swapped, replace(lenient, suspicious_area=1.0), stages)
+    wrong, found = outcome(body, swapped, replace(REPAIR, judge=generous), stages)
     assert wrong > 0.1 and not found.suspicious
-    wrong, found = outcome(body, swapped, lenient, stages)
+    wrong, found = outcome(body, swapped, replace(REPAIR, judge=lenient), stages)
     assert wrong < 0.02 and not found.suspicious
 
 
@@ -163,7 +164,7 @@ def test_stages_run_again_for_shapes_that_differ_in_form(body, init, non_isometr
     noise = np.random.default_rng(0).normal(scale=0.3, size=vertices.shape)
     start = KDTree(vertices).query(vertices + noise)[1]
     settings = replace(
-        REPAIR, suspicious=2.0, suspicious_area=1.0, non_isometric=non_isometric, passes=2,
+        REPAIR, judge=JudgeSettings(suspicious=2.0, suspicious_area=1.0), non_isometric=non_isometric, passes=2,
         coarse_from=coarse_from, coarse_levels=((10, 20), (20,)),
     )  # fmt: skip
     _, once = outcome(body, start, replace(settings, non_isometric=10.0), [stage])
@@ -179,9 +180,8 @@ def test_stages_run_again_for_shapes_that_differ_in_form(body, init, non_isometr
 
 def test_passes_do_not_clear_the_suspicion(body, identity):
     """Passes lower the distortion of a wrong map, but the map stays wrong."""
-    settings = replace(
-        REPAIR, suspicious=1.001, suspicious_area=1.0, doubtful=10.0, non_isometric=0.0, passes=1
-    )
+    judge = JudgeSettings(suspicious=1.001, suspicious_area=1.0, doubtful=10.0)
+    settings = replace(REPAIR, judge=judge, non_isometric=0.0, passes=1)
     prepared, start = prepared_body(body, identity)
     once = refine_and_repair(prepared, start, UNREPAIRED)
     preset = replace(UNREPAIRED, repair=settings)
@@ -255,12 +255,13 @@ def test_a_rival_replaces_the_map_if_its_score_is_better_after_the_passes(body, 
 
 def test_rivals_of_a_map_that_looks_right_look_right_as_well(body, mirrored, identity, given_alternatives):
     given_alternatives(identity)
-    settings = replace(REPAIR, suspicious=1.0, suspicious_area=1.0, doubtful=1.0, rounds=0)
+    judge = JudgeSettings(suspicious=1.0, suspicious_area=1.0)
+    settings = replace(REPAIR, rounds=0, non_isometric=10.0)
     for doubtful, margin, number in ((1.0, 100.0, 1), (1.0, 0.0, 0), (1.1, 100.0, 0), (100.0, 100.0, 1)):
         _, found = outcome(
             body,
             mirrored,
-            replace(settings, doubtful=doubtful, rival_margin=margin, non_isometric=10.0),
+            replace(settings, judge=replace(judge, doubtful=doubtful), rival_margin=margin),
             init="shot",
         )
         assert len(found.rivals) == number and found.suspicious == (doubtful == 1)
@@ -340,9 +341,9 @@ def test_default_repair_settings_are_those_of_the_preset_and_documented():
         (lambda: Stage(FeatureRegression(LEVELS), iterations=3), "require 4: leave iterations out"),
         (lambda: Stage(WaveletPreservation()).with_levels((3,)), "has no levels"),
         (lambda: RepairSettings(rounds=-1), "rounds is -1: give a whole number of at least 0"),
-        (lambda: RepairSettings(suspicious_area=3.0), "suspicious_area is 3.0: give a number from 0 to 1"),
-        (lambda: RepairSettings(suspicious=float("nan")), "suspicious is nan"),
-        (lambda: RepairSettings(uncertainty_weight=-1.0), "uncertainty_weight is -1.0"),
+        (lambda: JudgeSettings(suspicious_area=3.0), "suspicious_area is 3.0: give a number from 0 to 1"),
+        (lambda: JudgeSettings(suspicious=float("nan")), "suspicious is nan"),
+        (lambda: JudgeSettings(uncertainty_weight=-1.0), "uncertainty_weight is -1.0"),
     ],
 )
 def test_invalid_presets_and_settings_are_refused(make, fault):
@@ -354,7 +355,8 @@ def test_final_stages_run_once_after_repair(body, swapped, identity, monkeypatch
     """Repair and passes repeat only the stages before the final stage."""
     mesh, _ = body
     final = Stage(FeatureRegression((30, 40)))
-    repair = replace(REPAIR, non_isometric=0.0, coarse_from=1e3, passes=1, suspicious=1.0)
+    judge = JudgeSettings(suspicious=1.0)
+    repair = replace(REPAIR, judge=judge, non_isometric=0.0, coarse_from=1e3, passes=1)
     preset = Preset(repeated=(STAGE,), final=(final,), repair=repair)
     ran = []
 

@@ -23,7 +23,7 @@ from jaxsmw.geometry import SurfacePoints, cut_shortcuts, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, diagnose
 from jaxsmw.geometry.shortcuts import points_on_uncut
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.settings import JudgeSettings, RepairSettings
 from jaxsmw.matching.stages import PRESETS, Preset, Stage
 
 
@@ -174,7 +174,7 @@ def test_components_without_loops_do_no_harm(fused):
 
 SHORT = Stage(FeatureRegression((10, 15, 20)), number_of_descriptors=20)
 # Repair that changes no map.
-NEVER = RepairSettings(suspicious=1e3, compared=1e3, non_isometric=1e3)
+NEVER = RepairSettings(judge=JudgeSettings(suspicious=1e3), compared=1e3, non_isometric=1e3)
 REPAIRED = Preset(repeated=(SHORT,), repair=NEVER)
 
 

@@ -15,7 +15,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.search.trimming import trimmed, trimmed_stage
-from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.settings import JudgeSettings, RepairSettings
 from jaxsmw.matching.stages import Preset, Stage
 
 TRIMMED = Preset(
@@ -24,7 +24,7 @@ TRIMMED = Preset(
         Stage(Registration((30, 60))),
     ),
     final=(Stage(Registration((60, 60))),),
-    repair=RepairSettings(suspicious=10.0, suspicious_area=1.0),
+    repair=RepairSettings(judge=JudgeSettings(suspicious=10.0, suspicious_area=1.0)),
 )
 WHOLE = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=0))
 

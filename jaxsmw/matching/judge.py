@@ -23,7 +23,7 @@ from jaxsmw.matching.executor import Outcome, SpectralPair, StageRun
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.settings import (
     ExpectedErrorSettings,
-    RepairSettings,
+    JudgeSettings,
     ScoreSettings,
     WrongProbabilitySettings,
 )
@@ -350,7 +350,7 @@ class Judge:
 
     pair: Pair
     spectra: SpectralPair
-    settings: RepairSettings
+    settings: JudgeSettings
     measure_deformation: Callable[[Int64[np.ndarray, " m"]], float] | None = None
 
     def judged(self, outcome: Outcome) -> Scored:

@@ -155,19 +155,15 @@ class AlternativeSettings:
 
 
 @dataclass(frozen=True)
-class RepairSettings:
-    """The settings that determine when a map looks wrong, and how the map is repaired.
+class JudgeSettings:
+    """The settings by which maps are judged without ground truth.
 
-    The settings are passed as `Preset(first, repeated, repair=RepairSettings(...))` and take effect in
-    `jaxsmw.match`. docs/how_it_works.md explains distortions, faults, scores and the steps of the repair.
-    Tables and entries R1, R2, … are in `docs/research_log.md`. Areas are shares of X's area, from 0 to 1.
+    docs/how_it_works.md explains distortions, faults and scores. Areas are shares of X's area, from 0 to 1.
 
     **Attributes:**
 
     - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
       value is suspicious and is repaired. Correct maps between poses of one body have smaller distortions.
-    - `compared` (Table R40): a positive number, usually above 1. A map of two full shapes with a distortion
-      of at least this value is compared with alternative maps, even if it is not suspicious.
     - `suspicious_area` (Table R28): a map is also suspicious if a fault covers at least this share.
     - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
       value. A value below `suspicious` has no effect. Between non-isometric shapes, some correct maps have
@@ -176,10 +172,49 @@ class RepairSettings:
       and disappear by chance.
     - `excessive_area`: faults from this share on are not repaired. If most of a body is mapped upside down,
       the rest of the map does not suffice to find the correct map.
-    - `rounds` (Table R5): the largest number of rounds of repair, at least 0.
-    - `finalists`: the largest number of alternative maps that are refined at all vertices, at least 0.
     - `uncertainty_weight`, `deformation_weight` (Table R28): the weights of the uncertainty and of the
       deformation in the score, at least 0. The logarithm of the distortion has the weight 1.
+    - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
+
+    **Raises:** `InputError` if a number is out of its range.
+    """
+
+    suspicious: float = 1.12
+    suspicious_area: float = 0.02
+    doubtful: float = 1.15
+    negligible_area: float = 0.002
+    excessive_area: float = 0.5
+    uncertainty_weight: float = 30.0
+    deformation_weight: float = 5.0
+    scores: ScoreSettings = ScoreSettings()
+
+    def __post_init__(self) -> None:
+        for name in ("suspicious_area", "negligible_area", "excessive_area"):
+            check_number(name, getattr(self, name), most=1.0)
+        for name in ("uncertainty_weight", "deformation_weight"):
+            check_number(name, getattr(self, name))
+        for name in ("suspicious", "doubtful"):
+            check_number(name, getattr(self, name), positive=True)
+
+
+WITHOUT_REPAIR = JudgeSettings(suspicious=1.25, suspicious_area=1.0, doubtful=1.25)
+"""The settings by which `match` judges the map of a preset that has no repair. (Entry R25)"""
+
+
+@dataclass(frozen=True)
+class RepairSettings:
+    """The settings that determine how maps are repaired, and when a repaired map looks wrong.
+
+    The settings are passed as `Preset(first, repeated, repair=RepairSettings(...))` and take effect in
+    `jaxsmw.match`. docs/how_it_works.md explains the steps of the repair. Tables and entries R1, R2, … are in
+    `docs/research_log.md`.
+
+    **Attributes:**
+
+    - `compared` (Table R40): a positive number, usually above 1. A map of two full shapes with a distortion
+      of at least this value is compared with alternative maps, even if it is not suspicious.
+    - `rounds` (Table R5): the largest number of rounds of repair, at least 0.
+    - `finalists`: the largest number of alternative maps that are refined at all vertices, at least 0.
     - `non_isometric` (Table R29): a number of at least 0. Two full shapes whose map has an area-based shape
       difference of at least this value are refined by further passes.
     - `passes` (Table R29): the number of usual passes, at least 0.
@@ -211,21 +246,14 @@ class RepairSettings:
       smaller area. The faces at the boundary of the kept region add to this area.
     - `trimmed_levels` (Table R46): the levels of the last stage on a trimmed pair, if its refiner has levels.
     - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
-    - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
+    - `judge`: the settings by which maps are judged, a `JudgeSettings`.
 
     **Raises:** `InputError` if a number is out of its range.
     """
 
-    suspicious: float = 1.12
     compared: float = 1.05
-    suspicious_area: float = 0.02
-    doubtful: float = 1.15
-    negligible_area: float = 0.002
-    excessive_area: float = 0.5
     rounds: int = 4
     finalists: int = 4
-    uncertainty_weight: float = 30.0
-    deformation_weight: float = 5.0
     non_isometric: float = 0.14
     passes: int = 2
     pass_tolerance: float = 0.35
@@ -240,16 +268,12 @@ class RepairSettings:
     trimmed_area: float = 1.05
     trimmed_levels: tuple[int, ...] = (10, 30, 80, 200)
     alternatives: AlternativeSettings = AlternativeSettings()
-    scores: ScoreSettings = ScoreSettings()
+    judge: JudgeSettings = JudgeSettings()
 
     def __post_init__(self) -> None:
         for name in ("rounds", "finalists", "passes", "trims"):
             check_whole_number(name, getattr(self, name), 0)
-        for name in ("suspicious_area", "negligible_area", "excessive_area"):
-            check_number(name, getattr(self, name), most=1.0)
         for name in (
-            "uncertainty_weight",
-            "deformation_weight",
             "non_isometric",
             "pass_tolerance",
             "rival_margin",
@@ -258,11 +282,7 @@ class RepairSettings:
             "aligned_preference",
         ):
             check_number(name, getattr(self, name))
-        for name in ("suspicious", "compared", "doubtful", "trimmed_from", "trimmed_area"):
+        for name in ("compared", "trimmed_from", "trimmed_area"):
             check_number(name, getattr(self, name), positive=True)
         if not isinstance(self.cut_shortcuts, bool):
             raise InputError(f"cut_shortcuts is {self.cut_shortcuts!r}: give True or False.")
-
-
-WITHOUT_REPAIR = RepairSettings(suspicious=1.25, suspicious_area=1.0, doubtful=1.25)
-"""The settings by which `match` judges the map of a preset that has no repair. (Entry R25)"""

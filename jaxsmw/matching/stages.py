@@ -15,7 +15,7 @@ from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.shot import SHOT_DIMENSION
-from jaxsmw.matching.settings import WITHOUT_REPAIR, RepairSettings
+from jaxsmw.matching.settings import WITHOUT_REPAIR, JudgeSettings, RepairSettings
 
 
 class _FromRefiner(int):
@@ -283,9 +283,9 @@ class Preset:
         return Preset(first, repeated, final, self.repair, large)
 
     @property
-    def criteria(self) -> RepairSettings:
+    def criteria(self) -> JudgeSettings:
         """The settings by which maps are judged. Without repair, only grossly distorted maps look wrong."""
-        return self.repair or WITHOUT_REPAIR
+        return WITHOUT_REPAIR if self.repair is None else self.repair.judge
 
     @property
     def cuts_shortcuts(self) -> bool:

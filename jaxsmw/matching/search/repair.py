@@ -16,6 +16,7 @@ from jaxsmw.matching.executor import Outcome, SpectralPair, Start, run
 from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.alternatives import Alternatives
+from jaxsmw.matching.settings import RepairSettings
 from jaxsmw.matching.stages import Preset, Stage
 
 logger = logging.getLogger("jaxsmw")
@@ -51,7 +52,7 @@ def refine_and_repair(
     best = judge.judged(outcome)
     if repair is None or not best.successful:
         return best
-    repeater = _Repeater(prepared.spectra, preset.repeated, judge)
+    repeater = _Repeater(prepared.spectra, preset.repeated, judge, repair)
     has_alternatives = start.has_alternatives and repair.finalists > 0
     compares = has_alternatives and not prepared.pair.partial
     if best.suspicious:
@@ -59,8 +60,8 @@ def refine_and_repair(
             "limbs may be swapped (distortion %.3f; correct maps have at most %.2f, and faults on less than "
             "%.0f %% of the area)",
             best.distortion,
-            repair.suspicious,
-            100 * repair.suspicious_area,
+            repair.judge.suspicious,
+            100 * repair.judge.suspicious_area,
         )
     elif compares and best.distortion >= repair.compared:
         logger.info("the map is compared with alternative maps (distortion %.3f)", best.distortion)
@@ -107,7 +108,7 @@ def refine_further(prepared: PreparedPair, start: Start, preset: Preset, scored:
     aligned = start.is_rigid and not prepared.pair.partial
     if change < repair.non_isometric and not aligned:
         return scored
-    repeater = _Repeater(prepared.spectra, preset.repeated, judge)
+    repeater = _Repeater(prepared.spectra, preset.repeated, judge, repair)
     if change >= repair.without_creases_from:
         repeater = replace(repeater, spectra=_without_creases(repeater.spectra))
     passes = [repeater] * repair.passes
@@ -175,6 +176,7 @@ class _Repeater:
     spectra: SpectralPair
     stages: tuple[Stage, ...]
     judge: Judge
+    settings: RepairSettings
 
     def coarse(self, levels: tuple[int, ...]) -> _Repeater:
         """Return a repeater whose last stage has the given levels."""
@@ -192,8 +194,8 @@ class _Repeater:
         self, known: Sequence[Scored], alternatives: Iterable[Int64[np.ndarray, " m"]] = ()
     ) -> Scored:
         """Return the best of judged maps and alternative maps, repaired by rounds if it looks wrong."""
-        settings, maps = self.judge.settings, [*known]
-        for number, alternative in enumerate(islice(alternatives, settings.finalists), 1):
+        maps = [*known]
+        for number, alternative in enumerate(islice(alternatives, self.settings.finalists), 1):
             logger.info("alternative map %d ...", number)
             maps.append(self.judge.judged(self.repeated(Outcome(alternative))))
         best, *others = sorted(maps, key=self.judge.score)
@@ -202,7 +204,7 @@ class _Repeater:
             # than a wrong map without faults.
             best, *others = sorted(map(self._without_faults, (best, *others[:1])), key=self.judge.score)
         wrong = not self.judge.looks_right(best)
-        limit = self.judge.score(best) + settings.rival_margin
+        limit = self.judge.score(best) + self.settings.rival_margin
         close = (one for one in others if self.judge.score(one) <= limit)
         rivals = tuple(one for one in close if wrong or self.judge.looks_right(one))
         left = "; limbs may still be swapped" if wrong else ""
@@ -212,7 +214,7 @@ class _Repeater:
     def _without_faults(self, scored: Scored) -> Scored:
         """Run rounds, each without the vertices of one kind of fault, and return the best map."""
         best = last = scored
-        for done in range(self.judge.settings.rounds):
+        for done in range(self.settings.rounds):
             if not (last.successful and best.suspicious):
                 break
             if not (faults := self.judge.faults(last.pointwise_map)):

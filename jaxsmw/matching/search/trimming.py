@@ -95,13 +95,13 @@ def match_trimmed(
     **Returns:** The trimmed pair and its map, or None if the pair is not trimmed. The attribute `suspicious`
     is copied from the given map.
     """
-    following = trimmed_stage(prepared.pair, preset)
-    if following is None or not scored.successful:
+    repair, following = preset.repair, trimmed_stage(prepared.pair, preset)
+    if repair is None or following is None or not scored.successful:
         return None
     trimmed_match, given = None, prepared.pair
-    for _ in range(preset.criteria.trims):
+    for _ in range(repair.trims):
         reverse = extend_to_unreferenced(prepared.pair.mesh_y, scored.outcome.last.reverse_map())
-        pair = trimmed(given, _everywhere(prepared, scored), reverse, preset.criteria.trimmed_area)
+        pair = trimmed(given, _everywhere(prepared, scored), reverse, repair.trimmed_area)
         again = _matched_again(prepared, pair, following, preset, scored)
         if again is None:
             break
