@@ -138,5 +138,5 @@ def test_a_stage_that_was_compiled_ahead_is_not_compiled_again():
     programs = compilation._compiled(refine, jax.default_backend())._programs
     before = set(programs)
     compile_stage(stage, n, n)
-    (outcome,) = run([stage], SpectralPair(spectrum, spectrum), [Start(np.arange(n))])
+    outcome = run([stage], SpectralPair(spectrum, spectrum), Start(np.arange(n)))
     assert outcome.successful and len(set(programs) - before) == 1
