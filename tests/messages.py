@@ -1,7 +1,9 @@
 """Checks of messages that look for what a message must name, and not for its words."""
 
-from collections.abc import Iterator
+import tracemalloc
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -20,3 +22,22 @@ def refused(*facts: str, error: type[Exception] = InputError) -> Iterator[None]:
     with pytest.raises(error) as caught:
         yield
     assert_names(str(caught.value), *facts)
+
+
+def refusal(read: Callable[[Path], object], path: Path, *, most_memory: float) -> str:
+    """Return why a file is refused, in one sentence that names the file, the fault and the cure.
+
+    Reading may take at most `most_memory` bytes.
+    """
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError) as caught:
+            read(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ") and message.endswith(".") and message.count(": ") >= 2, message
+    assert "\n" not in message and len(message) < 400 + len(str(path))
+    assert peak < most_memory
+    return message.removeprefix(f"{path}: ")

@@ -14,7 +14,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.matching import executor, starts
+from jaxsmw.runtime import nearest
 from jaxsmw.runtime.cache import recomputing
 
 # `_dense` solves small meshes. The other solvers need more than 400 vertices and few eigenvectors.
@@ -108,7 +108,7 @@ def test_a_wrong_search_is_refused(monkeypatch, fault):
     )
     options = {"preset": Stage(number_of_eigenvectors=K), "mirror": "no"}
     assert len(jaxsmw.match(mesh, other, **options).pointwise_map) == len(mesh.vertices)
-    monkeypatch.setattr(executor, "nearest_neighbor", fault(executor.nearest_neighbor))
+    monkeypatch.setattr(nearest, "nearest_neighbor", fault(nearest.nearest_neighbor))
     with pytest.raises(ArithmeticError, match=r"wrong nearest neighbours.*install jax and jaxlib again"):
         jaxsmw.match(mesh, other, **options)
 
@@ -119,10 +119,10 @@ def test_ties_and_masks_are_no_fault():
     usable = np.arange(10, 40)
     squared = ((points[:, None] - points[usable]) ** 2).sum(axis=2)
     found = usable[squared.argmin(axis=1)]
-    starts._check_nearest(points, points, usable, found)
+    nearest.check_nearest(points, points, usable, found)
     tied = np.where(found == 20, 29, found)
     assert (tied != found).any()
-    starts._check_nearest(points, points, usable, tied)
+    nearest.check_nearest(points, points, usable, tied)
     masked = np.where(np.arange(40) == 0, 0, found)
     with pytest.raises(ArithmeticError):
-        starts._check_nearest(points, points, usable, masked)
+        nearest.check_nearest(points, points, usable, masked)

@@ -42,7 +42,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.meshes import read_mesh, write_mesh
 from jaxsmw.matching.match import match
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.stages import PRESETS, Stage, choose_preset
 from jaxsmw.report.texture import TEXTURE_FILES
 from jaxsmw.wording import percentage
 
@@ -280,19 +280,23 @@ def test_the_report_has_all_files_settings_and_maps(run, pair, tmp_path):
     assert refined["functional"] != initial["functional"] and refined["map"] != initial["map"]
 
 
-@pytest.mark.slow
-def test_the_default_preset_is_accurate_and_options_select_paper(run, pair, tmp_path):
-    maps = {}
-    common = ("--init", "shot")  # from the initial map "aligned", all presets find the same map
+def test_the_default_preset_is_accurate_and_options_select_paper(run, pair, tmp_path, monkeypatch):
+    chosen = []
+
+    def recorded(*_, preset, **__):
+        chosen.append(choose_preset(preset))
+        raise ArithmeticError("recorded")
+
+    monkeypatch.setattr("jaxsmw.matching.match.match", recorded)
+    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
     for options in ((), ("--preset", "accurate"), ("--preset", "paper"), ("--eigenvectors", "100"),
                     ("--preset", "fast"), ("--samples", "500")):  # fmt: skip
-        files = (pair / "x.off", pair / "y.ply", "--output", tmp_path / "m")
-        outcome = run("match", *files, *common, *options)
-        assert outcome.code == 0, outcome.errors
-        maps[options] = (tmp_path / "m").read_text()
-    default, accurate, paper, changed, fast, sampled = maps.values()
-    assert default == accurate != paper == changed != fast == sampled != default
-    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--quiet")
+        assert run(*call, *options).code == 1
+    default, accurate, paper, changed, fast, sampled = chosen
+    assert default == accurate == PRESETS["accurate"]
+    assert paper == changed == PRESETS["paper"]
+    assert fast == sampled == PRESETS["fast"]
+    assert default != paper != fast
     outcome = run(*call, "--preset", "accurate", "--stop-when-unchanged")
     assert_refused(outcome, naming="--stop-when-unchanged: changes the paper's method")
 

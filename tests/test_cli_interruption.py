@@ -64,7 +64,10 @@ def assert_interrupted(
 
 @pytest.mark.parametrize(
     "module",
-    ["argparse", "jaxsmw.cli.match", "numpy", "jax", "jaxlib._jax", "equinox", "scipy.sparse", "igl"],
+    first_always(
+        ["argparse", "numpy", "jaxlib._jax", "jaxsmw.cli.match", "jax", "equinox", "scipy.sparse", "igl"],
+        always=3,
+    ),
 )
 def test_an_interrupted_import_ends_with_one_line(pair, tmp_path, module):
     program = f"""

@@ -251,7 +251,6 @@ def test_hostile_names_are_drawn_as_plain_text() -> None:
     assert boxes[1].x1 < boxes[3].x0
 
 
-@pytest.mark.usefixtures("small")
 @pytest.mark.parametrize(
     ("names", "shown"),
     [
@@ -263,8 +262,14 @@ def test_hostile_names_are_drawn_as_plain_text() -> None:
         (("", "mesh"), ("", "mesh")),
     ],
 )
-def test_titles_tell_files_of_one_name_apart(names: tuple[str, str], shown: tuple[str, str]) -> None:
+def test_short_names_tell_files_of_one_name_apart(names: tuple[str, str], shown: tuple[str, str]) -> None:
     assert tuple(short_names(names)) == shown
+
+
+@pytest.mark.usefixtures("small")
+def test_titles_are_short_names() -> None:
+    names = "/data/s1/left/mesh.off", "/data/s2/left/mesh.off"
+    shown = short_names(names)
     bodies = [replace(TALL, name=name) for name in names]
     identity = np.arange(len(TALL.vertices))
     figure = draw_correspondence(*bodies, identity, errors={"Error": np.zeros(len(identity))})

@@ -315,6 +315,7 @@ def multiplies(found: Correspondence, bank: FilterBank) -> bool:
     return np.allclose(found.functional_map, encode(before, x, y) * kernel, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_history_ends_when_the_map_no_longer_changes(pair):
     patient = replace(STAGE, iterations=30, stop_when_unchanged=True)
     result = match(*pair[:2], preset=patient, history=True)

@@ -103,7 +103,7 @@ def by_definition(x: Spectrum, y: Spectrum, t, levels):
     return t, queries, database
 
 
-@pytest.mark.parametrize("number_of_descriptors", [0, 5])
+@pytest.mark.parametrize("number_of_descriptors", first_always([5, 0]))
 def test_refinement_agrees_with_the_definition(pair, number_of_descriptors):
     x, y, initial_map, *_ = pair
     if number_of_descriptors:

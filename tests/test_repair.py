@@ -109,8 +109,8 @@ def test_swapped_limbs_are_repaired(body, swapped):
 
 def test_padding_changes_nothing(body, swapped, monkeypatch):
     _, found = outcome(body, swapped)
-    padded_size = executor.padded_size
-    monkeypatch.setattr(executor, "padded_size", lambda size: padded_size(size) + 20)
+    program_size = executor.program_size
+    monkeypatch.setattr(executor, "program_size", lambda size: program_size(size) + 20)
     _, more = outcome(body, swapped)
     padded, padded_more = (one.outcome.last.refinement.pointwise_map.shape[0] for one in (found, more))
     assert padded_more == padded + 20

@@ -33,18 +33,22 @@ def check_against_brute_force(search, m, n, d, *, draws):
 # Many sizes are close to multiples of the block size (128) or the chunk size (64).
 @pytest.mark.parametrize(
     ("m", "n", "d"),
-    [
-        (1, 1, 1),
-        (1, 63, 3),
-        (2, 64, 20),
-        (127, 65, 3),
-        (128, 130, 1),
-        (129, 500, 20),
-        (600, 1, 3),
-        (255, 64, 1),
-        (256, 128, 3),
-        (257, 63, 20),
-    ],
+    first_always(
+        [
+            (1, 1, 1),
+            (127, 65, 3),
+            (128, 130, 1),
+            (257, 63, 20),
+            (1, 63, 3),
+            (2, 64, 20),
+            (129, 500, 20),
+            (600, 1, 3),
+            (255, 64, 1),
+            (256, 128, 3),
+        ],
+        always=4,
+        names=3,
+    ),
 )
 def test_equals_brute_force(m, n, d):
     check_against_brute_force(nearest_neighbor, m, n, d, draws=10)

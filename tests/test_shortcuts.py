@@ -139,6 +139,7 @@ def test_surfaces_without_handles_stay_unchanged(separate):
     assert cut_shortcuts(punched) is punched
 
 
+@pytest.mark.slow
 def test_porous_surfaces_stay_unchanged(fused, monkeypatch):
     def copies(number: int) -> Mesh:
         shifts = 4.0 * np.arange(number)[:, None, None] * [1, 0, 0]
@@ -223,6 +224,7 @@ def test_presets_fit_the_cut_meshes(fused, separate, monkeypatch):
     assert found.preset.stages[0].number_of_samples is None
 
 
+@pytest.mark.slow
 def test_surface_points_as_initial_map_refer_to_the_given_faces(fused, separate):
     first = match(separate, fused, preset=REPAIRED, init="shot", mirror="no")
     points = first.surface_points()

@@ -134,6 +134,7 @@ def test_registered_meshes_keep_the_shapes_of_small_components(with_counterparts
             assert lengths[0] == pytest.approx(0.1, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_match_sends_eyes_to_eyes_in_both_directions():
     mesh = with_eyes()
     found = jaxsmw.match(mesh, mesh, preset="fast", init=np.arange(810))

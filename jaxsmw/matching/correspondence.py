@@ -21,7 +21,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
 from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map
-from jaxsmw.matching.executor import SpectralPair, StageRun, Start, nearest_points
+from jaxsmw.matching.executor import SpectralPair, StageRun, Start
 from jaxsmw.matching.judge import Scored, estimate_error, overlap, wrong_probability
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -29,6 +29,7 @@ from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.stages import Preset
 from jaxsmw.matching.starts import INITIAL_MAPS
 from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.nearest import nearest_points
 from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, register_mesh
 
 

@@ -19,20 +19,10 @@ from jaxtyping import Array, Bool, Float, Int, Int64
 from jaxsmw.core.refinement import Refinement, RefineSettings, refine
 from jaxsmw.core.refiner import Problem, Refiner, Samples, State, recover_reverse
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.core.triangles import nearest_point_on_candidates
 from jaxsmw.matching.stages import Stage
-from jaxsmw.runtime.batches import pad_rows, padded_size, refine_pairs
+from jaxsmw.runtime.batches import pad_rows, program_size, refine_pairs
 from jaxsmw.runtime.compilation import compile_ahead, compiled
-
-# Shapes with more vertices than this number are not padded, because padding would need too much memory.
-_PADDED_UP_TO = 50_000
-
-
-def program_size(number_of_vertices: int) -> int:
-    """Return the number of vertices to which a shape is padded; large shapes are not padded."""
-    return number_of_vertices if number_of_vertices > _PADDED_UP_TO else padded_size(number_of_vertices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -356,52 +346,3 @@ def _outline(stage: Stage, number_of_vertices: int) -> Spectrum:
     described = spectrum.with_descriptors(jnp.zeros((n, d)) if d else None)
     creased = described.with_crease_eigenvectors(jnp.zeros((n, c)) if c else None)
     return creased.with_positions(jnp.zeros((n, 3)), jnp.zeros((n, 3)))
-
-
-def nearest_rows(
-    queries: Float[np.ndarray, "a d"], database: Float[np.ndarray, "b d"], mask: Bool[np.ndarray, " b"]
-) -> Int64[np.ndarray, " a"]:
-    """Return the row of the nearest point of the database for each query (a,), 0-based.
-
-    **Arguments:**
-
-    - `queries`, `database`: the points, (a, d) and (b, d), of the same float type.
-    - `mask`: the rows of the database that may be returned (b,).
-    """
-
-    def padded(rows: np.ndarray) -> Array:
-        return jax.device_put(pad_rows(rows, padded_size(len(rows))))
-
-    nearest = compiled(nearest_neighbor)(padded(queries), padded(database), database_mask=padded(mask))
-    return np.asarray(nearest)[: len(queries)].astype(np.int64)
-
-
-def nearest_points(
-    queries: Float[np.ndarray, "m d"],
-    database: Float[np.ndarray, "n d"],
-    faces: Int64[np.ndarray, "f 3"],
-    rows: Int64[np.ndarray, " c"],
-    candidates: Int64[np.ndarray, " c"],
-) -> tuple[Int64[np.ndarray, " m"], Float[np.ndarray, "m 3"]]:
-    """Return the nearest point on given candidate triangles for each query.
-
-    **Arguments:**
-
-    - `queries`, `database`: the queries (m, d), and the corners of the triangles (n, d).
-    - `faces`: the triangles (f, 3), as rows of the database.
-    - `rows`, `candidates`: pairs of a query (c,) and a triangle (c,) that is a candidate for it.
-
-    **Returns:** The triangle (m,), and the barycentric weights (m, 3) of the point on it.
-    """
-    padding = padded_size(len(rows)) - len(rows)
-    rows, candidates = (np.pad(values, (0, padding), "edge") for values in (rows, candidates))
-    padded = (
-        pad_rows(queries, program_size(len(queries))),
-        pad_rows(database, program_size(len(database))),
-        pad_rows(faces, padded_size(len(faces))),
-        rows,
-        candidates,
-    )
-    points = compiled(nearest_point_on_candidates)(*jax.device_put(padded))
-    nearest, weights = (np.asarray(values)[: len(queries)] for values in points)
-    return nearest.astype(np.int64), weights.astype(np.float64)

@@ -422,16 +422,22 @@ class PreparedPair:
     @cached_property
     def shot(self) -> tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]:
         """SHOT of X and Y at the compared vertices, with the usual radius."""
-        return self._shot(SHOT_RADIUS)
+        return self.shot_of_radius(SHOT_RADIUS)
 
-    def _shot(self, radius: float) -> tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]:
-        """Compute SHOT of both shapes, with a radius in `Pair.units_of_length`."""
+    def shot_of_radius(
+        self, radius: float, samples: tuple[SurfaceSamples, SurfaceSamples] | None = None
+    ) -> tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]:
+        """Compute SHOT of X and Y, with a radius in `Pair.units_of_length`.
 
-        def of_one(argument: tuple[PreparedShape, float]) -> Float[np.ndarray, "a d"]:
-            shape, unit = argument
-            return shape.shot(radius * unit / shape.mesh.area**0.5)
+        SHOT is computed at `samples`, by default at the compared vertices.
+        """
 
-        return side_by_side(of_one, *zip(self.shapes, self.pair.units_of_length, strict=True))
+        def of_one(argument: tuple[Mesh, float, SurfaceSamples | None]) -> Float[np.ndarray, "a d"]:
+            mesh, unit, at = argument
+            return shot_descriptors(mesh, radius=radius * unit / mesh.area**0.5, samples=at)
+
+        at = samples or (self.x.compared, self.y.compared)
+        return side_by_side(of_one, *zip(self.pair.meshes, self.pair.units_of_length, at, strict=True))
 
     def mirror(self) -> PreparedPair:
         """Return the prepared pair with the mirror image of X in place of X. There are no descriptors yet."""
@@ -458,7 +464,7 @@ class PreparedPair:
             with suppress(InputError), warnings.catch_warnings():
                 # A mesh that is too coarse for the smaller radius still has descriptors of the usual radius.
                 warnings.simplefilter("ignore")
-                shot.append(self._shot(FINE_RADIUS))
+                shot.append(self.shot_of_radius(FINE_RADIUS))
         dtype = self.x.spectrum.eigenvectors.dtype
         rows = np.hstack([np.concatenate(both) for both in shot], dtype=dtype)
         weight = np.concatenate(weights(self.shapes)).astype(dtype)

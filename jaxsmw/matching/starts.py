@@ -23,9 +23,10 @@ from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, check_surface_points
-from jaxsmw.matching.executor import Start, nearest_rows
+from jaxsmw.matching.executor import Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.runtime.nearest import nearest_rows
 
 INITIAL_MAPS: tuple[InitialMap, ...] = get_args(InitialMap)
 """The names of the initial maps."""
@@ -270,44 +271,10 @@ def _check_landmarks(pair: Pair, landmarks: np.ndarray) -> None:
 def nearest_map(prepared: PreparedPair, features: _Features) -> Int64[np.ndarray, " m"]:
     """Compute a pointwise map of all vertices of X (m,) by nearest-neighbour search in feature space.
 
-    **Raises:** `ArithmeticError` if some of the nearest rows are not the nearest; see `_check_nearest`.
+    **Raises:** `ArithmeticError` if the search is wrong; see `jaxsmw.runtime.nearest.check_nearest`.
     """
     x, y = prepared.shapes
     dtype, mask = y.spectrum.eigenvectors.dtype, np.asarray(y.compared_spectrum.mask)
     of_x, of_y = (of_shape.astype(dtype) for of_shape in features)
     nearest = nearest_rows(of_x, of_y, mask)
-    _check_nearest(*features, np.flatnonzero(mask), nearest)
     return x.everywhere(nearest if y.compared is None else y.compared.vertices[nearest])
-
-
-# The number of queries that `_check_nearest` checks, and the tolerance relative to the squared norms.
-_CHECKED_QUERIES, _TOLERANCE = 32, 1e-4
-
-
-def _check_nearest(
-    queries: Float[np.ndarray, "a d"],
-    database: Float[np.ndarray, "b d"],
-    usable: Int64[np.ndarray, " u"],
-    nearest: Int64[np.ndarray, " a"],
-) -> None:
-    """Check a few results of a nearest-neighbour search in float64, because all maps depend on this search.
-
-    A broken installation of JAX, a broken processor or a compiler fault would otherwise give a wrong map
-    without a message. Points with NaN are not checked here.
-
-    **Raises:** `ArithmeticError` if a result is not usable, or is farther than the nearest row by more than
-    the rounding errors of float32.
-    """
-    rows = np.linspace(0, len(queries) - 1, _CHECKED_QUERIES).astype(int)
-    few, all_rows = queries[rows].astype(np.float64), database[usable].astype(np.float64)
-    sizes, size = (all_rows**2).sum(axis=1), (few**2).sum(axis=1)
-    if not (np.isfinite(sizes).all() and np.isfinite(size).all()):
-        return
-    squared = size[:, None] - 2 * few @ all_rows.T + sizes
-    reached = ((few - database[nearest[rows]].astype(np.float64)) ** 2).sum(axis=1)
-    tolerance = _TOLERANCE * (size + sizes.max())
-    if not (np.isin(nearest[rows], usable).all() and (reached <= squared.min(axis=1) + tolerance).all()):
-        raise ArithmeticError(
-            "JAX returned wrong nearest neighbours, so numerical results of this installation cannot be "
-            "trusted: install jax and jaxlib again, and unset XLA_FLAGS and JAX_PLATFORMS."
-        )

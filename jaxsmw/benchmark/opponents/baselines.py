@@ -63,12 +63,11 @@ class PublishedMaps(Method):
     """A method that reads the map of each pair from a directory; see `read_published_map`."""
 
     directory: Path
+    reference: str = field(init=False)
     number_of_eigenvectors: int = 1  # the smallest number that a benchmark can compute
 
-    @property
-    def reference(self) -> str:  # type: ignore[override]
-        """The text that is printed with the results, with the name of the directory."""
-        return f"maps in {self.directory.name}, computed elsewhere"
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "reference", f"maps in {self.directory.name}, computed elsewhere")
 
     def __call__(self, pair: MethodInput) -> PointwiseMap:
         assert pair.meshes is not None
@@ -135,11 +134,11 @@ class Matched(Method):
 
     reference: str
     preset: PresetName
+    number_of_eigenvectors: int = field(init=False)
 
-    @property
-    def number_of_eigenvectors(self) -> int:  # type: ignore[override]
-        """The largest number of eigenvectors that a stage of the preset uses."""
-        return PRESETS[self.preset].sizes.number_of_eigenvectors
+    def __post_init__(self) -> None:
+        number = PRESETS[self.preset].sizes.number_of_eigenvectors
+        object.__setattr__(self, "number_of_eigenvectors", number)
 
     def __call__(self, pair: MethodInput) -> PointwiseMap:
         return self._match(pair).pointwise_map

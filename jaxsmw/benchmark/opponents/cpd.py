@@ -43,11 +43,9 @@ functional map and recovers a pointwise map.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
 from jax import lax
@@ -132,12 +130,49 @@ def coherent_point_drift(
         )
     data_mask = jnp.ones(data.shape[0], bool) if data_mask is None else data_mask
     centroids_mask = jnp.ones(centroids.shape[0], bool) if centroids_mask is None else centroids_mask
-    settings = [jnp.asarray(value, data.dtype) for value in (width, stiffness, outliers, tolerance)]
-    return _drift(data, centroids, data_mask, centroids_mask, *settings, jnp.int32(iterations), rank=rank)
+    x, mean, scale = _normalized(data, data_mask)
+    y, _, _ = _normalized(centroids, centroids_mask)
+    factor = kernel_factor(y, centroids_mask, width=width, rank=rank)
+    d, points = data.shape[1], jnp.sum(data_mask).astype(x.dtype)
+
+    def step(state: _DriftState) -> _DriftState:
+        moved = y + product(factor, state.coefficients)
+        expected = _expectation(x, data_mask, moved, centroids_mask, state.variance, outliers)
+        objective = (
+            stiffness / 2 * jnp.sum(state.coefficients**2)
+            + d / 2 * points * jnp.log(state.variance)
+            - expected.log_likelihood
+        )
+        coefficients = _maximization(expected, y, factor, stiffness * state.variance)
+        return _DriftState(
+            coefficients,
+            _variance(expected, x, y + product(factor, coefficients)),
+            objective,
+            change=jnp.abs(1 - state.objective / objective),
+            iterations=state.iterations + 1,
+        )
+
+    def goes_on(state: _DriftState) -> Bool[Array, ""]:
+        drifting = (state.change > tolerance) & (state.variance > _LEAST_VARIANCE)
+        return drifting & (state.iterations < iterations)
+
+    infinite = jnp.asarray(jnp.inf, x.dtype)
+    initial = _DriftState(
+        jnp.zeros((rank, d), x.dtype),
+        # The initial variance is the mean squared distance between data and centroids, divided by d. This
+        # value is 2 / d, because both sets have zero mean and a mean squared norm of 1.
+        jnp.asarray(2 / d, x.dtype),
+        objective=infinite,
+        change=infinite,
+        iterations=jnp.asarray(0, jnp.int32),
+    )
+    end = lax.while_loop(goes_on, step, initial)
+    moved = mean[None, :] + scale * (y + product(factor, end.coefficients))
+    return Drift(moved, end.variance, end.iterations)
 
 
 def kernel_factor(
-    points: Float[Array, "n d"], mask: Bool[Array, " n"], *, width: float | Float[Array, ""], rank: int
+    points: Float[Array, "n d"], mask: Bool[Array, " n"], *, width: float, rank: int
 ) -> Float[Array, "n rank"]:
     """Return a factor L (n, rank) such that `L L^T` approximates the Gaussian kernel matrix of points.
 
@@ -229,62 +264,6 @@ class DriftRecovery(WaveletPreservation):
         )
 
 
-@partial(jax.jit, static_argnames="rank")
-def _drift(
-    data: Float[Array, "m d"],
-    centroids: Float[Array, "n d"],
-    data_mask: Bool[Array, " m"],
-    centroids_mask: Bool[Array, " n"],
-    width: Float[Array, ""],
-    stiffness: Float[Array, ""],
-    outliers: Float[Array, ""],
-    tolerance: Float[Array, ""],
-    iterations: Int32[Array, ""],
-    *,
-    rank: int,
-) -> Drift:
-    """Compute `coherent_point_drift`. JAX compiles one program for each combination of sizes and rank."""
-    x, mean, scale = _normalized(data, data_mask)
-    y, _, _ = _normalized(centroids, centroids_mask)
-    factor = kernel_factor(y, centroids_mask, width=width, rank=rank)
-    d, points = data.shape[1], jnp.sum(data_mask).astype(x.dtype)
-
-    def step(state: _DriftState) -> _DriftState:
-        moved = y + product(factor, state.coefficients)
-        expected = _expectation(x, data_mask, moved, centroids_mask, state.variance, outliers)
-        objective = (
-            stiffness / 2 * jnp.sum(state.coefficients**2)
-            + d / 2 * points * jnp.log(state.variance)
-            - expected.log_likelihood
-        )
-        coefficients = _maximization(expected, y, factor, stiffness * state.variance)
-        return _DriftState(
-            coefficients,
-            _variance(expected, x, y + product(factor, coefficients)),
-            objective,
-            change=jnp.abs(1 - state.objective / objective),
-            iterations=state.iterations + 1,
-        )
-
-    def goes_on(state: _DriftState) -> Bool[Array, ""]:
-        drifting = (state.change > tolerance) & (state.variance > _LEAST_VARIANCE)
-        return drifting & (state.iterations < iterations)
-
-    infinite = jnp.asarray(jnp.inf, x.dtype)
-    initial = _DriftState(
-        jnp.zeros((rank, d), x.dtype),
-        # The initial variance is the mean squared distance between data and centroids, divided by d. This
-        # value is 2 / d, because both sets have zero mean and a mean squared norm of 1.
-        jnp.asarray(2 / d, x.dtype),
-        objective=infinite,
-        change=infinite,
-        iterations=jnp.asarray(0, jnp.int32),
-    )
-    end = lax.while_loop(goes_on, step, initial)
-    moved = mean[None, :] + scale * (y + product(factor, end.coefficients))
-    return Drift(moved, end.variance, end.iterations)
-
-
 class _DriftState(NamedTuple):
     """The state of EM; `objective` is its value before the last M-step, and `change` its relative change."""
 
@@ -321,7 +300,7 @@ def _expectation(
     centroids: Float[Array, "n d"],
     centroids_mask: Bool[Array, " n"],
     variance: Float[Array, ""],
-    outliers: Float[Array, ""],
+    outliers: float,
 ) -> _Expected:
     """Compute the E-step for one block of data points at a time. Shifted logarithms prevent underflow."""
     (m, d), n = data.shape, centroids.shape[0]

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
-from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
+from jaxsmw.geometry.shot import SHOT_RADIUS
 from jaxsmw.matching.executor import SpectralPair, Start, run
 from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.preparation import PreparedPair, PreparedShape
@@ -168,9 +168,12 @@ class Alternatives:
     def _initial_maps(self) -> Iterator[SampleMap]:
         """Yield the initial maps, each from the samples of X to the samples of Y."""
         settings = self.settings.alternatives
-        usual = self._usual_shot()
+        usual, at = self._usual_shot(), (self.x.samples, self.y.samples)
         for radii in settings.radii:
-            of_x, of_y = zip(*(usual if r == 1 else self._shot(r) for r in radii), strict=True)
+            of_x, of_y = zip(
+                *(usual if r == 1 else self.prepared.shot_of_radius(r * SHOT_RADIUS, at) for r in radii),
+                strict=True,
+            )
             yield np.argmin(_squares(np.hstack(of_x), np.hstack(of_y)), axis=1)
         if self.pair.partial:
             return
@@ -221,16 +224,6 @@ class Alternatives:
                 self.prepared.shot, self.prepared.shapes, (self.x, self.y), strict=True
             )
         )
-
-    def _shot(self, multiple: int) -> tuple[Float[np.ndarray, "s d"], Float[np.ndarray, "t d"]]:
-        """Compute SHOT with a multiple of the usual radius at all samples."""
-
-        def of_one(argument: tuple[Proxy, float]) -> Float[np.ndarray, "s d"]:
-            proxy, unit = argument
-            radius = multiple * SHOT_RADIUS * unit / proxy.mesh.area**0.5
-            return shot_descriptors(proxy.mesh, radius=radius, samples=proxy.samples)
-
-        return side_by_side(of_one, *zip((self.x, self.y), self.pair.units_of_length, strict=True))
 
     def _refined(
         self,
