@@ -47,7 +47,9 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.meshes import read_mesh
-from jaxsmw.matching.executor import SpectralPair, Start, padded_map, run_batches
+from jaxsmw.matching.executor import padded_map, run_batches
+from jaxsmw.matching.outcome import Start
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, PresetName
 from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
 
@@ -237,7 +239,7 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
         spectra, first = tasks[0]
         seen = spectra.padded.seen_by(stage)
         start = padded_map(first.pointwise_map)
-        traced = partial(refine, samples=seen.samples, **stage.settings)
+        traced = partial(refine, samples=seen.samples, **stage.settings())
         products += matrix_products(traced, *seen.both, start)
     floor = time_of_products(products, count, options.repeats)
     yield (

@@ -96,7 +96,6 @@ def measure(
         direct, other = map(scores_of, (result, reflected))
         scores = {name: (direct[name], other[name]) for name in direct}
     expected = result.expected_error()
-    assert result.distortion is not None
     return Measured(
         error.errors[finite],
         expected[error.source_vertices][finite],

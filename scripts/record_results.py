@@ -289,7 +289,7 @@ def program(stage: Stage, m: int, n: int, part: bool, history: bool, data: Path)
         y,
         jnp.zeros(m, jnp.int32),
         samples=None if samples is None else (jnp.zeros(samples, int),) * 2,
-        **{**stage.settings, "partial": part, "history": history},
+        **{**stage.settings(partial=part), "history": history},
     )
     return {"program": digest(without_names(traced.as_text()))}
 

@@ -18,8 +18,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
-from jaxsmw.matching.executor import Outcome
 from jaxsmw.matching.judge import Judge, Scored
+from jaxsmw.matching.outcome import Outcome
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.alternatives import Alternatives

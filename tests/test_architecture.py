@@ -45,6 +45,23 @@ def test_layers_import_only_from_lower_layers():
     assert not upwards
 
 
+def test_matching_is_read_from_the_top():
+    """The package lists its modules in an order in which each imports only from modules above it."""
+    import jaxsmw.matching
+
+    listed = [line.split(":")[0] for line in jaxsmw.matching.__doc__.splitlines() if line.startswith("- `")]
+    order = [name for line in listed for name in line.replace("-", "").replace("`", "").split(", ")]
+    order = [name.strip() for name in order]
+    inside = {
+        module.split(".")[1]: {other.split(".")[1] for other in others if other.startswith("matching.")}
+        for module, others in imported_modules().items()
+        if module.startswith("matching.") and not module.startswith("matching.search.")
+    }
+    assert set(order) == {*inside, "search"}
+    for module, others in inside.items():
+        assert all(order.index(other) < order.index(module) for other in others)
+
+
 def test_every_module_belongs_to_a_layer_or_a_namespace():
     assert {module.split(".")[0] for module in imported_modules()} <= {*LAYERS, *NAMESPACES}
 

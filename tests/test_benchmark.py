@@ -36,7 +36,7 @@ from jaxsmw.benchmark.tables import _introduction, latex_table, markdown, markdo
 from jaxsmw.cli.run import run_command
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.meshes import write_mesh
-from jaxsmw.matching.executor import SpectralPair
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.runtime.provenance import measured_code
 from jaxsmw.runtime.workers import open_executor
 

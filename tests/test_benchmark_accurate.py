@@ -130,7 +130,7 @@ def test_the_seconds_leave_out_steps_whose_results_all_methods_share(monkeypatch
     def matched(*meshes, **options):
         cached("spectrum", inputs, lambda: calls.append(1) or {"values": np.zeros(1)})
         shared = {"eigenbases": 100.0, "initial map": 50.0, "descriptors": 20.0, "samples": 10.0}
-        own = {"mirror test": 1.0, "crease eigenvectors": 2.0, "refinement": 4.0, "expected error": 8.0}
+        own = {"mirror test": 1.0, "crease eigenvectors": 2.0, "refinement": 4.0, "choice of start": 8.0}
         return SimpleNamespace(pointwise_map=np.arange(3), seconds=shared | own)
 
     monkeypatch.setattr("jaxsmw.benchmark.opponents.baselines.match", matched)

@@ -32,9 +32,11 @@ from jaxsmw.core.results import RESULTS
 from jaxsmw.creature import creature
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching.executor import SpectralPair, Start, run, run_batches
+from jaxsmw.matching.executor import run, run_batches
+from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.preparation import prepare_shapes
 from jaxsmw.matching.search.chirality import Decision
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
 
 

@@ -12,7 +12,9 @@ from jaxsmw import compiler_options
 from jaxsmw.core.refinement import refine
 from jaxsmw.functional_maps import nearest_neighbor
 from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.matching.executor import SpectralPair, Start, compile_stage, run
+from jaxsmw.matching.executor import compile_stage, run
+from jaxsmw.matching.outcome import Start
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime import compilation
 from jaxsmw.runtime.compilation import compile_ahead, compiled, release_programs
@@ -138,5 +140,5 @@ def test_a_stage_that_was_compiled_ahead_is_not_compiled_again():
     programs = compilation._compiled(refine, jax.default_backend())._programs
     before = set(programs)
     compile_stage(stage, n, n)
-    (outcome,) = run([stage], SpectralPair(spectrum, spectrum), [Start(np.arange(n))])
+    outcome = run([stage], SpectralPair(spectrum, spectrum), Start(np.arange(n)))
     assert outcome.successful and len(set(programs) - before) == 1

@@ -15,7 +15,7 @@ from jaxsmw.geometry import crease_eigenvectors
 from jaxsmw.geometry.eigenbasis import eigenpairs
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.meshes import read_mesh
-from jaxsmw.matching.executor import SpectralPair
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS
 
 C = 9

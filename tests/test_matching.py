@@ -234,7 +234,7 @@ def test_pairs_of_similar_size_share_compiled_programs(caplog):
     m = len(pairs[1].source.vertices)
     assert found.refinement.pointwise_map.shape == found.spectrum_x.mask.shape == (m,)
     assert found.initial_map.shape == found.pointwise_map.shape == (m,)
-    alone = refine(found.spectrum_x, found.spectrum_y, jnp.asarray(found.initial_map), **STAGE.settings)
+    alone = refine(found.spectrum_x, found.spectrum_y, jnp.asarray(found.initial_map), **STAGE.settings())
     assert (np.asarray(alone.pointwise_map) == found.pointwise_map).mean() > 0.99
 
 
@@ -480,7 +480,7 @@ def test_presets_match_a_copy_accurately(pair, usual):
     assert paper.functional_map.shape == (100, 100) != usual.functional_map.shape
     steps = ["eigenbases", "samples", "crease eigenvectors", "mirror test", "initial map", "descriptors"]
     # The body differs from its mirror image, so the better of two maps was chosen.
-    assert list(accurate.seconds) == [*steps, "refinement", "expected error", "final stages"]
+    assert list(accurate.seconds) == [*steps, "refinement", "choice of start", "final stages"]
     assert accurate.expected_error().mean() < 0.002
     points = accurate.surface_points()
     distances = np.linalg.norm(points.positions(mesh_y) - mesh_y.vertices[truth], axis=1)

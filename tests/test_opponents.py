@@ -15,7 +15,7 @@ from jaxsmw.benchmark.opponents.smooth_shells import SmoothShells
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.matching.executor import SpectralPair
+from jaxsmw.matching.spectral_pair import SpectralPair
 
 pytestmark = pytest.mark.study
 

@@ -38,7 +38,7 @@ def test_invalid_maps_and_errors_are_refused(show: Callable[..., Any]) -> None:
     n = len(TALL.vertices)
     good = np.arange(n)
     for bad, fault in (
-        (good[1:], f"has {n - 1} .*: give a map from X to Y"),
+        (good[1:], f"has {n - 1} entries, but ellipsoid has {n} vertices"),
         (good.astype(float), "must be a list of integers"),
         (good[None], "must be a list of integers"),
         (good + 1, f"between 0 and {n - 1}, but entry {n - 1} is {n}: .* count from 1"),

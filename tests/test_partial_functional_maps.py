@@ -25,9 +25,9 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import creature
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching.executor import SpectralPair
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import describe, paired_spectra
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.runtime.compilation import compiled
 
 pytestmark = pytest.mark.study

@@ -14,10 +14,11 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import executor
-from jaxsmw.matching.executor import Outcome, Start, run
+from jaxsmw.matching import executor, spectral_pair
+from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import Judge, detours, distortion, overlap
 from jaxsmw.matching.match import match
+from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search import repair
@@ -110,7 +111,8 @@ def test_swapped_limbs_are_repaired(body, swapped):
 def test_padding_changes_nothing(body, swapped, monkeypatch):
     _, found = outcome(body, swapped)
     program_size = executor.program_size
-    monkeypatch.setattr(executor, "program_size", lambda size: program_size(size) + 20)
+    for module in (executor, spectral_pair):
+        monkeypatch.setattr(module, "program_size", lambda size: program_size(size) + 20)
     _, more = outcome(body, swapped)
     padded, padded_more = (one.outcome.last.refinement.pointwise_map.shape[0] for one in (found, more))
     assert padded_more == padded + 20

@@ -99,13 +99,12 @@ def estimate_error(correspondence: Correspondence, stopwatch: Stopwatch) -> Floa
 def show_quality(correspondence: Correspondence) -> None:
     """Print one line with the quality of a match."""
 
-    parts = []
-    if correspondence.distortion is not None:
-        parts.append(f"distortion {correspondence.distortion:.3f} (1 for isometries)")
     mean = correspondence.mesh_x.average(correspondence.expected_error())
-    parts.append(f"area-weighted mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)")
-    if (probability := correspondence.wrong_probability()) is not None:
-        parts.append(f"wrong on a part of the body with probability {percentage(probability)}")
+    parts = [
+        f"distortion {correspondence.distortion:.3f} (1 for isometries)",
+        f"area-weighted mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)",
+        f"wrong on a part of the body with probability {percentage(correspondence.wrong_probability())}",
+    ]
     if correspondence.left_out:
         parts.append(f"{correspondence.left_out:.1%} of the source has no counterpart (small components)")
     if correspondence.suspicious:

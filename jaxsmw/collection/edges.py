@@ -76,7 +76,6 @@ class EdgeMap:
     @classmethod
     def of(cls, matched: Correspondence) -> EdgeMap:
         """Return the maps of a correspondence of `match` in both directions."""
-        assert matched.distortion is not None
         return cls(
             matched.surface_points(),
             matched.reverse_surface_points(),

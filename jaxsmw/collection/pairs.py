@@ -15,8 +15,9 @@ from jaxsmw.collection.shapes import fitted_preset, prepare_collection, warned_a
 from jaxsmw.errors import check_whole_number
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.executor import Outcome, Start, run_batches
+from jaxsmw.matching.executor import run_batches
 from jaxsmw.matching.match import match_prepared
+from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset

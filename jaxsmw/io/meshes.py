@@ -21,7 +21,9 @@ import codecs
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64, UInt8
@@ -30,31 +32,24 @@ from numpy.typing import ArrayLike
 from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.point_cloud import triangulate_points
-from jaxsmw.io.formats.gltf import parse_glb, parse_gltf
-from jaxsmw.io.formats.gltf_writing import format_glb, format_gltf
-from jaxsmw.io.formats.mat import format_mat, parse_mat
-from jaxsmw.io.formats.npz import format_npz, parse_npz
-from jaxsmw.io.formats.obj import format_obj, parse_obj
-from jaxsmw.io.formats.off import format_off, parse_off
-from jaxsmw.io.formats.pcd import parse_pcd
-from jaxsmw.io.formats.ply import format_ply, parse_ply
-from jaxsmw.io.formats.points import parse_npy, parse_xyz
-from jaxsmw.io.formats.polygons import Formatted, Polygons, texture_or_note, triangles_of
-from jaxsmw.io.formats.stl import format_stl, parse_stl
-from jaxsmw.io.formats.vtk import format_vtk, parse_vtk
-from jaxsmw.io.formats.vtp import format_vtp, parse_vtp
+from jaxsmw.io.formats.polygons import Polygons, texture_or_note, triangles_of
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, checked_texture
 from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
 
-_PARSERS: dict[str, Callable[..., Polygons]] = {
-    **{".off": parse_off, ".obj": parse_obj, ".ply": parse_ply, ".stl": parse_stl, ".mat": parse_mat},
-    **{".vtk": parse_vtk, ".vtp": parse_vtp, ".gltf": parse_gltf, ".glb": parse_glb, ".npz": parse_npz},
-    **{".xyz": parse_xyz, ".pcd": parse_pcd, ".npy": parse_npy},
+# The functions that read and write files with a suffix, as "module:function". A module of `jaxsmw.io.formats`
+# is loaded when such a file is opened.
+_PARSERS = {
+    **{".off": "off:parse_off", ".obj": "obj:parse_obj", ".ply": "ply:parse_ply", ".stl": "stl:parse_stl"},
+    **{".mat": "mat:parse_mat", ".vtk": "vtk:parse_vtk", ".vtp": "vtp:parse_vtp", ".npz": "npz:parse_npz"},
+    **{".gltf": "gltf:parse_gltf", ".glb": "gltf:parse_glb"},
+    **{".xyz": "points:parse_xyz", ".pcd": "pcd:parse_pcd", ".npy": "points:parse_npy"},
 }
-_FORMATTERS: dict[str, Callable[[MeshData], Formatted]] = {
-    **{".off": format_off, ".obj": format_obj, ".ply": format_ply, ".stl": format_stl, ".mat": format_mat},
-    **{".vtk": format_vtk, ".vtp": format_vtp, ".gltf": format_gltf, ".glb": format_glb, ".npz": format_npz},
+_FORMATTERS = {
+    **{".off": "off:format_off", ".obj": "obj:format_obj", ".ply": "ply:format_ply"},
+    **{".stl": "stl:format_stl", ".mat": "mat:format_mat", ".vtk": "vtk:format_vtk"},
+    **{".vtp": "vtp:format_vtp", ".npz": "npz:format_npz"},
+    **{".gltf": "gltf_writing:format_gltf", ".glb": "gltf_writing:format_glb"},
 }
 # The formats whose files begin with text, even if numbers are binary.
 _TEXT = (".off", ".obj", ".ply", ".vtk", ".pcd")
@@ -62,6 +57,11 @@ MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
 """The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
 POINT_CLOUD_SUFFIXES = tuple(suffix for suffix in _PARSERS if suffix not in _FORMATTERS)
 """The suffixes of files that contain only points."""
+
+
+def _loaded(function: str) -> Callable[..., Any]:
+    module, name = function.split(":")
+    return getattr(import_module(f"jaxsmw.io.formats.{module}"), name)
 
 
 def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
@@ -192,7 +192,8 @@ def _parse(data: bytes, suffix: str, folder: Path) -> Polygons:
         raise InputError("is UTF-16 text, which cannot be read: save the file as UTF-8.")
     # Damaged files can contain numbers that overflow, or signalling NaN. `make_mesh` refuses them later.
     with np.errstate(all="ignore"):
-        return parse_gltf(data, folder) if suffix == ".gltf" else _PARSERS[suffix](data)
+        parse = _loaded(_PARSERS[suffix])
+        return parse(data, folder) if suffix == ".gltf" else parse(data)
 
 
 def _notes(sizes: Int64[np.ndarray, " f"], lines: int, triangles: int) -> list[str]:
@@ -289,7 +290,7 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
     path = Path(path)
     check_mesh_suffix(path)
     with naming(path):
-        content, notes = _FORMATTERS[path.suffix.lower()](data)
+        content, notes = _loaded(_FORMATTERS[path.suffix.lower()])(data)
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
     return notes

@@ -1,10 +1,12 @@
-"""What a match is made of, in the order in which it runs. (`preparation` imports `stages` and `executor`.)
+"""What a match is made of, in the order in which it runs. No module imports one that stands below it.
 
 - `pair`: two meshes, and the units in which they are compared.
+- `settings`, `stages`: what refines a map, and presets that say in which order.
+- `spectral_pair`: the spectra of a pair, on which stages run.
 - `preparation`: spectra, samples and descriptors of both shapes.
+- `outcome`: what stages start from, and what they leave.
 - `starts`: initial maps.
-- `stages`: what refines a map, and presets that say in which order.
-- `executor`: runs stages, padded and compiled, for one start or many.
+- `executor`: runs stages, padded and compiled, on one pair or on many.
 - `judge`: whether a map looks right, and which of two is better.
 - `search`: mirror images, alternative maps, repair and trimming.
 - `correspondence`: the result, for the vertices of the given meshes.

@@ -21,11 +21,12 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
 from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map
-from jaxsmw.matching.executor import SpectralPair, StageRun, Start
 from jaxsmw.matching.judge import Scored, estimate_error, overlap, wrong_probability
+from jaxsmw.matching.outcome import StageRun, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.settings import ExpectedErrorSettings
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset
 from jaxsmw.matching.starts import INITIAL_MAPS
 from jaxsmw.runtime.compilation import compiled
@@ -60,7 +61,7 @@ class Correspondence:
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
     - `distortion`: the distortion of the map (`jaxsmw.matching.judge.distortion`), a number without unit. The
-      distortion is 1 for isometries and larger for worse maps. The value is None if it was not computed.
+      distortion is 1 for isometries and larger for worse maps.
     - `suspicious`: whether the map looks wrong. If the preset has repair, the value is True if limbs still
       look swapped or the body still looks upside down after repair. If the preset has no repair, the value is
       True if the distortion is at least 1.25. In both cases, the value is also True if `match` is uncertain
@@ -87,7 +88,7 @@ class Correspondence:
     spectrum_y: Spectrum
     refinement: Refinement
     iterations: int
-    distortion: float | None = None
+    distortion: float
     suspicious: bool = False
     mirrored: bool = False
     mirror_evidence: float | None = None
@@ -133,9 +134,9 @@ class Correspondence:
 
     def __repr__(self) -> str:
         m, n = (len(mesh.vertices) for mesh in self.pair.meshes)
-        judged = "" if self.distortion is None else f", distortion {self.distortion:.3f}"
         flag = (", mirrored" if self.mirrored else "") + (", suspicious" if self.suspicious else "")
-        return f"Correspondence({self.pair.name}: {m} to {n} vertices{judged}{flag})"
+        judged = f"distortion {self.distortion:.3f}{flag}"
+        return f"Correspondence({self.pair.name}: {m} to {n} vertices, {judged})"
 
     @property
     def mesh_x(self) -> Mesh:
@@ -336,16 +337,14 @@ class Correspondence:
             overlap(self.pair.reversed(), reverse, self.pointwise_map),
         )
 
-    def wrong_probability(self) -> float | None:
+    def wrong_probability(self) -> float:
         """Estimate the probability that the map is wrong on a part of the body, without ground truth.
 
         A map is called wrong if at least 2 % of X's area have errors above 0.25 times the square root of Y's
         area, for example because limbs are swapped; see `jaxsmw.matching.judge.wrong_probability`.
 
-        **Returns:** A probability, from 0 to 1; None if `distortion` is None.
+        **Returns:** A probability, from 0 to 1.
         """
-        if self.distortion is None:
-            return None
         return wrong_probability(self.distortion, float(self.mesh_x.average(self._expected_error)))
 
     @functools.cached_property

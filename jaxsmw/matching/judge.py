@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int64
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import connected_components, extend_from
 from jaxsmw.geometry.sampling import coarse_edges
-from jaxsmw.matching.executor import Outcome, SpectralPair, StageRun
+from jaxsmw.matching.outcome import Outcome, StageRun
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.settings import (
     ExpectedErrorSettings,
@@ -27,6 +27,7 @@ from jaxsmw.matching.settings import (
     ScoreSettings,
     WrongProbabilitySettings,
 )
+from jaxsmw.matching.spectral_pair import SpectralPair
 
 _DEFAULT = ScoreSettings()
 

@@ -29,8 +29,9 @@ from jaxsmw.geometry.mesh import Mesh, MeshLike
 from jaxsmw.geometry.scans import SMALL_CLOSED
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.executor import Outcome, Start, compile_stage
+from jaxsmw.matching.executor import compile_stage
 from jaxsmw.matching.judge import Scored, discontinuous_parts, estimate_error, orientation_reversal
+from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, prepare
 from jaxsmw.matching.search.chirality import Decision, Hands
@@ -205,7 +206,7 @@ def match_prepared(
     ]
     start, scored = successful[0] if successful else (starts[0], repaired[0])
     if len(successful) > 1 and preset.repair is not None:
-        with step("expected error"):
+        with step("choice of start"):
             shot, aligned = (_mean_expected_error(prepared, preset, scored) for _, scored in successful)
         start, scored = successful[int(shot >= preset.repair.aligned_preference * aligned)]
     last = step("final stages") if preset.final or preset.repair else nullcontext()

@@ -23,8 +23,8 @@ from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpai
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples, poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
-from jaxsmw.matching.executor import SpectralPair, common_range
 from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.spectral_pair import SpectralPair, common_range
 from jaxsmw.matching.stages import Sizes
 from jaxsmw.runtime.progress import Step, no_step
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side

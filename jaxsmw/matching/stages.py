@@ -104,9 +104,8 @@ class Stage:
                 f"{name} is {number!r}, but the refiner's levels require {derived}: leave {name} out."
             )
 
-    @property
-    def settings(self) -> RefineSettings:
-        """The refiner, the iterations and the Boolean attributes, as keyword arguments of `jaxsmw.refine`.
+    def settings(self, *, partial: bool = False) -> RefineSettings:
+        """Return the stage as keyword arguments of `jaxsmw.refine`, for two full shapes or a partial pair.
 
         The levels of the refiner are an array, so stages with equally many levels share a compiled program.
         """
@@ -115,6 +114,7 @@ class Stage:
             iterations=self.iterations,
             starts_on_samples=self.starts_on_samples,
             ends_on_samples=self.ends_on_samples,
+            partial=partial,
             stop_when_unchanged=self.stop_when_unchanged,
             history=self.history,
         )

@@ -23,7 +23,7 @@ from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, check_surface_points
-from jaxsmw.matching.executor import Start
+from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.runtime.nearest import nearest_rows

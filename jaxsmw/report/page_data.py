@@ -12,7 +12,7 @@ from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.matching.executor import common_range
+from jaxsmw.matching.spectral_pair import common_range
 from jaxsmw.report.inputs import check_functional_map
 from jaxsmw.report.standing import placement
 

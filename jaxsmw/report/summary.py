@@ -365,15 +365,13 @@ def summarize(
     for name, error in errors.items():
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
-    if correspondence.distortion is not None:
-        limit, suspicion = correspondence.preset.criteria.suspicious, ""
-        if correspondence.suspicious and correspondence.distortion >= limit:
-            suspicion = f"; above {limit} limbs may be swapped"
-        facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
+    limit, suspicion = correspondence.preset.criteria.suspicious, ""
+    if correspondence.suspicious and correspondence.distortion >= limit:
+        suspicion = f"; above {limit} limbs may be swapped"
+    facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
     expected = correspondence.mesh_x.average(correspondence.expected_error())
     facts["expected error, mean"] = f"{expected:.4f} √area"
-    if (probability := correspondence.wrong_probability()) is not None:
-        facts["probability of a wrong part"] = percentage(probability)
+    facts["probability of a wrong part"] = percentage(correspondence.wrong_probability())
     if correspondence.left_out:
         facts["small components without counterpart"] = f"{correspondence.left_out:.1%} of the source's area"
     steps = correspondence.seconds if seconds is None else seconds

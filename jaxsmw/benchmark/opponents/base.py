@@ -22,9 +22,10 @@ from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced, make_mesh
-from jaxsmw.matching.executor import SpectralPair, padded_map
+from jaxsmw.matching.executor import padded_map
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Sizes
 from jaxsmw.matching.starts import make_start
 

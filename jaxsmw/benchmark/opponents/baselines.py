@@ -31,7 +31,7 @@ from jaxsmw.benchmark.opponents.base import MOST_SAMPLES, Method, MethodInput, P
 from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
-from jaxsmw.core.refinement import RefineSettings, refine
+from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions import Filtering, NearestOrthogonal
@@ -40,8 +40,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.maps import read_pointwise_map
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.executor import SpectralPair
 from jaxsmw.matching.match import match
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, PresetName, Stage
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.runtime.compilation import compiled
@@ -119,7 +119,7 @@ class Refined(Method):
             number_of_samples=self.number_of_samples,
         )
         seen, start = pair.spectra.seen_by(stage), pair.initial_map
-        settings: RefineSettings = {**stage.settings, "partial": seen.partial}
+        settings = stage.settings(partial=seen.partial)
         refinement = compiled(refine)(*seen.both, start, samples=seen.samples, **settings)
         return successful(refinement.pointwise_map, refinement.result)
 

@@ -184,7 +184,7 @@ def partial_functional_map(
     **Arguments:**
 
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, in the unit of length in which Y has area 1. Both
-      spectra must be cut to their common range of eigenvalues (`jaxsmw.matching.executor.common_range`).
+      spectra must be cut to their common range of eigenvalues (`jaxsmw.matching.spectral_pair.common_range`).
       After this cut, the number k_X of eigenvectors of X is the rank r of the paper. If k_X is larger than
       k_Y, only the first k_Y eigenvectors of X are used. Both spectra need the same number of descriptors.
       The descriptors of X and Y must be comparable, and scaled to mean square 1.

@@ -13,11 +13,13 @@ from jaxtyping import Bool, Float, Int64
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS
-from jaxsmw.matching.executor import SpectralPair, Start, run
+from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import Judge, Scored
+from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.preparation import PreparedPair, PreparedShape
 from jaxsmw.matching.search.proxies import Proxy, deformation, extremities, map_difference, plausible_pairings
 from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime.threads import side_by_side
 

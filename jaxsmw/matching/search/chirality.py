@@ -15,10 +15,12 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, shot_descriptors
-from jaxsmw.matching.executor import SpectralPair, Start, run
+from jaxsmw.matching.executor import run
+from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import principal_components
 from jaxsmw.matching.search.proxies import Proxy, distance_error
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime.threads import side_by_side
 

@@ -12,11 +12,13 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.matching.executor import Outcome, SpectralPair, Start, run
+from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import Judge, Scored
+from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.alternatives import Alternatives
 from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset, Stage
 
 logger = logging.getLogger("jaxsmw")

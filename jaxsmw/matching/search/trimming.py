@@ -13,8 +13,9 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
 from jaxsmw.geometry.scans import in_small_components
-from jaxsmw.matching.executor import Start, run
+from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import Judge, Scored, detours
+from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, prepare_shapes
 from jaxsmw.matching.stages import Preset, Sizes, Stage

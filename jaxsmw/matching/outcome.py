@@ -1,0 +1,128 @@
+"""What stages start from, and what they leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int64
+
+from jaxsmw.core.refinement import Refinement
+from jaxsmw.core.refiner import Problem, Refiner, State, recover_reverse
+from jaxsmw.core.results import RESULTS
+from jaxsmw.matching.spectral_pair import SpectralPair
+from jaxsmw.matching.stages import Stage
+from jaxsmw.runtime.compilation import compiled
+
+
+class Start(NamedTuple):
+    """A map from which stages start.
+
+    **Attributes:**
+
+    - `pointwise_map`: T: X -> Y (m,), 0-based vertices of Y.
+    - `origin`: where the map comes from: the name of an initial map, `"map"` for a given map, `"landmarks"`,
+      or `"stages"` for the map of earlier stages.
+    - `excluded`: a mask of the vertices of X (m,) that the first stage leaves out; None to use all vertices.
+      If the stage iterates on samples, the vertices are left out only in its first functional map.
+    """
+
+    pointwise_map: Int64[np.ndarray, " m"]
+    origin: str = "stages"
+    excluded: Bool[np.ndarray, " m"] | None = None
+
+    @property
+    def has_alternatives(self) -> bool:
+        """Whether alternative maps can exist. They are variants of the initial map from SHOT."""
+        return self.origin == "shot"
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether the map comes from a rigid alignment of shapes that differ in form, not in pose."""
+        return self.origin == "aligned"
+
+
+@dataclass(frozen=True, eq=False)
+class StageRun:
+    """A stage that has run on a pair, with the state from which further results can be computed.
+
+    **Attributes:**
+
+    - `stage`: the `Stage`.
+    - `spectra`: the spectra of the pair, without padding.
+    - `refinement`: the `Refinement`, whose vertices may be padded.
+    """
+
+    stage: Stage
+    spectra: SpectralPair
+    refinement: Refinement
+
+    @cached_property
+    def seen(self) -> SpectralPair:
+        """The spectra that the stage has seen."""
+        return self.spectra.seen_by(self.stage)
+
+    def reverse_map(self) -> Int64[np.ndarray, " n"]:
+        """Return the map Y -> X (n,) of all vertices, 0-based vertices of X, from the last state."""
+        reverse = compiled(recover_reverse)(*self._arguments)
+        return np.asarray(reverse)[: self.spectra.y.mask.shape[0]].astype(np.int64)
+
+    def embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
+        """Return the embeddings of X and Y in which the last search has compared vertices."""
+        x, y = (np.asarray(points) for points in compiled(_embeddings)(*self._arguments))
+        return x[: self.spectra.x.mask.shape[0]], y[: self.spectra.y.mask.shape[0]]
+
+    @property
+    def _arguments(self) -> tuple[Refiner, Problem, State]:
+        problem = Problem(*self.seen.padded.both, partial=self.spectra.partial)
+        return self.stage.refiner, problem, self.refinement.state
+
+
+def _embeddings(
+    refiner: Refiner, problem: Problem, state: State
+) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
+    return refiner.embeddings(refiner.prepare(problem), state)
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """The outcome of several stages.
+
+    **Attributes:**
+
+    - `initial_map`: the map from which the first stage started (m,), 0-based vertices of Y.
+    - `runs`: one `StageRun` per stage, up to the first stage that failed.
+    """
+
+    initial_map: Int64[np.ndarray, " m"]
+    runs: tuple[StageRun, ...] = ()
+
+    @cached_property
+    def successful(self) -> bool:
+        """Whether all stages succeeded."""
+        return all(bool(run.refinement.result == RESULTS.successful) for run in self.runs)
+
+    @cached_property
+    def pointwise_map(self) -> Int64[np.ndarray, " m"]:
+        """The map of the last stage that has run (m,), or the initial map if no stage has run."""
+        if not self.runs:
+            return self.initial_map
+        padded = np.asarray(self.last.refinement.pointwise_map)
+        return padded[: len(self.initial_map)].astype(np.int64)
+
+    @property
+    def last(self) -> StageRun:
+        """The last stage that has run."""
+        return self.runs[-1]
+
+    @property
+    def uncertainty(self) -> float:
+        """The uncertainty of the last stage whose refiner computes one; 0 if there is none."""
+        known = [u for run in self.runs if (u := run.refinement.state.uncertainty) is not None]
+        return float(known[-1]) if known else 0.0
+
+    def followed_by(self, later: Outcome) -> Outcome:
+        """Return the outcome of these stages and later ones, which started from their map."""
+        return Outcome(self.initial_map, self.runs + later.runs)

@@ -1,0 +1,100 @@
+"""The spectra of a pair, on which stages run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsmw.core.refiner import Samples
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.matching.stages import Stage
+from jaxsmw.runtime.batches import program_size
+from jaxsmw.runtime.compilation import compiled
+
+
+@dataclass(frozen=True, eq=False)
+class SpectralPair:
+    """Two spectra in comparable units, on which stages run.
+
+    **Attributes:**
+
+    - `x`, `y`: the spectra of X (m vertices) and Y (n vertices), each a `Spectrum`.
+    - `samples`: samples of X (s,) and of Y (s,) in farthest-point order, as 0-based vertices; None if no
+      stage iterates on samples.
+    - `partial`: whether one of the shapes is a partial shape.
+    - `common_limit`: whether both spectra must end at a common eigenvalue; see `common_range`.
+    """
+
+    x: Spectrum
+    y: Spectrum
+    samples: Samples | None = None
+    partial: bool = False
+    common_limit: bool = False
+
+    @property
+    def both(self) -> tuple[Spectrum, Spectrum]:
+        """The spectra of X and Y."""
+        return self.x, self.y
+
+    @cached_property
+    def padded(self) -> SpectralPair:
+        """The pair with padded spectra."""
+        pad = compiled(Spectrum.pad)
+        x, y = (pad(spectrum, program_size(spectrum.mask.shape[0])) for spectrum in (self.x, self.y))
+        return SpectralPair(x, y, self.samples, self.partial, self.common_limit)
+
+    def seen_by(self, stage: Stage) -> SpectralPair:
+        """Return the pair, restricted to the eigenvectors, descriptors and samples that a stage uses.
+
+        If one of the spectra has no crease eigenvectors, the result has none either. This happens in a
+        collection if only one of two meshes is large.
+        """
+        spectra = self.x, self.y
+        creased = all(spectrum.crease_eigenvectors is not None for spectrum in spectra)
+        number_of_creases = stage.number_of_crease_eigenvectors if creased else 0
+        x, y = (
+            spectrum.truncate(stage.number_of_eigenvectors)
+            .with_descriptors(_first(spectrum.descriptors, stage.number_of_descriptors))
+            .with_crease_eigenvectors(_first(spectrum.crease_eigenvectors, number_of_creases))
+            for spectrum in spectra
+        )
+        fewer = any(
+            now.eigenvalues.shape != all_.eigenvalues.shape for now, all_ in zip((x, y), spectra, strict=True)
+        )
+        if self.common_limit and fewer:
+            x, y = common_range(x, y)
+        samples = None
+        if stage.number_of_samples is not None and self.samples is not None:
+            samples = (
+                self.samples[0][: stage.number_of_samples],
+                self.samples[1][: stage.number_of_samples],
+            )
+        return SpectralPair(x, y, samples, self.partial, self.common_limit)
+
+
+def _first(columns: Float[Array, "n d"] | None, number: int) -> Float[Array, "n c"] | None:
+    """Return the first columns of an array; None if there is no array, or if the number is 0."""
+    return columns[:, :number] if number and columns is not None else None
+
+
+def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, Spectrum]:
+    """Cut two spectra at a common limit.
+
+    The limit is the largest eigenvalue of X or the largest eigenvalue of Y, whichever is smaller. Eigenpairs
+    with eigenvalues above this limit are removed. The MWP paper truncates the spectra of partial shapes in
+    the same way.
+
+    **Arguments:**
+
+    - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`, in the same unit of length.
+
+    **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors, in the same unit. One of the spectra is
+    unchanged.
+    """
+    spectra = spectrum_x, spectrum_y
+    last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)
+    cut = [s.truncate(int((np.asarray(s.eigenvalues) <= last).sum())) for s in spectra]
+    return cut[0], cut[1]
