@@ -340,7 +340,7 @@ def test_vmap_over_pairs_equals_a_loop():
             assert batched.iterations[index] == alone.iterations
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux reports peak memory in /proc")
 def test_memory_stays_far_below_all_distances():
     """All 30 000 x 30 000 distances would take 3.6 GB. The process must use less than 0.7 GB."""

@@ -222,7 +222,7 @@ def test_signs_padding_and_vmap_do_not_change_the_map(pair):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_search_in_patches_gives_the_same_map(pair):
     x, y, initial_map, *_ = pair
     x, y = (s.with_descriptors(s.positions[:, :1] / s.positions[:, :1].std()) for s in (x, y))

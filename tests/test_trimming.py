@@ -32,7 +32,7 @@ WHOLE = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=0))
 @pytest.fixture(scope="module")
 def pose():
     """Two poses of a body with different triangulations, and the true map of the vertices of the first."""
-    found = creature_pair(vertices=1300)
+    found = creature_pair(vertices=1500)
     return found.source, found.target, found.truth.nearest_corners(found.target)
 
 
