@@ -20,7 +20,7 @@ from jaxsmw.functional_maps import nearest_neighbor
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.runtime import compilation, traced_programs
 from jaxsmw.runtime.compilation import compile_ahead, compiled
-from jaxsmw.runtime.traced_programs import UndescribedError, describe, rebuild
+from jaxsmw.runtime.traced_programs import UndescribedError, flatten, rebuild
 
 LEVELS = (6, 9)
 
@@ -212,7 +212,7 @@ def test_descriptions_are_rebuilt(arguments):
         "values": (None, True, 3, 0.5, "text", ()),
         "arrays": {"b": start, "a": np.zeros((0, 2))},
     }
-    structure, arrays = describe(tree)
+    structure, arrays = flatten(tree)
     assert json.loads(json.dumps(structure)) == structure
     rebuilt = rebuild(json.loads(json.dumps(structure)), arrays)
     assert jax.tree.structure(rebuilt) == jax.tree.structure(tree)
@@ -223,4 +223,4 @@ def test_descriptions_are_rebuilt(arguments):
 @pytest.mark.parametrize("unknown", [object(), {1: 2}, lambda: 0, Path("a"), UsersRefiner(), UsersRefiner])
 def test_unknown_objects_are_not_described(unknown):
     with pytest.raises(UndescribedError):
-        describe([unknown])
+        flatten([unknown])

@@ -201,8 +201,3 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     def convention(self) -> Convention:
         """The direction of the functional map, `"pullback"` by default."""
         return "pullback"
-
-
-def recover_reverse(refiner: Refiner, problem: Problem, state: State) -> Int32[Array, " n"]:
-    """Recover the reverse map Y -> X (n,) of a problem without samples."""
-    return refiner.recover_reverse(refiner.prepare(problem), state)

@@ -7,10 +7,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int64
+from jaxtyping import Array, Bool, Float, Int32, Int64
 
 from jaxsmw.core.refinement import Refinement
-from jaxsmw.core.refiner import Problem, Refiner, State, recover_reverse
+from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
@@ -66,7 +66,7 @@ class StageRun:
 
     def reverse_map(self) -> Int64[np.ndarray, " n"]:
         """Return the map Y -> X (n,) of all vertices, 0-based vertices of X, from the last state."""
-        reverse = compiled(recover_reverse)(*self._arguments)
+        reverse = compiled(_reverse_map)(*self._arguments)
         return np.asarray(reverse)[: self.spectra.y.mask.shape[0]].astype(np.int64)
 
     def embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
@@ -78,6 +78,10 @@ class StageRun:
     def _arguments(self) -> tuple[Refiner, Problem, State]:
         problem = Problem(*self.seen.padded.both, partial=self.spectra.partial)
         return self.stage.refiner, problem, self.refinement.state
+
+
+def _reverse_map(refiner: Refiner, problem: Problem, state: State) -> Int32[Array, " n"]:
+    return refiner.recover_reverse(refiner.prepare(problem), state)
 
 
 def _embeddings(

@@ -263,8 +263,15 @@ class Preset:
 
     def with_history(self) -> Preset:
         """Return the preset whose last stage records a `History`."""
-        last = self.stages[-1]
-        return self._with_stages(lambda stage: replace(stage, history=True) if stage is last else stage)
+
+        def recorded(stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+            return (*stages[:-1], replace(stages[-1], history=True))
+
+        if self.final:
+            return replace(self, final=recorded(self.final))
+        if self.repeated:
+            return replace(self, repeated=recorded(self.repeated))
+        return replace(self, first=recorded(self.first))
 
     def without_alternatives(self) -> Preset:
         """Return the preset whose repair tries no alternative maps."""

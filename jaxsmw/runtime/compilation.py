@@ -15,7 +15,7 @@ import numpy as np
 from jax import ShapeDtypeStruct
 from jaxtyping import PyTree
 
-from jaxsmw.runtime.traced_programs import Structure, UndescribedError, describe, rebuild, traced
+from jaxsmw.runtime.traced_programs import Structure, UndescribedError, flatten, rebuild, traced
 
 Function = TypeVar("Function", bound=Callable)
 
@@ -114,7 +114,7 @@ class _CompiledFunction:
             self._load(future, arguments, ahead=False)
         if (program := future.result()) is None:
             return self._jitted(*positional, **named)
-        return rebuild(program.structure, program.run(*describe(arguments)[1]))
+        return rebuild(program.structure, program.run(*flatten(arguments)[1]))
 
     def compile_ahead(self, arguments: _Arguments) -> Future[_Program | None]:
         """Start to compile the program for given arguments in the background."""
@@ -154,7 +154,7 @@ class _CompiledFunction:
         if self._backend != "cpu" or not _stores_programs():
             return None
         try:
-            structure, arrays = describe(arguments)
+            structure, arrays = flatten(arguments)
             if not all(map(_is_plain, arrays)):
                 return None
             shapes = [ShapeDtypeStruct(a.shape, jax.dtypes.canonicalize_dtype(a.dtype)) for a in arrays]

@@ -32,7 +32,7 @@ Structure = Any
 
 
 class UndescribedError(Exception):
-    """A pytree contains an object that `describe` cannot describe, such as an object of the user's code."""
+    """A pytree contains an object that `flatten` cannot describe, such as an object of the user's code."""
 
 
 def traced(
@@ -44,7 +44,7 @@ def traced(
 
     - `function`: a function of jaxsmw that JAX can trace.
     - `structure`: the structure of the pair of positional arguments (a tuple) and keyword arguments (a
-      dictionary); see `describe`.
+      dictionary); see `flatten`.
     - `shapes`: the shape and the type of each array in the arguments.
 
     **Returns:** The function from a list of arrays to a list of arrays, and the structure of its result.
@@ -58,7 +58,7 @@ def traced(
 
         def of_arrays(*arrays: jax.Array) -> list[jax.Array | np.ndarray]:
             positional, named = rebuild(structure, arrays)
-            described, results = describe(function(*positional, **named))
+            described, results = flatten(function(*positional, **named))
             of_result.append(described)
             return results
 
@@ -92,7 +92,7 @@ def _software() -> str:
     return digest.hexdigest()
 
 
-def describe(tree: PyTree) -> tuple[Structure, list[jax.Array | np.ndarray]]:
+def flatten(tree: PyTree) -> tuple[Structure, list[jax.Array | np.ndarray]]:
     """Divide a pytree into its structure and its arrays.
 
     **Raises:** `UndescribedError` if the pytree contains an object other than tuples, lists, dictionaries,
@@ -124,7 +124,7 @@ def describe(tree: PyTree) -> tuple[Structure, list[jax.Array | np.ndarray]]:
 
 
 def rebuild(structure: Structure, arrays: Sequence[Any]) -> Any:
-    """Return the pytree that `describe` divided into a structure and arrays."""
+    """Return the pytree that `flatten` divided into a structure and arrays."""
     remaining = iter(arrays)
 
     def rebuilt(part: Structure) -> Any:

@@ -99,7 +99,7 @@ class CoarseToFine(Refiner[PreparedT, CoarseStateT], Generic[PreparedT, CoarseSt
         return state.iteration >= len(self.levels)
 
 
-def check_descriptors(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
+def check_features(spectrum_x: Spectrum, spectrum_y: Spectrum) -> None:
     """Raise `ValueError` unless two shapes have equal numbers of descriptors and of crease eigenvectors."""
     for kind in ("descriptors", "crease_eigenvectors"):
         arrays = [getattr(spectrum, kind) for spectrum in (spectrum_x, spectrum_y)]

@@ -15,7 +15,7 @@ from jaxsmw.core.refiner import Prepared, Problem
 from jaxsmw.core.refiners.coarse_to_fine import (
     CoarseToFine,
     CoarseToFineState,
-    check_descriptors,
+    check_features,
     partial_matching_weights,
 )
 from jaxsmw.core.results import RESULTS
@@ -56,7 +56,7 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         **Raises:** `ValueError` if the shapes have different numbers of descriptors or of crease
         eigenvectors.
         """
-        check_descriptors(problem.spectrum_x, problem.spectrum_y)
+        check_features(problem.spectrum_x, problem.spectrum_y)
         all_x, all_y = _Features.of(problem.spectrum_x), _Features.of(problem.spectrum_y)
         spectrum_x, spectrum_y = problem.query_spectra()
         if problem.samples is None:

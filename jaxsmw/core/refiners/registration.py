@@ -20,7 +20,7 @@ from jaxsmw.core.refiner import Prepared, Problem, Samples
 from jaxsmw.core.refiners.coarse_to_fine import (
     CoarseToFine,
     CoarseToFineState,
-    check_descriptors,
+    check_features,
     partial_matching_weights,
 )
 from jaxsmw.core.results import RESULTS
@@ -80,7 +80,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         numbers of descriptors.
         """
         spectrum_x, spectrum_y = problem.spectrum_x, problem.spectrum_y
-        check_descriptors(spectrum_x, spectrum_y)
+        check_features(spectrum_x, spectrum_y)
         areas = [jnp.sum(spectrum.vertex_areas) for spectrum in (spectrum_x, spectrum_y)]
         if problem.partial:
             areas = [jnp.maximum(*areas)] * 2
