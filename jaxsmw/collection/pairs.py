@@ -21,7 +21,7 @@ from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
-from jaxsmw.matching.starts import make_start
+from jaxsmw.matching.starts import make_starts
 from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.compilation import release_programs
 
@@ -102,9 +102,7 @@ def prepare_task(
     pair = Pair(x.mesh, y.mesh)
     prepared = PreparedPair.of(pair, x, y, given=given)
     with warned_already():
-        starts = [make_start(prepared, "shot" if init is None else init)]
-        if aligned and init is None:
-            starts.append(make_start(prepared, "aligned"))
+        starts = make_starts(prepared, "shot" if init is None else init, rigid=aligned and init is None)
     return prepared, starts
 
 

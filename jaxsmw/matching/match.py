@@ -39,7 +39,7 @@ from jaxsmw.matching.search.repair import finish, refine_and_repair
 from jaxsmw.matching.search.trimming import match_trimmed, trimmed_stage
 from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
-from jaxsmw.matching.starts import check_initial_map, make_start
+from jaxsmw.matching.starts import check_initial_map, make_starts
 from jaxsmw.runtime.memory import return_free_memory
 from jaxsmw.runtime.progress import Step, no_step, timed
 from jaxsmw.runtime.threads import one_blas_thread
@@ -151,8 +151,7 @@ def match(
     if decision.mirrored:
         prepared = prepared.mirror()
     with step("initial map"):
-        inits = [first_init, "aligned"] if aligns and decision.asymmetric else [first_init]
-        starts = [make_start(prepared, one) for one in inits]
+        starts = make_starts(prepared, first_init, rigid=aligns and decision.asymmetric)
     if method.number_of_descriptors:
         with step("descriptors"):
             prepared = prepared.describe(method.number_of_descriptors, required=not adapts)

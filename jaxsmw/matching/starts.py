@@ -93,6 +93,13 @@ def make_start(prepared: PreparedPair, init: InitialMap | ArrayLike | SurfacePoi
     return Start(pointwise_map, "landmarks")
 
 
+def make_starts(
+    prepared: PreparedPair, init: InitialMap | ArrayLike | SurfacePoints, *, rigid: bool
+) -> list[Start]:
+    """Return the start from `init` and, if the shapes may differ in form only, the start from `"aligned"`."""
+    return [make_start(prepared, one) for one in ((init, "aligned") if rigid else (init,))]
+
+
 def check_initial_map(
     pair: Pair, init: InitialMap | ArrayLike | SurfacePoints
 ) -> InitialMap | Int64[np.ndarray, " m"] | Int[np.ndarray, "l 2"]:
