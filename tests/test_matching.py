@@ -35,7 +35,7 @@ from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import describe, paired_spectra
 from jaxsmw.matching.search.repair import refine_and_repair
 from jaxsmw.matching.stages import PRESETS, Preset, Stage, choose_preset
-from jaxsmw.matching.starts import initial_map
+from jaxsmw.matching.starts import INITIAL_MAPS, METHODS, initial_map
 from jaxsmw.runtime import threads as threads_module
 
 STAGE = Stage(WaveletPreservation(bank=Meyer(4)), number_of_eigenvectors=30)
@@ -724,3 +724,7 @@ def test_a_spectrum_of_another_mesh_is_refused(pair):
     spectrum, other = compute_spectrum(mesh_x, 10), compute_spectrum(bumpy_mesh(2), 10)
     with pytest.raises(InputError, match="its spectrum has 162"):
         initial_map(Pair(mesh_x, mesh_y), spectrum, other)
+
+
+def test_every_name_of_an_initial_map_has_a_method():
+    assert tuple(METHODS) == INITIAL_MAPS

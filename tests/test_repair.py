@@ -65,7 +65,8 @@ def prepared_body(body, initial_map, origin="map"):
     """Return the prepared pair of the body and itself, and the start from a map."""
     mesh, spectrum = body
     prepared = PreparedPair.from_spectra(Pair(mesh, mesh), spectrum, spectrum)
-    return prepared, Start(np.asarray(initial_map, np.int64), origin)
+    kind = {"has_alternatives": origin == "shot", "is_rigid": origin == "aligned"}
+    return prepared, Start(np.asarray(initial_map, np.int64), origin, **kind)
 
 
 @pytest.fixture

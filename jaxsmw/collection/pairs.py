@@ -124,8 +124,7 @@ def match_many(
     def fitted() -> Iterator[tuple[Preset, PreparedPair, list[Start]]]:
         for prepared, starts in tasks:
             own = fitted_preset(preset, *prepared.pair.meshes)
-            described = prepared.x.spectrum.descriptors is not None
-            yield own if described else own.without_descriptors(), prepared, starts
+            yield prepared.usable(own), prepared, starts
 
     if not batched:
         for own, prepared, starts in fitted():

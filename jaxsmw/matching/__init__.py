@@ -10,5 +10,6 @@
 - `judge`: whether a map looks right, and which of two is better.
 - `search`: mirror images, alternative maps, repair and trimming.
 - `correspondence`: the result, for the vertices of the given meshes.
+- `advice`: what `match` tells about a map that may be wrong.
 - `match`: all of these in one function.
 """

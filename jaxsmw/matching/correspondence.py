@@ -27,7 +27,7 @@ from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
-from jaxsmw.matching.stages import Preset
+from jaxsmw.matching.stages import Preset, Stage
 from jaxsmw.matching.starts import INITIAL_MAPS
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.nearest import nearest_points
@@ -49,14 +49,15 @@ class Correspondence:
     - `functional_map`: the functional map of the last iteration, a property without unit. Its shape is
       (k_X, k_Y) for a pullback, which is the usual convention, and (k_Y, k_X) for a pushforward.
     - `initial_map`: the map from which refinement started (m,), int64, as 0-based vertices of Y.
-    - `init`: the name of the initial map, such as `"shot"`; None if a map or landmarks were given. If repair
-      chose an alternative initial map, `initial_map` is the alternative.
+    - `origin`: where the initial map comes from; see `Start`. If repair chose an alternative initial map,
+      `initial_map` is the alternative.
     - `preset`: the `Preset` with the stages of refinement and the settings of the repair, adapted to the
       meshes; see `Preset.fitted`.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y in `Pair.units_of_length`, each a `Spectrum` with the
       k_X or k_Y eigenvectors that the last stage uses. If a mesh was cut before it was matched
       (`jaxsmw.geometry.cut_shortcuts`), or was trimmed (`jaxsmw.matching.search.trimming`), the spectrum
       belongs to the cut or trimmed mesh. The mask of the spectrum is False for trimmed vertices.
+    - `stage`: the last `Stage`. After trimming, its levels are `RepairSettings.trimmed_levels`.
     - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
@@ -82,10 +83,11 @@ class Correspondence:
     pair: Pair
     pointwise_map: Int64[np.ndarray, " m"]
     initial_map: Int64[np.ndarray, " m"]
-    init: str | None
+    origin: str
     preset: Preset
     spectrum_x: Spectrum
     spectrum_y: Spectrum
+    stage: Stage
     refinement: Refinement
     iterations: int
     distortion: float
@@ -115,15 +117,16 @@ class Correspondence:
             for matches in (outcome.initial_map, outcome.pointwise_map)
         )
         pointwise_map, left_out = pair.with_small_components(refined_map)
-        seen = prepared.spectra.seen_by(preset.stages[-1])
+        seen = outcome.last.seen
         return cls(
             pair=pair,
             pointwise_map=pointwise_map,
             initial_map=initial_map,
-            init=start.origin if start.origin in INITIAL_MAPS else None,
+            origin=start.origin,
             preset=preset,
             spectrum_x=seen.x.reflect() if prepared.mirrored else seen.x,
             spectrum_y=seen.y,
+            stage=outcome.last.stage,
             refinement=replace(last, pointwise_map=jax.device_put(pointwise_map.astype(np.int32))),
             iterations=sum(int(run.refinement.iterations) for run in outcome.runs),
             distortion=scored.distortion,
@@ -147,6 +150,11 @@ class Correspondence:
     def mesh_y(self) -> Mesh:
         """The target Y."""
         return self.pair.mesh_y
+
+    @property
+    def init(self) -> str | None:
+        """The name of the initial map, such as `"shot"`; None if a map or landmarks were given."""
+        return self.origin if self.origin in INITIAL_MAPS else None
 
     @property
     def matched_pair(self) -> Pair:
@@ -380,7 +388,7 @@ class Correspondence:
         """The last stage, which has seen the mirror image of X if it was matched."""
         spectrum_x = self.spectrum_x.reflect() if self.mirrored else self.spectrum_x
         spectra = SpectralPair(spectrum_x, self.spectrum_y, partial=self.pair.partial)
-        return StageRun(self.preset.stages[-1], spectra, self.refinement)
+        return StageRun(self.stage, spectra, self.refinement)
 
     def _precision(self) -> AbstractContextManager[None]:
         """Return a context manager in which JAX uses the float type of the functional map."""

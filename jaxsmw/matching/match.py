@@ -26,18 +26,16 @@ from jaxsmw.choices import (
 )
 from jaxsmw.errors import check_choice
 from jaxsmw.geometry.mesh import Mesh, MeshLike
-from jaxsmw.geometry.scans import SMALL_CLOSED
 from jaxsmw.geometry.surface_points import SurfacePoints
+from jaxsmw.matching.advice import advice
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import compile_stage
-from jaxsmw.matching.judge import Scored, discontinuous_parts, estimate_error, orientation_reversal
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, prepare
 from jaxsmw.matching.search.chirality import Decision, Hands
-from jaxsmw.matching.search.repair import finish, refine_and_repair
+from jaxsmw.matching.search.repair import choose, finish, refine_and_repair
 from jaxsmw.matching.search.trimming import match_trimmed, trimmed_stage
-from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
 from jaxsmw.matching.starts import check_initial_map, make_starts
 from jaxsmw.runtime.memory import return_free_memory
@@ -156,12 +154,8 @@ def match(
         with step("descriptors"):
             prepared = prepared.describe(method.number_of_descriptors, required=not adapts)
     correspondence = match_prepared(prepared, starts, method, step=step)
-    if correspondence.suspicious:
-        warnings.warn(_warning(correspondence, landmarks=starts[0].origin == "landmarks"), stacklevel=2)
-    if correspondence.left_out > SMALL_CLOSED:
-        warnings.warn(_omission(correspondence), stacklevel=2)
-    if decision.doubtful:
-        warnings.warn(_doubt(pair, decision), stacklevel=2)
+    for text in advice(correspondence, decision):
+        warnings.warn(text, stacklevel=2)
     return replace(
         correspondence,
         suspicious=correspondence.suspicious or decision.doubtful,
@@ -192,8 +186,7 @@ def match_prepared(
 
     **Raises:** `ArithmeticError` if refinement fails numerically from every start.
     """
-    if prepared.x.spectrum.descriptors is None:
-        preset = preset.without_descriptors()
+    preset = prepared.usable(preset)
     return_free_memory()
     with step("refinement"), one_blas_thread():
         repaired = [
@@ -204,10 +197,9 @@ def match_prepared(
         (start, scored) for start, scored in zip(starts, repaired, strict=True) if scored.successful
     ]
     start, scored = successful[0] if successful else (starts[0], repaired[0])
-    if len(successful) > 1 and preset.repair is not None:
+    if len(successful) > 1:
         with step("choice of start"):
-            shot, aligned = (_mean_expected_error(prepared, preset, scored) for _, scored in successful)
-        start, scored = successful[int(shot >= preset.repair.aligned_preference * aligned)]
+            start, scored = choose(prepared, preset, successful)
     last = step("final stages") if preset.final or preset.repair else nullcontext()
     with last, one_blas_thread():
         if trimmed := match_trimmed(prepared, preset, scored):
@@ -216,18 +208,6 @@ def match_prepared(
             scored = finish(prepared, start, preset, scored)
         jax.block_until_ready(scored.outcome.last.refinement)
     return Correspondence.of(prepared, start, preset, scored)
-
-
-def _mean_expected_error(prepared: PreparedPair, preset: Preset, scored: Scored) -> float:
-    """Return the mean expected error of a map, with `area_weight` 0.
-
-    With a positive `area_weight`, the expected error would contain a factor that depends on the shapes, not
-    on the quality of the map. (Entry R24 of docs/research_log.md)
-    """
-    given = prepared.given.mirrored() if prepared.mirrored else prepared.given
-    settings = ExpectedErrorSettings(area_weight=0.0), preset.criteria.scores
-    expected = estimate_error(given, scored.pointwise_map, scored.outcome.last, *settings)
-    return float(prepared.given.mesh_x.average(expected))
 
 
 def _compile_ahead(pair: Pair, preset: Preset) -> None:
@@ -247,63 +227,3 @@ def _compile_ahead(pair: Pair, preset: Preset) -> None:
     numbers = [len(mesh.vertices) for mesh in pair.meshes]
     for stage in stages:
         compile_stage(stage, *numbers, partial=pair.partial)
-
-
-def _omission(correspondence: Correspondence) -> str:
-    """Return the text of the warning that small components have no counterpart."""
-    return (
-        f"{correspondence.pair.name}: {correspondence.left_out:.0%} of the source's area lies in small "
-        "components that have no counterpart on the target, so they only move with their surroundings. If "
-        "they are parts of one surface, join them, for example by welding (weld=True, --weld)."
-    )
-
-
-def _doubt(pair: Pair, decision: Decision) -> str:
-    """Return the text of the warning that X and its mirror image match Y about equally well."""
-    took = "the mirror image of the source" if decision.mirrored else "the source itself"
-    return (
-        f"{pair.name}: the source and its mirror image match the target about equally well (evidence "
-        f"{decision.evidence:.2f} for the mirror image). {took.capitalize()} was matched. If both meshes are "
-        'of the same hand, set mirror="no" (--mirror no); if not, set mirror="yes" (--mirror yes).'
-    )
-
-
-# If the map reverses the orientation of more than this share of the area, one shape may be a mirror image.
-_MOSTLY = 0.5
-
-
-def _warning(correspondence: Correspondence, *, landmarks: bool) -> str:
-    """Return the text of the warning that a map looks wrong. `landmarks` is True if landmarks were given."""
-    pair, repair = correspondence.pair, correspondence.preset.repair
-    settings = correspondence.preset.criteria
-    reversed_ = orientation_reversal(
-        correspondence.matched_pair, correspondence.pointwise_map, correspondence.spectrum_x, settings.scores
-    )
-    cut_off = discontinuous_parts(correspondence.matched_pair, correspondence.pointwise_map, settings.scores)
-    reversed_share, cut_off_share = (pair.mesh_x.average(fault) for fault in (reversed_, cut_off))
-    cure = f"use {'more' if landmarks else 'a few'} landmarks as the initial map"
-    if repair is None:
-        cure = f'use preset="accurate" (--preset accurate), which repairs such maps, or {cure}'
-    if reversed_share > _MOSTLY:
-        cure += (
-            '; if both meshes are of the same hand, set mirror="no" (--mirror no)'
-            if correspondence.mirrored
-            else '; if one mesh is a mirror image of the other, set mirror="yes" (--mirror yes)'
-        )
-    if pair.partial:
-        cure += (
-            ", and check that both meshes have the same unit of length, or estimate the scale with "
-            'scale="unknown" (--scale unknown)'
-        )
-    else:
-        cure += "; if one mesh is a partial shape, set partial=True (--partial)"
-    return (
-        f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down. The map has "
-        f"distortion {correspondence.distortion:.3f}, reverses the orientation of {reversed_share:.0%} of "
-        f"the source's area, and separates {cut_off_share:.0%} of the source's area by discontinuities. "
-        f"Correct maps between poses of one body have distortions up to {settings.suspicious}. Correct maps "
-        "can have larger distortions between non-isometric shapes, with topological noise, or if one shape "
-        "is mirrored. "
-        "Look at the map with the option --report or, in Python, with jaxsmw.report.summary.write_report. If "
-        f"the map is wrong, {cure}."
-    )

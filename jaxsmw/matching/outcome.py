@@ -27,21 +27,15 @@ class Start(NamedTuple):
       or `"stages"` for the map of earlier stages.
     - `excluded`: a mask of the vertices of X (m,) that the first stage leaves out; None to use all vertices.
       If the stage iterates on samples, the vertices are left out only in its first functional map.
+    - `has_alternatives`: whether repair can try alternative maps, which are variants of the map.
+    - `is_rigid`: whether the map comes from a rigid alignment of shapes that differ in form, not in pose.
     """
 
     pointwise_map: Int64[np.ndarray, " m"]
     origin: str = "stages"
     excluded: Bool[np.ndarray, " m"] | None = None
-
-    @property
-    def has_alternatives(self) -> bool:
-        """Whether alternative maps can exist. They are variants of the initial map from SHOT."""
-        return self.origin == "shot"
-
-    @property
-    def is_rigid(self) -> bool:
-        """Whether the map comes from a rigid alignment of shapes that differ in form, not in pose."""
-        return self.origin == "aligned"
+    has_alternatives: bool = False
+    is_rigid: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples, poi
 from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.spectral_pair import SpectralPair, common_range
-from jaxsmw.matching.stages import Sizes
+from jaxsmw.matching.stages import Preset, Sizes
 from jaxsmw.runtime.progress import Step, no_step
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
@@ -438,6 +438,15 @@ class PreparedPair:
 
         at = samples or (self.x.compared, self.y.compared)
         return side_by_side(of_one, *zip(self.pair.meshes, self.pair.units_of_length, at, strict=True))
+
+    @property
+    def matched(self) -> Pair:
+        """The given pair, with the mirror image of X in place of X if it is matched."""
+        return self.given.mirrored() if self.mirrored else self.given
+
+    def usable(self, preset: Preset) -> Preset:
+        """Return the preset, without descriptors if the pair has none."""
+        return preset.without_descriptors() if self.x.spectrum.descriptors is None else preset
 
     def mirror(self) -> PreparedPair:
         """Return the prepared pair with the mirror image of X in place of X. There are no descriptors yet."""

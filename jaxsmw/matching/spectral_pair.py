@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -44,7 +44,7 @@ class SpectralPair:
         """The pair with padded spectra."""
         pad = compiled(Spectrum.pad)
         x, y = (pad(spectrum, program_size(spectrum.mask.shape[0])) for spectrum in (self.x, self.y))
-        return SpectralPair(x, y, self.samples, self.partial, self.common_limit)
+        return replace(self, x=x, y=y)
 
     def seen_by(self, stage: Stage) -> SpectralPair:
         """Return the pair, restricted to the eigenvectors, descriptors and samples that a stage uses.
@@ -72,7 +72,7 @@ class SpectralPair:
                 self.samples[0][: stage.number_of_samples],
                 self.samples[1][: stage.number_of_samples],
             )
-        return SpectralPair(x, y, samples, self.partial, self.common_limit)
+        return replace(self, x=x, y=y, samples=samples)
 
 
 def _first(columns: Float[Array, "n d"] | None, number: int) -> Float[Array, "n c"] | None:

@@ -200,7 +200,7 @@ class Preset:
     **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if there is repair,
     but no repeated stage. `InputError` is also raised if one of these rules is broken. The last stage, and
     the last stage before the final stages, must not end on samples. If a stage ends on samples, the next
-    stage must start on samples, and must not have more samples. The first repeated stage must have levels.
+    stage must start on samples, and must not have more samples. The last repeated stage must have levels.
     """
 
     first: tuple[Stage, ...] = ()
@@ -231,10 +231,10 @@ class Preset:
             return
         if not self.repeated:
             raise InputError("repair has no stage to repeat: give the preset repeated stages.")
-        if not self.repeated[0].refiner.levels:
+        if not self.repeated[-1].refiner.levels:
             raise InputError(
-                f"repair repeats a stage of {type(self.repeated[0].refiner).__name__}, which has no levels: "
-                "let the repeated stages begin with FeatureRegression or Registration."
+                f"repair repeats a stage of {type(self.repeated[-1].refiner).__name__}, which has no levels: "
+                "let the repeated stages end with a refiner with levels, such as Registration."
             )
 
     @property
@@ -287,7 +287,7 @@ class Preset:
     def _with_stages(self, change: Callable[[Stage], Stage]) -> Preset:
         first, repeated, final = (tuple(map(change, s)) for s in (self.first, self.repeated, self.final))
         large = None if self.large is None else self.large._with_stages(change)
-        return Preset(first, repeated, final, self.repair, large)
+        return replace(self, first=first, repeated=repeated, final=final, large=large)
 
     @property
     def criteria(self) -> JudgeSettings:

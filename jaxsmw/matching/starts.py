@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import jax.numpy as jnp
 import numpy as np
@@ -84,7 +84,9 @@ def make_start(prepared: PreparedPair, init: InitialMap | ArrayLike | SurfacePoi
     """
     init = check_initial_map(prepared.pair, init)
     if isinstance(init, str):
-        return Start(nearest_map(prepared, _finite(prepared, init, FEATURES[init](prepared))), init)
+        method = METHODS[init]
+        pointwise_map = nearest_map(prepared, _finite(prepared, init, method.features(prepared)))
+        return Start(pointwise_map, init, has_alternatives=method.has_alternatives, is_rigid=method.is_rigid)
     if init.ndim == 1:
         return Start(init, "map")
     features = _finite(prepared, "landmark", _landmark_features(prepared, init))
@@ -223,15 +225,30 @@ def _aligned_features(prepared: PreparedPair) -> _Features:
     return of_x, of_y
 
 
-FEATURES: dict[InitialMap, Callable[[PreparedPair], _Features]] = {
-    "shot": _shot_features,
-    "wks": partial(_signature_features, wave_kernel_signature),
-    "hks": partial(_signature_features, heat_kernel_signature),
-    "wavelet": partial(_signature_features, wavelet_signature),
-    "functional": _functional_features,
-    "aligned": _aligned_features,
+class InitialMethod(NamedTuple):
+    """How an initial map with a name is computed: by the nearest neighbours in features.
+
+    **Attributes:**
+
+    - `features`: the function that computes the features of X (a, d) and of Y (b, d) at the compared
+      vertices.
+    - `has_alternatives`, `is_rigid`: see `Start`.
+    """
+
+    features: Callable[[PreparedPair], _Features]
+    has_alternatives: bool = False
+    is_rigid: bool = False
+
+
+METHODS: dict[InitialMap, InitialMethod] = {
+    "shot": InitialMethod(_shot_features, has_alternatives=True),
+    "wks": InitialMethod(partial(_signature_features, wave_kernel_signature)),
+    "hks": InitialMethod(partial(_signature_features, heat_kernel_signature)),
+    "wavelet": InitialMethod(partial(_signature_features, wavelet_signature)),
+    "functional": InitialMethod(_functional_features),
+    "aligned": InitialMethod(_aligned_features, is_rigid=True),
 }
-"""A dictionary from the name of each initial map to the function that computes its features."""
+"""A dictionary from the name of each initial map to its `InitialMethod`."""
 
 # Distances to landmarks, in units of the square root of the area, are multiplied by this weight. A distance
 # of half a unit becomes 1, which is the norm of a SHOT descriptor. On pairs of real bodies, weights from 1 to

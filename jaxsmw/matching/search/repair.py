@@ -13,11 +13,11 @@ from jaxtyping import Bool, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import Judge, Scored
+from jaxsmw.matching.judge import Judge, Scored, estimate_error
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.alternatives import Alternatives
-from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.settings import ExpectedErrorSettings, RepairSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset, Stage
 
@@ -83,6 +83,27 @@ def refine_and_repair(
         if maps := list(proxies.best(usual, creased=True)):
             best = min(best, repeater.repaired([], maps), key=judge.score)
     return replace(best, rivals=proxies.different(best, best.rivals))
+
+
+def choose(
+    prepared: PreparedPair, preset: Preset, candidates: Sequence[tuple[Start, Scored]]
+) -> tuple[Start, Scored]:
+    """Choose the start whose map has the smallest mean expected error. Rigid starts are preferred.
+
+    The expected errors have `area_weight` 0. A positive weight would multiply them by a factor that depends
+    on the shapes, not on the quality of the map. (Entry R24 of docs/research_log.md)
+    """
+    repair, mesh_x = preset.repair, prepared.given.mesh_x
+    if repair is None:
+        return candidates[0]
+    settings = ExpectedErrorSettings(area_weight=0.0), repair.judge.scores
+
+    def error(candidate: tuple[Start, Scored]) -> float:
+        start, scored = candidate
+        errors = estimate_error(prepared.matched, scored.pointwise_map, scored.outcome.last, *settings)
+        return (repair.aligned_preference if start.is_rigid else 1.0) * float(mesh_x.average(errors))
+
+    return min(reversed(candidates), key=error)  # of equal errors, that of the last start counts
 
 
 def refine_further(prepared: PreparedPair, start: Start, preset: Preset, scored: Scored) -> Scored:
