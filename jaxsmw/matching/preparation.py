@@ -356,6 +356,7 @@ class PreparedPair:
       `jaxsmw.matching.search.trimming`.
       The spectra of such a pair have equal numbers of eigenvectors, and need no common limit.
     - `laplacian`, `eigensolver`: how the spectra were computed; see `jaxsmw.compute_spectrum`.
+    - `known_shot`: SHOT at the compared vertices, if it has already been computed for these meshes.
     """
 
     given: Pair
@@ -366,6 +367,7 @@ class PreparedPair:
     trimmed: bool = False
     laplacian: Laplacian = "auto"
     eigensolver: Eigensolver = "auto"
+    known_shot: tuple[Float[np.ndarray, "a c"], Float[np.ndarray, "b c"]] | None = None
 
     @classmethod
     def of(
@@ -422,7 +424,7 @@ class PreparedPair:
     @cached_property
     def shot(self) -> tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]:
         """SHOT of X and Y at the compared vertices, with the usual radius."""
-        return self.shot_of_radius(SHOT_RADIUS)
+        return self.known_shot or self.shot_of_radius(SHOT_RADIUS)
 
     def shot_of_radius(
         self, radius: float, samples: tuple[SurfaceSamples, SurfaceSamples] | None = None
@@ -450,7 +452,8 @@ class PreparedPair:
 
     def mirror(self) -> PreparedPair:
         """Return the prepared pair with the mirror image of X in place of X. There are no descriptors yet."""
-        return replace(self, pair=self.pair.mirrored(), x=self.x.mirrored(), mirrored=not self.mirrored)
+        x = self.x.mirrored()
+        return replace(self, pair=self.pair.mirrored(), x=x, mirrored=not self.mirrored, known_shot=None)
 
     def describe(self, number_of_descriptors: int, *, required: bool = False) -> PreparedPair:
         """Return the prepared pair with descriptors of both shapes in the same axes.
@@ -479,9 +482,12 @@ class PreparedPair:
         weight = np.concatenate(weights(self.shapes)).astype(dtype)
         components = principal_components(rows, weight, number_of_descriptors)
         of_x, of_y = np.split(components, [len(self.shot[0])])
-        described = replace(self, x=with_descriptors(self.x, of_x), y=with_descriptors(self.y, of_y))
-        vars(described)["shot"] = self.shot  # the surfaces are the same, so SHOT need not be computed again
-        return described
+        return replace(
+            self,
+            x=with_descriptors(self.x, of_x),
+            y=with_descriptors(self.y, of_y),
+            known_shot=self.shot,
+        )
 
 
 def prepare(
