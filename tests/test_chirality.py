@@ -113,7 +113,7 @@ def test_a_creature_is_its_own_mirror_image(lump):
     np.testing.assert_array_equal(found.pointwise_map, alone.pointwise_map)
 
 
-@pytest.mark.parametrize(("mirror", "advice"), [("no", "--mirror yes"), ("yes", "--mirror no")])
+@pytest.mark.parametrize(("mirror", "advice"), [("no", 'mirror="yes"'), ("yes", 'mirror="no"')])
 def test_the_warning_of_a_reversed_map_names_the_other_hand(lump, mirror, advice):
     target = lump.mirrored() if mirror == "no" else lump
     with pytest.warns(UserWarning, match=rf"reverses the orientation of 100%.*{advice}"):

@@ -448,8 +448,8 @@ def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
     ("message", "expected"),
     [
         ("welding (weld=True).", "welding (--weld)."),
-        ("the robust Laplacian (laplacian='robust', on the command line --laplacian robust).", "the robust Laplacian (--laplacian robust)."),
-        ('set mirror="no" (--mirror no); if', "set --mirror no; if"),
+        ("the robust Laplacian (laplacian='robust').", "the robust Laplacian (--laplacian robust)."),
+        ('set mirror="no"; if', "set --mirror no; if"),
         ("scale=1.5.ply: pass index_base=1.", "scale=1.5.ply: pass --index-base 1."),
     ],
 )  # fmt: skip

@@ -559,7 +559,7 @@ def test_a_mesh_of_one_triangle_is_refused(pair):
 def test_triangle_soup_is_refused_with_a_hint_to_weld(pair):
     mesh = pair[0]
     soup = make_mesh(mesh.vertices[mesh.faces.ravel()], np.arange(mesh.faces.size).reshape(-1, 3))
-    with pytest.raises(InputError, match=r"largest of the 30 eigenvalues is zero.* --weld"):
+    with pytest.raises(InputError, match=r"largest of the 30 eigenvalues is zero.*weld=True"):
         match(soup, mesh, preset=Stage(number_of_eigenvectors=30))
 
 

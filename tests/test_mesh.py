@@ -171,7 +171,7 @@ def unwelded(mesh: Mesh) -> Mesh:
 def test_welding_closes_a_seam_without_renumbering():
     seam = unwelded(OCTAHEDRON)
     assert diagnose(seam).components == 8
-    assert any("24 boundary vertices" in note and "--weld" in note for note in seam.notes)
+    assert any("24 boundary vertices" in note and "weld=True" in note for note in seam.notes)
 
     welded = make_mesh(seam.vertices, seam.faces, weld=True)
     assert welded.vertices.tobytes() == seam.vertices.tobytes()
@@ -182,7 +182,7 @@ def test_welding_closes_a_seam_without_renumbering():
     for i in np.flatnonzero(welded.referenced_vertices):
         assert i == (seam.vertices == seam.vertices[i]).all(axis=1).argmax()
     assert any("Welding changed" in note for note in welded.notes)
-    assert not any("--weld" in note for note in welded.notes)
+    assert not any("weld=True" in note for note in welded.notes)
 
 
 @pytest.mark.parametrize(("gap", "joined"), [(1e-15, True), (1e-3, True), (-1e-3, True), (0.02, False)])
@@ -194,7 +194,7 @@ def test_welding_joins_positions_that_differ_by_rounding_and_both_zeros_are_equa
     assert welded.faces.tolist() == [[0, 1, 2], [0, 5, 1 if joined else 4]]
     assert welded.vertices.tolist() == vertices
     reported = sum("4 boundary vertices" in note for note in make_mesh(vertices, faces).notes)
-    assert reported == joined and not any("--weld" in note for note in welded.notes)
+    assert reported == joined and not any("weld=True" in note for note in welded.notes)
 
 
 def test_rounding_never_closes_a_short_edge():
@@ -650,7 +650,7 @@ def test_stl_corners_that_differ_by_rounding_become_one_vertex(saved, form):
     assert any(
         "rounding" in note and str(mesh.faces.size - len(mesh.vertices)) in note for note in again.notes
     )
-    assert not any("--weld" in note for note in again.notes)
+    assert not any("weld=True" in note for note in again.notes)
 
 
 HOSTILE = {

@@ -301,9 +301,7 @@ def test_a_map_that_still_looks_wrong_is_reported(body, mirrored, identity):
 
 def test_maps_of_presets_without_repair_are_judged(body, mirrored, identity):
     mesh, _ = body
-    with pytest.warns(
-        UserWarning, match=r"reverses the orientation of .* use preset=\"accurate\" \(--preset"
-    ):
+    with pytest.warns(UserWarning, match=r"reverses the orientation of .* use preset=\"accurate\", which"):
         wrong = match(mesh, mesh, preset=Preset((STAGE,)), init=mirrored, mirror="no")
     assert wrong.suspicious and wrong.distortion > 1.25
     facts = summarize(wrong, {})

@@ -53,11 +53,10 @@ def say(message: str) -> None:
             print(printable(with_options(message)), file=sys.stderr, flush=True)
 
 
-# An argument that a message of the library recommends, and perhaps the same option behind it.
+# An argument that a message of the library recommends.
 _ARGUMENT = re.compile(
     r"\b(coordinates|index_base|laplacian|mirror|partial|preset|scale|weld)="
     r"(?:True|([01])(?!\.?\w)|([\"'])(\w+)\3)"
-    r"(?:,(?: on the command line)? --[a-z-]+(?: \w+)?| \(--[a-z-]+(?: \w+)?\))?"
 )
 
 

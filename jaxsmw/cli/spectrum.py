@@ -7,7 +7,7 @@ import argparse
 from jaxsmw.choices import NUMBER_OF_EIGENVECTORS
 from jaxsmw.cli.arguments import add_eigenproblem, add_paths, add_weld, path, refuse_without, whole_number
 from jaxsmw.cli.banks import add_bank, make_bank
-from jaxsmw.cli.console import show
+from jaxsmw.cli.console import show, with_options
 from jaxsmw.cli.inputs import check_inputs
 from jaxsmw.cli.outputs import check_outputs, report_written, write_figure
 from jaxsmw.errors import check_suffix
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
     laplacian = choose_laplacian(mesh) if options.laplacian == "auto" else options.laplacian
     pairs = eigenpairs(mesh, options.eigenvectors, laplacian=laplacian, eigensolver=options.eigensolver)
     eigenvalues, _, _ = pairs
-    show("\n".join([*mesh.notes, *diagnose(mesh).sentences()]))
+    show(with_options("\n".join([*mesh.notes, *diagnose(mesh).sentences()])))
     show(f"area {mesh.area:.6g}, {laplacian} Laplacian; eigenvalues of the surface scaled to area 1:")
     for first in range(0, len(eigenvalues), _EIGENVALUES_PER_LINE):
         row = eigenvalues[first : first + _EIGENVALUES_PER_LINE]

@@ -244,8 +244,8 @@ def _solve_component(
             )
     raise InputError(
         f"{name}: the first {k} eigenvectors could not be computed accurately ({failure}), probably because "
-        "of badly shaped triangles: try the robust Laplacian (laplacian='robust', on the command line "
-        "--laplacian robust), fewer eigenvectors, or a remeshed surface."
+        "of badly shaped triangles: try the robust Laplacian (laplacian='robust'), fewer eigenvectors, or a "
+        "remeshed surface."
     )
 
 

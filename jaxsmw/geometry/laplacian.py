@@ -51,6 +51,6 @@ def assemble_laplacian(
     if not np.isfinite(stiffness.data).all() or (areas[mesh.referenced_indices] <= 0).any():
         raise InputError(
             f"{mesh.name}: the cotangent Laplacian is undefined on zero-area faces: use the robust Laplacian "
-            "(laplacian='robust', on the command line --laplacian robust)."
+            "(laplacian='robust')."
         )
     return stiffness, areas

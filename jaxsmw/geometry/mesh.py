@@ -491,7 +491,7 @@ def _unusual_vertices(mesh: Mesh) -> list[str]:
     if seam := int(_split_vertices(mesh)[1].sum()):
         notes.append(
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
-            "surface should be closed there, weld it (`weld=True`, on the command line `--weld`)."
+            "surface should be closed there, weld it (`weld=True`)."
         )
     if unreferenced := len(mesh.vertices) - len(mesh.referenced_indices):
         notes.append(

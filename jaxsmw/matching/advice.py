@@ -26,7 +26,7 @@ def _omission(correspondence: Correspondence) -> str:
     return (
         f"{correspondence.pair.name}: {correspondence.left_out:.0%} of the source's area lies in small "
         "components that have no counterpart on the target, so they only move with their surroundings. If "
-        "they are parts of one surface, join them, for example by welding (weld=True, --weld)."
+        "they are parts of one surface, join them, for example by welding (weld=True)."
     )
 
 
@@ -36,7 +36,7 @@ def _doubt(pair: Pair, decision: Decision) -> str:
     return (
         f"{pair.name}: the source and its mirror image match the target about equally well (evidence "
         f"{decision.evidence:.2f} for the mirror image). {took.capitalize()} was matched. If both meshes are "
-        'of the same hand, set mirror="no" (--mirror no); if not, set mirror="yes" (--mirror yes).'
+        'of the same hand, set mirror="no"; if not, set mirror="yes".'
     )
 
 
@@ -56,20 +56,20 @@ def _suspicion(correspondence: Correspondence) -> str:
     more = "more" if correspondence.origin == "landmarks" else "a few"
     cure = f"use {more} landmarks as the initial map"
     if repair is None:
-        cure = f'use preset="accurate" (--preset accurate), which repairs such maps, or {cure}'
+        cure = f'use preset="accurate", which repairs such maps, or {cure}'
     if reversed_share > _MOSTLY:
         cure += (
-            '; if both meshes are of the same hand, set mirror="no" (--mirror no)'
+            '; if both meshes are of the same hand, set mirror="no"'
             if correspondence.mirrored
-            else '; if one mesh is a mirror image of the other, set mirror="yes" (--mirror yes)'
+            else '; if one mesh is a mirror image of the other, set mirror="yes"'
         )
     if pair.partial:
         cure += (
             ", and check that both meshes have the same unit of length, or estimate the scale with "
-            'scale="unknown" (--scale unknown)'
+            'scale="unknown"'
         )
     else:
-        cure += "; if one mesh is a partial shape, set partial=True (--partial)"
+        cure += "; if one mesh is a partial shape, set partial=True"
     return (
         f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down. The map has "
         f"distortion {correspondence.distortion:.3f}, reverses the orientation of {reversed_share:.0%} of "

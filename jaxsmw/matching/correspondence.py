@@ -106,11 +106,7 @@ class Correspondence:
         pair, outcome = prepared.given, scored.outcome
         last = outcome.last.refinement.unpadded(len(pair.mesh_x.vertices))
         if last.result != RESULTS.successful:
-            cure = (
-                ' If the units of length differ, set scale="unknown" (--scale unknown).'
-                if pair.partial
-                else ""
-            )
+            cure = ' If the units of length differ, set scale="unknown".' if pair.partial else ""
             raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
         initial_map, refined_map = (
             extend_to_unreferenced(prepared.pair.mesh_x, matches)

@@ -125,7 +125,7 @@ class Pair:
             raise InputError(
                 f"{other.name} is open and {closed.name} is closed, so {other.name} should be the partial "
                 f"shape, but it has {large / small:.3g} times the area: check the units of length, or set "
-                'scale="unknown" (--scale unknown).'
+                'scale="unknown".'
             )
 
     def fewest_vertices(self) -> int:
@@ -166,7 +166,7 @@ def _known_scale(mesh_x: Mesh, mesh_y: Mesh, partial: bool, scale: float | Scale
         if scale != 1.0:
             raise InputError(
                 f"scale is {scale!r}, but full shapes are scaled to the same area: leave the scale out, or "
-                "set partial=True (--partial)."
+                "set partial=True."
             )
         return 1.0
     if isinstance(scale, str):

@@ -180,7 +180,7 @@ def _shape(
         raise InputError(
             f"{mesh.name}: the largest of the {len(spectrum.eigenvalues)} eigenvalues is zero, so the "
             "eigenvectors only distinguish connected components: compute more eigenvectors than the mesh has "
-            "components, or join vertices at the same position (weld=True, on the command line --weld)."
+            "components, or join vertices at the same position (weld=True)."
         )
     return PreparedShape(mesh, spectrum, compared_samples(mesh))
 
@@ -518,7 +518,7 @@ def prepare(
         raise InputError(
             f"{pair.mesh_x.name} has area {pair.mesh_x.area * pair.scale**2:.3g} and {pair.mesh_y.name} has "
             f"area {pair.mesh_y.area:.3g}, so their units of length probably differ: scale one of the "
-            'meshes, or set scale="unknown" (--scale unknown).'
+            'meshes, or set scale="unknown".'
         )
     x, y = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver, step=step)
     return PreparedPair.of(pair, x, y, given=given, laplacian=laplacian, eigensolver=eigensolver)
