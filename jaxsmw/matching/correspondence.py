@@ -108,16 +108,13 @@ class Correspondence:
         if last.result != RESULTS.successful:
             cure = ' If the units of length differ, set scale="unknown".' if pair.partial else ""
             raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
-        initial_map, refined_map = (
-            extend_to_unreferenced(prepared.pair.mesh_x, matches)
-            for matches in (outcome.initial_map, outcome.pointwise_map)
-        )
+        refined_map = extend_to_unreferenced(prepared.pair.mesh_x, outcome.pointwise_map)
         pointwise_map, left_out = pair.with_small_components(refined_map)
         seen = outcome.last.seen
         return cls(
             pair=pair,
             pointwise_map=pointwise_map,
-            initial_map=initial_map,
+            initial_map=outcome.initial_map,
             origin=start.origin,
             preset=preset,
             spectrum_x=seen.x.reflect() if prepared.mirrored else seen.x,

@@ -73,26 +73,23 @@ def initial_map(
     another mesh, a mesh that is too coarse for SHOT, or signatures that are not finite. `ArithmeticError` if
     the functional map of `"functional"` cannot be computed.
     """
-    start = make_start(PreparedPair.from_spectra(pair, spectrum_x, spectrum_y), init)
-    return extend_to_unreferenced(pair.mesh_x, start.pointwise_map)
+    return make_start(PreparedPair.from_spectra(pair, spectrum_x, spectrum_y), init).pointwise_map
 
 
 def make_start(prepared: PreparedPair, init: InitialMap | ArrayLike | SurfacePoints) -> Start:
-    """Return the start of a prepared pair from the initial map that `initial_map` describes.
-
-    The matches of unreferenced vertices have no meaning.
-    """
+    """Return the start of a prepared pair from the initial map that `initial_map` describes."""
     init = check_initial_map(prepared.pair, init)
+    mesh_x = prepared.pair.mesh_x
     if isinstance(init, str):
-        method = METHODS[init]
-        pointwise_map = nearest_map(prepared, _finite(prepared, init, method.features(prepared)))
-        return Start(pointwise_map, init, has_alternatives=method.has_alternatives, is_rigid=method.is_rigid)
+        features, has_alternatives, is_rigid = METHODS[init]
+        matches = nearest_map(prepared, _finite(prepared, init, features(prepared)))
+        pointwise_map = extend_to_unreferenced(mesh_x, matches)
+        return Start(pointwise_map, init, has_alternatives=has_alternatives, is_rigid=is_rigid)
     if init.ndim == 1:
-        return Start(init, "map")
-    features = _finite(prepared, "landmark", _landmark_features(prepared, init))
-    pointwise_map = nearest_map(prepared, features)
-    pointwise_map[init[:, 0]] = init[:, 1]
-    return Start(pointwise_map, "landmarks")
+        return Start(extend_to_unreferenced(mesh_x, init), "map")
+    matches = nearest_map(prepared, _finite(prepared, "landmark", _landmark_features(prepared, init)))
+    matches[init[:, 0]] = init[:, 1]
+    return Start(extend_to_unreferenced(mesh_x, matches), "landmarks")
 
 
 def make_starts(

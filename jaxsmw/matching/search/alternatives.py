@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS
 from jaxsmw.matching.executor import run
@@ -252,7 +253,8 @@ class Alternatives:
         return self.y.samples.nearest[pointwise_map[self.x.samples.vertices]]
 
     def _extended(self, matches: SampleMap) -> Int64[np.ndarray, " m"]:
-        return self.y.samples.vertices[matches][self.x.samples.nearest]
+        everywhere = self.y.samples.vertices[matches][self.x.samples.nearest]
+        return extend_to_unreferenced(self.pair.mesh_x, everywhere)
 
 
 def _within(margin: float, candidates: Sequence[_Candidate]) -> list[_Candidate]:
