@@ -27,7 +27,7 @@ from jaxsmw.matching.search.proxies import Proxy, deformation, distance_error, m
 from jaxsmw.matching.search.repair import refine_and_repair
 from jaxsmw.matching.settings import AlternativeSettings, JudgeSettings
 from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
-from jaxsmw.matching.starts import make_start
+from jaxsmw.matching.starts import METHODS, make_start
 
 REPAIR = PRESETS["accurate"].repair
 # Fewer samples and levels, which compile faster.
@@ -208,7 +208,7 @@ def test_maps_that_look_right_are_compared(
     judge = JudgeSettings(suspicious=100.0, suspicious_area=1.0)
     settings = replace(REPAIR, judge=judge, compared=compared, finalists=finalists)
     pair = prepared(mesh_x, mesh_y, partial=is_partial)
-    start = make_start(pair, "shot")._replace(origin=init)
+    start = make_start(pair, "shot")._replace(origin=init, has_alternatives=METHODS[init].has_alternatives)
     found = refine_and_repair(pair, start, replace(TWO_STAGES, repair=settings))
     assert asked == [True] * compares and not found.suspicious
     assert len(found.outcome.runs) == (1 if compares else 2)
