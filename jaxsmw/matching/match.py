@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import logging
 import warnings
 from collections.abc import Sequence
@@ -184,14 +183,15 @@ def match_prepared(
 
     **Returns:** The `Correspondence`.
 
-    **Raises:** `ArithmeticError` if refinement fails numerically from every start.
+    **Raises:** `ArithmeticError` if refinement fails numerically from every start, or in the final stages.
     """
     preset = prepared.usable(preset)
     return_free_memory()
+    known: Sequence[Outcome | None] = outcomes or [None] * len(starts)
     with step("refinement"), one_blas_thread():
         repaired = [
             refine_and_repair(prepared, start, preset, outcome=outcome)
-            for start, outcome in itertools.zip_longest(starts, outcomes)
+            for start, outcome in zip(starts, known, strict=True)
         ]
     successful = [
         (start, scored) for start, scored in zip(starts, repaired, strict=True) if scored.successful
