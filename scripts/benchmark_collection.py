@@ -236,7 +236,7 @@ def _cycles(collection: Collection) -> dict[str, float]:
     for _ in range(_TRIANGLES if number > 2 else 0):
         i, j, k = generator.choice(number, 3, replace=False)
         mesh = collection.meshes[i]
-        vertex = generator.choice(np.flatnonzero(mesh.referenced_vertices), 20)
+        vertex = generator.choice(mesh.referenced_indices, 20)
         points = vertices_as_points(mesh)[vertex]
         for before, after in ((i, j), (j, k), (k, i)):
             points = collection.registered[after].project(collection.registered[before].project_back(points))

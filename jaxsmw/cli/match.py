@@ -93,7 +93,7 @@ def run(options: argparse.Namespace) -> None:
     if options.one_to_one:
         from jaxsmw.geometry.assignment import check_one_to_one
 
-        check_one_to_one(int(mesh_x.referenced_vertices.sum()), int(mesh_y.referenced_vertices.sum()))
+        check_one_to_one(len(mesh_x.referenced_indices), len(mesh_y.referenced_indices))
     correspondence = match_meshes(options, mesh_x, mesh_y, stopwatch)
     maps = _write_files(options, correspondence, stopwatch)
     expected = estimate_error(correspondence, stopwatch)

@@ -98,7 +98,6 @@ def estimate_error(correspondence: Correspondence, stopwatch: Stopwatch) -> Floa
 
 def show_quality(correspondence: Correspondence) -> None:
     """Print one line with the quality of a match."""
-
     mean = correspondence.mesh_x.average(correspondence.expected_error())
     parts = [
         f"distortion {correspondence.distortion:.3f} (1 for isometries)",

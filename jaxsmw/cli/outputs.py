@@ -116,7 +116,6 @@ def write_figure(path: str, figure: Figure) -> None:
 
 def write_text(path: str, text: str) -> None:
     """Write a text to a file."""
-
     with atomic_write(path) as temporary:
         temporary.write_text(text, "utf-8")
     report_written(path)

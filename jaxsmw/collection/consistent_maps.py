@@ -131,6 +131,6 @@ def _both_directions(maps: Mapping[Edge, EdgeMap]) -> dict[tuple[int, int], Surf
 
 def _cycle_samples(shape: PreparedShape) -> Int64[np.ndarray, " s"]:
     if shape.samples is None:
-        used = np.flatnonzero(shape.mesh.referenced_vertices)
+        used = shape.mesh.referenced_indices
         return used[:: max(1, len(used) // _CYCLE_SAMPLES)]
     return np.asarray(shape.samples, np.int64)[:_CYCLE_SAMPLES]

@@ -72,34 +72,28 @@ def run_batches(
     outcomes = [Outcome(start.pointwise_map) for _, start in tasks]
     for stage in stages:
         seen = _seen_by(stage, [pair for pair, _ in tasks])
-        # Pairs with and without crease eigenvectors need different programs.
-        for creased in (True, False):
-            numbers = [
-                i for i, pair in enumerate(seen) if (pair.x.crease_eigenvectors is not None) == creased
-            ]
-            shapes = {id(spectrum): spectrum for i in numbers for spectrum in seen[i].both}
-            samples = {
-                id(spectrum): of_shape
-                for i in numbers
-                for spectrum, of_shape in zip(seen[i].both, seen[i].samples or (), strict=False)
-            }
-            row = {key: number for number, key in enumerate(shapes)}
-            refined = refine_pairs(
-                list(shapes.values()),
-                [(row[id(seen[i].x)], row[id(seen[i].y)]) for i in numbers],
-                [maps[i] for i in numbers],
-                samples=[samples[key] for key in shapes] if samples else None,
-                batch_size=batch_size,
-                devices=devices,
-                **stage.settings(),
-            )
-            for number, refinement in refined:
-                i = numbers[number]
-                maps[i] = np.asarray(refinement.pointwise_map)
-                # After a failure, later stages still run for this pair, but their results are ignored.
-                if (before := outcomes[i]).successful:
-                    runs = (*before.runs, StageRun(stage, tasks[i][0], refinement))
-                    outcomes[i] = Outcome(before.initial_map, runs)
+        shapes = {id(spectrum): spectrum for pair in seen for spectrum in pair.both}
+        samples = {
+            id(spectrum): of_shape
+            for pair in seen
+            for spectrum, of_shape in zip(pair.both, pair.samples or (), strict=False)
+        }
+        row = {key: number for number, key in enumerate(shapes)}
+        refined = refine_pairs(
+            list(shapes.values()),
+            [(row[id(pair.x)], row[id(pair.y)]) for pair in seen],
+            maps,
+            samples=[samples[key] for key in shapes] if samples else None,
+            batch_size=batch_size,
+            devices=devices,
+            **stage.settings(),
+        )
+        for number, refinement in refined:
+            maps[number] = np.asarray(refinement.pointwise_map)
+            # After a failure, later stages still run for this pair, but their results are ignored.
+            if (before := outcomes[number]).successful:
+                runs = (*before.runs, StageRun(stage, tasks[number][0], refinement))
+                outcomes[number] = Outcome(before.initial_map, runs)
     return outcomes
 
 

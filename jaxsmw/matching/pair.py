@@ -192,7 +192,7 @@ def number_of_usable_vertices(mesh: Mesh) -> int:
 
     **Raises:** `InputError` if there are fewer than 4, which are too few for matching.
     """
-    number = int(mesh.referenced_vertices.sum())
+    number = len(mesh.referenced_indices)
     if number < _FEWEST_VERTICES:
         raise InputError(
             f"{mesh.name}: its faces use {number} vertices, which are too few for a match: give a mesh with "

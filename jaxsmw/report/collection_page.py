@@ -147,7 +147,7 @@ def simplify(mesh: Mesh, most: int) -> tuple[Int64[np.ndarray, " q"], Int64[np.n
     unreferenced vertices are removed. Return the indices of the chosen vertices (q,), and faces (g, 3) that
     refer to the chosen vertices. A mesh with at most `most` vertices keeps all its vertices and faces.
     """
-    n, used = len(mesh.vertices), np.flatnonzero(mesh.referenced_vertices)
+    n, used = len(mesh.vertices), mesh.referenced_indices
     if n <= most:
         return np.arange(n), mesh.faces
     numbers = np.full(n, -1)

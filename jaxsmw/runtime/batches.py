@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple, TypeVar, Unpack
 
@@ -143,7 +143,7 @@ def refine_pairs(
     mesh = Mesh(np.array(devices), ("pairs",))
 
     def results() -> Iterator[tuple[int, Refinement]]:
-        for sizes, positions in _positions_by_size(spectra, pairs).items():
+        for sizes, positions in _positions_by_size(spectra, pairs):
             needed = bytes_per_pair(
                 sizes.m, sizes.n, max(sizes.k_x, sizes.k_y), spectra[0].eigenvectors.dtype.itemsize
             )
@@ -215,12 +215,15 @@ class _Sizes(NamedTuple):
 
 def _positions_by_size(
     spectra: Sequence[Spectrum], pairs: Sequence[tuple[int, int]]
-) -> dict[_Sizes, list[int]]:
-    groups: dict[_Sizes, list[int]] = {}
+) -> list[tuple[_Sizes, list[int]]]:
+    """Group pairs that share a program: by their sizes, and by the optional arrays of their spectra."""
+    groups: dict[tuple[_Sizes, Hashable, Hashable], list[int]] = {}
     for position, pair in enumerate(pairs):
-        (m, k_x), (n, k_y) = (spectra[shape].eigenvectors.shape for shape in pair)
-        groups.setdefault(_Sizes(padded_size(m), padded_size(n), k_x, k_y), []).append(position)
-    return groups
+        x, y = (spectra[shape] for shape in pair)
+        (m, k_x), (n, k_y) = x.eigenvectors.shape, y.eigenvectors.shape
+        sizes = _Sizes(padded_size(m), padded_size(n), k_x, k_y)
+        groups.setdefault((sizes, jax.tree.structure(x), jax.tree.structure(y)), []).append(position)
+    return [(sizes, positions) for (sizes, *_), positions in groups.items()]
 
 
 _DIVIDED, _EVERYWHERE = PartitionSpec("pairs"), PartitionSpec()

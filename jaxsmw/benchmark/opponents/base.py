@@ -156,11 +156,10 @@ class HostShape:
     @classmethod
     def of(cls, mesh: Mesh, spectrum: Spectrum) -> HostShape:
         """Return a mesh and its spectrum without unreferenced vertices."""
-        used = mesh.referenced_vertices
-        if not used.all():
-            faces = (np.cumsum(used) - 1)[mesh.faces]
-            mesh = make_mesh(mesh.vertices[used], faces, name=mesh.name)
-        return cls(mesh, np.flatnonzero(used), spectrum)
+        used = mesh.referenced_indices
+        if len(used) < len(mesh.vertices):
+            mesh = make_mesh(*mesh.compact(), name=mesh.name)
+        return cls(mesh, used, spectrum)
 
     @property
     def eigenvalues(self) -> Float64[np.ndarray, " k"]:

@@ -74,7 +74,7 @@ class Alternatives:
 
     def _proxy(self, side: tuple[PreparedShape, float]) -> Proxy:
         shape, unit = side
-        number = min(self.settings.alternatives.samples, int(shape.mesh.referenced_vertices.sum()))
+        number = min(self.settings.alternatives.samples, len(shape.mesh.referenced_indices))
         samples = SurfaceSamples.along_surface(shape.mesh, farthest_point_samples(shape.mesh, number))
         return Proxy(shape.mesh, shape.spectrum, samples, unit)
 
