@@ -71,7 +71,8 @@ class StageRun:
     @property
     def _arguments(self) -> tuple[Refiner, Problem, State]:
         problem = Problem(*self.seen.padded.both, partial=self.spectra.partial)
-        return self.stage.refiner, problem, self.refinement.state
+        # Stages with other levels share the program.
+        return self.stage.refiner.with_traced_levels(), problem, self.refinement.state
 
 
 def _reverse_map(refiner: Refiner, problem: Problem, state: State) -> Int32[Array, " n"]:
