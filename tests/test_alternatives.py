@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import mean_error
+from synthetic import mean_error, refine_and_repair
 
 from jaxsmw import creature_pair, geodesic_error, match, read_mesh
 from jaxsmw.benchmark.datasets import open_data_set
@@ -24,7 +24,6 @@ from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.alternatives import Alternatives
 from jaxsmw.matching.search.proxies import Proxy, deformation, distance_error, map_difference
-from jaxsmw.matching.search.repair import refine_and_repair
 from jaxsmw.matching.settings import AlternativeSettings, JudgeSettings
 from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
 from jaxsmw.matching.starts import METHODS, make_start

@@ -368,7 +368,7 @@ def test_batches_are_not_refined_a_second_time(three, monkeypatch):
         raise AssertionError("a stage ran on a single pair")
 
     monkeypatch.setattr("jaxsmw.matching.executor.run", refuse)
-    monkeypatch.setattr("jaxsmw.matching.search.repair.run", refuse)
+    monkeypatch.setattr("jaxsmw.matching.match.run", refuse)
     found = match_pairs(three, PAIRS, preset="paper", batch_size=3)
     assert len(dict(found)) == len(PAIRS)
 

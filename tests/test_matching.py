@@ -30,10 +30,9 @@ from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching import preparation
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.match import match
+from jaxsmw.matching.match import match, refine_and_judge
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import describe, paired_spectra
-from jaxsmw.matching.search.repair import refine_and_repair
 from jaxsmw.matching.stages import PRESETS, Preset, Stage, choose_preset
 from jaxsmw.matching.starts import INITIAL_MAPS, METHODS, initial_map
 from jaxsmw.runtime import threads as threads_module
@@ -346,10 +345,10 @@ def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
 
     def watched(*arguments, **options):
         meanwhile.append(threads())
-        return refine_and_repair(*arguments, **options)
+        return refine_and_judge(*arguments, **options)
 
     meanwhile: list[list[int]] = []
-    monkeypatch.setattr("jaxsmw.matching.match.refine_and_repair", watched)
+    monkeypatch.setattr("jaxsmw.matching.match.refine_and_judge", watched)
     threads_module._libraries.cache_clear()  # other tests load libraries that bring their own BLAS
     with threadpool_limits(2, user_api="blas"):
         before = threads()

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
-from synthetic import body_with_arms
+from synthetic import body_with_arms, refine_and_repair
 
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -22,7 +22,7 @@ from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search import repair
-from jaxsmw.matching.search.repair import refine_and_repair, refine_further
+from jaxsmw.matching.search.repair import refine_further
 from jaxsmw.matching.settings import JudgeSettings, RepairSettings
 from jaxsmw.matching.stages import PRESETS, Preset, Stage
 from jaxsmw.report.summary import summarize
@@ -365,7 +365,8 @@ def test_final_stages_run_once_after_repair(body, swapped, identity, monkeypatch
         ran.extend(stages)
         return run(stages, spectra, start)
 
-    monkeypatch.setattr("jaxsmw.matching.search.repair.run", watched)
+    for module in ("match", "search.repair"):
+        monkeypatch.setattr(f"jaxsmw.matching.{module}.run", watched)
     found = match(mesh, mesh, preset=preset, init=swapped, mirror="no", history=True)
     recorded = replace(final, history=True)
     assert ran.count(recorded) == 1 and ran[-1] == recorded and ran.count(STAGE) > 2

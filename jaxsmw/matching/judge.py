@@ -10,7 +10,7 @@ without padding and with a few hundred eigenvectors. `settings` and `scores` are
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,7 @@ from jaxsmw.geometry.mesh import connected_components, extend_from
 from jaxsmw.geometry.sampling import coarse_edges
 from jaxsmw.matching.outcome import Outcome, StageRun
 from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.settings import (
     ExpectedErrorSettings,
     JudgeSettings,
@@ -28,6 +29,7 @@ from jaxsmw.matching.settings import (
     WrongProbabilitySettings,
 )
 from jaxsmw.matching.spectral_pair import SpectralPair
+from jaxsmw.matching.stages import Stage
 
 _DEFAULT = ScoreSettings()
 
@@ -353,6 +355,13 @@ class Judge:
     spectra: SpectralPair
     settings: JudgeSettings
     measure_deformation: Callable[[Int64[np.ndarray, " m"]], float] | None = None
+
+    @classmethod
+    def of(cls, prepared: PreparedPair, stages: Sequence[Stage], settings: JudgeSettings) -> Judge:
+        """Return a judge that sees the spectra of the stage with the most eigenvectors."""
+        seen = (prepared.spectra.seen_by(stage) for stage in stages)
+        finest = max(seen, key=lambda spectra: spectra.x.eigenvalues.shape[0])
+        return cls(prepared.pair, finest, settings)
 
     def judged(self, outcome: Outcome) -> Scored:
         """Measure an outcome, and decide whether it is suspicious. A failed outcome is suspicious."""

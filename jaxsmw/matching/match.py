@@ -28,13 +28,15 @@ from jaxsmw.geometry.mesh import Mesh, MeshLike
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.advice import advice
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.executor import compile_stage
+from jaxsmw.matching.executor import compile_stage, run
+from jaxsmw.matching.judge import Judge, Scored, estimate_error
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, prepare
 from jaxsmw.matching.search.chirality import Decision, Hands
-from jaxsmw.matching.search.repair import choose, finish, refine_and_repair
+from jaxsmw.matching.search.repair import refine_further, repair_map
 from jaxsmw.matching.search.trimming import match_trimmed, trimmed_stage
+from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
 from jaxsmw.matching.starts import check_initial_map, make_starts
 from jaxsmw.runtime.memory import return_free_memory
@@ -188,26 +190,64 @@ def match_prepared(
     preset = prepared.usable(preset)
     return_free_memory()
     known: Sequence[Outcome | None] = outcomes or [None] * len(starts)
+    candidates = []
     with step("refinement"), one_blas_thread():
-        repaired = [
-            refine_and_repair(prepared, start, preset, outcome=outcome)
-            for start, outcome in zip(starts, known, strict=True)
-        ]
-    successful = [
-        (start, scored) for start, scored in zip(starts, repaired, strict=True) if scored.successful
-    ]
-    start, scored = successful[0] if successful else (starts[0], repaired[0])
+        for start, outcome in zip(starts, known, strict=True):
+            scored = refine_and_judge(prepared, start, preset, outcome)
+            candidates.append((start, repair_map(prepared, start, preset, scored)))
+    successful = [(start, scored) for start, scored in candidates if scored.successful]
+    start, scored = (successful or candidates)[0]
     if len(successful) > 1:
         with step("choice of start"):
-            start, scored = choose(prepared, preset, successful)
+            start, scored = _choose(prepared, preset, successful)
     last = step("final stages") if preset.final or preset.repair else nullcontext()
     with last, one_blas_thread():
         if trimmed := match_trimmed(prepared, preset, scored):
             prepared, scored = trimmed
         else:
-            scored = finish(prepared, start, preset, scored)
+            scored = refine_further(prepared, start, preset, scored)
+            scored = _run_final(prepared, preset, scored)
         jax.block_until_ready(scored.outcome.last.refinement)
     return Correspondence.of(prepared, start, preset, scored)
+
+
+def refine_and_judge(
+    prepared: PreparedPair, start: Start, preset: Preset, outcome: Outcome | None = None
+) -> Scored:
+    """Run all stages before the final ones from a start, unless their outcome is given, and judge the map."""
+    if outcome is None:
+        outcome = run(preset.before_final, prepared.spectra, start)
+    return Judge.of(prepared, preset.before_final, preset.criteria).judged(outcome)
+
+
+def _choose(
+    prepared: PreparedPair, preset: Preset, candidates: Sequence[tuple[Start, Scored]]
+) -> tuple[Start, Scored]:
+    """Choose the start whose map has the smallest mean expected error. Rigid starts are preferred.
+
+    The expected errors have `area_weight` 0. A positive weight would multiply them by a factor that depends
+    on the shapes, not on the quality of the map. (Entry R24 of docs/research_log.md)
+    """
+    repair, mesh_x = preset.repair, prepared.given.mesh_x
+    if repair is None:
+        return candidates[0]
+    settings = ExpectedErrorSettings(area_weight=0.0), repair.judge.scores
+
+    def error(candidate: tuple[Start, Scored]) -> float:
+        start, scored = candidate
+        errors = estimate_error(prepared.matched, scored.pointwise_map, scored.outcome.last, *settings)
+        return (repair.aligned_preference if start.is_rigid else 1.0) * float(mesh_x.average(errors))
+
+    return min(reversed(candidates), key=error)  # of equal errors, that of the last start counts
+
+
+def _run_final(prepared: PreparedPair, preset: Preset, scored: Scored) -> Scored:
+    """Run the final stages from a map. The result is as suspicious as the given map."""
+    if not (preset.final and scored.successful):
+        return scored
+    after = run(preset.final, prepared.spectra, Start(scored.pointwise_map))
+    judge = Judge.of(prepared, preset.final, preset.criteria)
+    return judge.measured(scored.outcome.followed_by(after), suspicious=scored.suspicious)
 
 
 def _compile_ahead(pair: Pair, preset: Preset) -> None:

@@ -13,25 +13,19 @@ from jaxtyping import Bool, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import Judge, Scored, estimate_error
+from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.alternatives import Alternatives
-from jaxsmw.matching.settings import ExpectedErrorSettings, RepairSettings
+from jaxsmw.matching.settings import RepairSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset, Stage
 
 logger = logging.getLogger("jaxsmw")
 
 
-def refine_and_repair(
-    prepared: PreparedPair,
-    start: Start,
-    preset: Preset,
-    *,
-    outcome: Outcome | None = None,
-) -> Scored:
-    """Run the first and the repeated stages of a preset from a start, and repair a map that looks wrong.
+def repair_map(prepared: PreparedPair, start: Start, preset: Preset, best: Scored) -> Scored:
+    """Repair a map that looks wrong.
 
     docs/how_it_works.md explains the steps. Alternative maps are tried first, and only for the initial map
     `"shot"`. Rounds of repair follow if the best map still looks wrong. If the map of two near-isometric full
@@ -43,17 +37,15 @@ def refine_and_repair(
 
     - `prepared`: the prepared pair.
     - `start`: the initial map.
-    - `preset`: the stages and the repair. Without repair, the outcome is judged but not repaired.
-    - `outcome`: the outcome of the stages if they have already run, such as a result of `run_batches`.
+    - `preset`: the stages and the repair. Without repair, the map is returned as it is.
+    - `best`: the judged map of `preset.before_final`. A failed map is returned as it is.
 
     **Raises:** `InputError` if alternative maps cannot be computed.
     """
-    judge, repair = _judge(prepared, preset.before_final, preset), preset.repair
-    if outcome is None:
-        outcome = run(preset.before_final, prepared.spectra, start)
-    best = judge.judged(outcome)
+    repair = preset.repair
     if repair is None or not best.successful:
         return best
+    judge = Judge.of(prepared, preset.before_final, preset.criteria)
     repeater = _Repeater(prepared.spectra, preset.repeated, judge, repair)
     has_alternatives = start.has_alternatives and repair.finalists > 0
     compares = has_alternatives and not prepared.pair.partial
@@ -85,27 +77,6 @@ def refine_and_repair(
     return replace(best, rivals=proxies.different(best, best.rivals))
 
 
-def choose(
-    prepared: PreparedPair, preset: Preset, candidates: Sequence[tuple[Start, Scored]]
-) -> tuple[Start, Scored]:
-    """Choose the start whose map has the smallest mean expected error. Rigid starts are preferred.
-
-    The expected errors have `area_weight` 0. A positive weight would multiply them by a factor that depends
-    on the shapes, not on the quality of the map. (Entry R24 of docs/research_log.md)
-    """
-    repair, mesh_x = preset.repair, prepared.given.mesh_x
-    if repair is None:
-        return candidates[0]
-    settings = ExpectedErrorSettings(area_weight=0.0), repair.judge.scores
-
-    def error(candidate: tuple[Start, Scored]) -> float:
-        start, scored = candidate
-        errors = estimate_error(prepared.matched, scored.pointwise_map, scored.outcome.last, *settings)
-        return (repair.aligned_preference if start.is_rigid else 1.0) * float(mesh_x.average(errors))
-
-    return min(reversed(candidates), key=error)  # of equal errors, that of the last start counts
-
-
 def refine_further(prepared: PreparedPair, start: Start, preset: Preset, scored: Scored) -> Scored:
     """Run further passes for non-isometric shapes, because their maps converge slowly.
 
@@ -116,7 +87,7 @@ def refine_further(prepared: PreparedPair, start: Start, preset: Preset, scored:
     - `prepared`: the prepared pair.
     - `start`: the initial map.
     - `preset`: the stages and the repair. Without repair, no pass runs.
-    - `scored`: a result of `refine_and_repair`.
+    - `scored`: a result of `repair_map`.
 
     **Returns:** The map after the last pass, as suspicious as the given map. The given map is returned if no
     pass runs, if a pass fails, or if the passes worsen the score by more than `pass_tolerance`.
@@ -124,7 +95,7 @@ def refine_further(prepared: PreparedPair, start: Start, preset: Preset, scored:
     repair = preset.repair
     if repair is None or not scored.successful:
         return scored
-    judge = _judge(prepared, preset.before_final, preset)
+    judge = Judge.of(prepared, preset.before_final, preset.criteria)
     change = judge.area_change(scored)
     # Rigidly aligned full shapes differ in form, not in pose. Coarse passes lower the errors of such pairs
     # even if the area-based shape difference is small. (Entry R24)
@@ -159,27 +130,6 @@ def refine_further(prepared: PreparedPair, start: Start, preset: Preset, scored:
     # Passes also lower the distortion of wrong maps. Therefore a low distortion after the passes does not
     # show that a map is right. (Entry R36)
     return replace(after, suspicious=scored.suspicious)
-
-
-def finish(prepared: PreparedPair, start: Start, preset: Preset, scored: Scored) -> Scored:
-    """Refine a map further, and run the final stages of the preset; see `refine_further`.
-
-    **Returns:** The map after the last stage, with its distortion. The attribute `suspicious` is copied from
-    the given map.
-    """
-    scored = refine_further(prepared, start, preset, scored)
-    if not (preset.final and scored.successful):
-        return scored
-    after = run(preset.final, prepared.spectra, Start(scored.pointwise_map))
-    outcome = scored.outcome.followed_by(after)
-    return _judge(prepared, preset.final, preset).measured(outcome, suspicious=scored.suspicious)
-
-
-def _judge(prepared: PreparedPair, stages: Sequence[Stage], preset: Preset) -> Judge:
-    """Return a judge that sees the spectra of the stage with the most eigenvectors."""
-    seen = (prepared.spectra.seen_by(stage) for stage in stages)
-    finest = max(seen, key=lambda spectra: spectra.x.eigenvalues.shape[0])
-    return Judge(prepared.pair, finest, preset.criteria)
 
 
 def _without_creases(spectra: SpectralPair) -> SpectralPair:
