@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Int64
 
-from jaxsmw.choices import Eigensolver
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, Eigensolver
 from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.pairs import match_many, prepare_task
 from jaxsmw.collection.shapes import preset_key, shape_key
@@ -200,7 +200,7 @@ class EdgeMatcher:
     def _key(self, edge: Edge, init: InitialMap) -> tuple[Any, ...]:
         x, y = (shape_key(self.shapes[number], self.preset, self.eigensolver) for number in edge)
         axes = () if self.axes is None else (self.axes.principal.axes,)
-        first = "shot" if init is None else init
+        first = DEFAULT_INITIAL_MAP if init is None else init
         return (*x, *y, *axes, *preset_key(self.preset), str(self.aligned), first)
 
 

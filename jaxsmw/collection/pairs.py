@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Int64
 
-from jaxsmw.choices import DEFAULT_PRESET
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_PRESET
 from jaxsmw.collection.consistency import check_pairs
 from jaxsmw.collection.shapes import fitted_preset, prepare_collection, warned_already
 from jaxsmw.errors import check_whole_number
@@ -102,7 +102,9 @@ def prepare_task(
     pair = Pair(x.mesh, y.mesh)
     prepared = PreparedPair.of(pair, x, y, given=given)
     with warned_already():
-        starts = make_starts(prepared, "shot" if init is None else init, rigid=aligned and init is None)
+        starts = make_starts(
+            prepared, DEFAULT_INITIAL_MAP if init is None else init, rigid=aligned and init is None
+        )
     return prepared, starts
 
 

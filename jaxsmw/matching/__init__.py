@@ -1,4 +1,4 @@
-"""What a match is made of, in the order in which it runs. No module imports one that stands below it.
+"""What a match is made of. No module imports one that stands below it, so the list reads from the top.
 
 - `pair`: two meshes, and the units in which they are compared.
 - `settings`, `stages`: what refines a map, and presets that say in which order.
@@ -11,5 +11,5 @@
 - `search`: mirror images, alternative maps, repair and trimming.
 - `correspondence`: the result, for the vertices of the given meshes.
 - `advice`: what `match` tells about a map that may be wrong.
-- `match`: all of these in one function.
+- `match`: all of these in one function, in the order in which they run.
 """

@@ -140,14 +140,15 @@ def match(
     prepared = prepare(
         surfaces, method.sizes, given=pair, laplacian=laplacian, eigensolver=eigensolver, step=step
     )
-    decision = Decision(mirror == "yes")
     aligns = automatic and method.repair is not None  # "aligned" is used only for asymmetric shapes
+    decision = Decision(mirror == "yes")
     if (mirror == "auto" or aligns) and not partial:
         with step("mirror test"):
             decision = Hands(surfaces, *prepared.spectra.both).decide(mirror)
-        if decision.mirrored and mirror == "auto":
-            logger.info("%s: the mirror image of the source is matched", pair.name)
+    # SHOT changes in a mirror image, so initial maps and descriptors are computed after this decision.
     if decision.mirrored:
+        if mirror == "auto":
+            logger.info("%s: the mirror image of the source is matched", pair.name)
         prepared = prepared.mirror()
     with step("initial map"):
         starts = make_starts(prepared, first_init, rigid=aligns and decision.asymmetric)
@@ -155,6 +156,7 @@ def match(
         with step("descriptors"):
             prepared = prepared.describe(method.number_of_descriptors, required=not adapts)
     correspondence = match_prepared(prepared, starts, method, step=step)
+    # The advice distinguishes a map that looks wrong from a doubtful hand. The result does not.
     for text in advice(correspondence, decision):
         warnings.warn(text, stacklevel=2)
     return replace(

@@ -1,4 +1,4 @@
-"""The settings of the repair, of the expected error, and of the choice between X and its mirror image."""
+"""The settings of the repair, of the judge, and of the expected error."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Int64
 from numpy.typing import ArrayLike
 
-from jaxsmw.choices import InitialMap
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
@@ -37,7 +37,7 @@ def initial_map(
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
     *,
-    init: InitialMap | ArrayLike | SurfacePoints = "shot",
+    init: InitialMap | ArrayLike | SurfacePoints = DEFAULT_INITIAL_MAP,
 ) -> Int64[np.ndarray, " m"]:
     """Compute the pointwise map T: X -> Y from which refinement begins.
 
