@@ -10,7 +10,7 @@ from .core.refiners.feature_regression import FeatureRegression
 from .core.refiners.registration import Registration
 from .core.refiners.wavelet_preservation import WaveletPreservation
 from .core.results import RESULTS
-from .core.solutions import Filtering, LeastSquares
+from .core.solutions.closed_form import Filtering, LeastSquares
 from .core.spectrum import Spectrum
 from .creature import creature_pair
 from .errors import InputError

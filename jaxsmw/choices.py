@@ -38,11 +38,9 @@ Eigensolver = Literal["auto", "exact", "approximate"]
 APPROXIMATE_FROM = 50_000
 """The smallest number of vertices for which the eigensolver `"auto"` chooses `"approximate"`."""
 
-Search = Literal["auto", "exhaustive", "patches"]
-"""The methods of nearest-neighbour search; `"auto"` chooses the faster method.
-
-`"patches"` compares embeddings only, so a refiner that also compares descriptors can find other matches.
-"""
+Backend = Literal["auto", "numpy", "jax"]
+"""What refines one pair; `"auto"` chooses NumPy on machines without accelerators, see `jaxsmw.match`."""
+DEFAULT_BACKEND: Backend = "auto"
 
 GeodesicMethod = Literal["strips", "exact"]
 """The methods that compute geodesic distances; see `jaxsmw.geometry.geodesic_distances`."""

@@ -4,17 +4,12 @@
 """
 
 from jaxsmw.core.functional_map import QuadraticEnergy, WaveletProblem, encode, multiscale_kernel
-from jaxsmw.core.pointwise_map import decode, decode_to_triangles, search_patches
+from jaxsmw.core.pointwise_map import decode, decode_to_triangles
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
-from jaxsmw.core.solutions import (
-    DescriptorPair,
-    Filtering,
-    LeastSquares,
-    NearestOrthogonal,
-    RegularizedLeastSquares,
-    Solution,
-)
+from jaxsmw.core.solutions.closed_form import Filtering, LeastSquares, NearestOrthogonal, Solution
+from jaxsmw.core.solutions.descriptors import DescriptorPair
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.core.triangles import nearest_point_on_triangles
 from jaxsmw.matching.preparation import describe
 
@@ -35,7 +30,6 @@ __all__ = [
     "multiscale_kernel",
     "nearest_neighbor",
     "nearest_point_on_triangles",
-    "search_patches",
     "wave_kernel_signature",
     "wavelet_signature",
 ]

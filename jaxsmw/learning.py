@@ -3,6 +3,7 @@
 The page `docs/gradients.md` explains their use.
 """
 
+from jaxsmw.core.functional_map import pull_back
 from jaxsmw.core.soft_maps import (
     NearestFew,
     Recovery,
@@ -10,7 +11,6 @@ from jaxsmw.core.soft_maps import (
     SoftMap,
     Softmax,
     SparseSoftMap,
-    pull_back,
     sinkhorn,
 )
 from jaxsmw.core.soft_refinement import SoftRefinement, WaveletPreservationLayer, refine_softly

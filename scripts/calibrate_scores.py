@@ -45,7 +45,6 @@ from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.judge import dirichlet_energy_ratio, distortion, wrong_probability
 from jaxsmw.matching.settings import WrongProbabilitySettings
 from jaxsmw.matching.stages import PRESETS, PresetName
-from jaxsmw.runtime.compilation import release_programs
 from jaxsmw.runtime.provenance import made_with
 
 GROSS, TENTH = 0.1, 0.1
@@ -231,7 +230,6 @@ def main() -> None:
     for preset, (data_set_name, pair) in tqdm(list(product(options.preset, drawn)), unit="map"):
         name = data_set_name if len(options.preset) == 1 else f"{data_set_name}, {preset}"
         measured.setdefault(name, []).append(measure(pair, options.seed, preset))
-        release_programs()
     page = "\n".join((*tables(measured), made_with() + "\n"))
     print(page)
     if options.output:

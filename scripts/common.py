@@ -17,7 +17,6 @@ from jaxsmw.benchmark.journal import Journal
 from jaxsmw.benchmark.tables import markdown
 from jaxsmw.io import Landmarks, read_landmark_file
 from jaxsmw.report.summary import provenance
-from jaxsmw.runtime.compilation import release_programs
 from jaxsmw.runtime.files import atomic_write, make_directory
 
 Part = tuple[str, str, list[list[str]], dict[str, Any]]
@@ -123,7 +122,6 @@ def measure_pairs(
     for pair in pairs:
         source, target = names(pair)
         if (source, target) not in journal:
-            release_programs()
             row = {"source": source, "target": target, **measure(pair)}
             journal.append([row])
             print(row, flush=True)

@@ -7,7 +7,7 @@ import pytest
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.solutions import Filtering
+from jaxsmw.core.solutions.closed_form import Filtering
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.metrics import geodesic_error

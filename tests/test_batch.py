@@ -17,7 +17,8 @@ from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
+from jaxsmw.core.solutions.closed_form import LeastSquares
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.runtime import batches as batch
 from jaxsmw.runtime.batches import bytes_per_pair, padded_size, refine_pairs, stack
 

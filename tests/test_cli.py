@@ -35,7 +35,8 @@ from jaxsmw.cli.banks import BANKS, bounds_unless_tight, make_bank
 from jaxsmw.cli.console import with_options
 from jaxsmw.cli.run import run_command
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
+from jaxsmw.core.solutions.closed_form import Filtering, LeastSquares
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.geometry.eigenbasis import compute_spectrum

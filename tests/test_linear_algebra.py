@@ -22,7 +22,8 @@ from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.soft_refinement import refine_softly
-from jaxsmw.core.solutions import Filtering, LeastSquares, NearestOrthogonal, RegularizedLeastSquares
+from jaxsmw.core.solutions.closed_form import Filtering, LeastSquares, NearestOrthogonal
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.runtime.batches import stack
 
 BATCH = 4

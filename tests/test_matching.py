@@ -21,7 +21,7 @@ from jaxsmw.core.refiner import State
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.core.solutions import LeastSquares
+from jaxsmw.core.solutions.closed_form import LeastSquares
 from jaxsmw.creature import creature_pair
 from jaxsmw.errors import InputError
 from jaxsmw.geometry import eigenbasis

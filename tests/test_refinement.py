@@ -24,7 +24,8 @@ from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.solutions import Filtering, LeastSquares, RegularizedLeastSquares
+from jaxsmw.core.solutions.closed_form import Filtering, LeastSquares
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 
 M, K = 300, 15

@@ -16,7 +16,9 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.soft_maps import NearestFew, Recovery, Sinkhorn, Softmax, pull_back
 from jaxsmw.core.soft_refinement import WaveletPreservationLayer, refine_softly
-from jaxsmw.core.solutions import DescriptorPair, Filtering, LeastSquares, RegularizedLeastSquares
+from jaxsmw.core.solutions.closed_form import Filtering, LeastSquares
+from jaxsmw.core.solutions.descriptors import DescriptorPair
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 
 M, K = 120, 8

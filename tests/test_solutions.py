@@ -15,12 +15,9 @@ from jaxsmw.core.functional_map import QuadraticEnergy, encode
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.solutions import (
-    DescriptorPair,
-    Filtering,
-    LeastSquares,
-    RegularizedLeastSquares,
-)
+from jaxsmw.core.solutions.closed_form import Filtering, LeastSquares
+from jaxsmw.core.solutions.descriptors import DescriptorPair
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 
 M, N, K_X, K_Y, D = 70, 60, 7, 6, 3

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, get_args
 
 from jaxsmw.choices import (
+    DEFAULT_BACKEND,
     DEFAULT_MATCH_INIT,
     DEFAULT_MIRROR,
     DEFAULT_PRESET,
     ITERATIONS,
     NUMBER_OF_EIGENVECTORS,
+    Backend,
     MatchInit,
     Mirror,
     PresetName,
     Scale,
-    Search,
 )
 from jaxsmw.cli.arguments import add_eigenproblem, add_values, option_of, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
@@ -46,10 +49,8 @@ _CHANGES = (
     "solution",
     "iterations",
     "samples",
-    "search",
     "stop_when_unchanged",
 )
-_DEFAULT_SEARCH: Search = get_args(Search)[0]
 # The preset that the options in `_CHANGES` modify.
 _PAPER: PresetName = "paper"
 
@@ -80,6 +81,13 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "samples; accurate has more stages and repairs maps, so refinement takes nine to ten times as long "
         f"as with paper (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is "
         "given)",
+    )
+    group.add_argument(
+        "--backend",
+        choices=get_args(Backend),
+        default=DEFAULT_BACKEND,
+        help="what computes the refinement: numpy starts at once, jax compiles it first for the sizes of the "
+        "meshes; auto is jax if JAX has an accelerator, else numpy (default: %(default)s)",
     )
     group.add_argument(
         "--mirror",
@@ -123,12 +131,6 @@ def _add_changes(group: argparse._ActionsContainer) -> None:
             "--samples N": "number of samples per shape on which the refiner iterates; the last step matches "
             "all vertices (default: the refiner iterates on all vertices)",
         },
-    )
-    group.add_argument(
-        "--search",
-        choices=get_args(Search),
-        help="method of nearest-neighbour search: exhaustive and patches give the same result; patches is "
-        f"faster on large meshes; auto chooses the faster search (default: {_DEFAULT_SEARCH})",
     )
     group.add_argument(
         "--stop-when-unchanged",
@@ -175,8 +177,6 @@ def match_meshes(
 
     Some commands have no options `--partial`, `--scale` and `--index-base`.
     """
-    import jax
-
     from jaxsmw.matching.match import match
 
     scale: float | Scale | None = getattr(options, "scale", None)
@@ -187,7 +187,7 @@ def match_meshes(
             f"note: preset {_PAPER} replaces {DEFAULT_PRESET}, because {listed} "
             f"{'changes' if len(changes) == 1 else 'change'} the paper's method."
         )
-    with jax.enable_x64(options.precision == "float64"):
+    with _precision(options.precision):
         correspondence = match(
             mesh_x,
             mesh_y,
@@ -198,6 +198,7 @@ def match_meshes(
             partial=getattr(options, "partial", False),
             scale=scale or 1.0,
             mirror=options.mirror,
+            backend=options.backend,
         )
     stopwatch.add(correspondence.seconds)
     if isinstance(scale, str):
@@ -210,19 +211,27 @@ def match_meshes(
     return correspondence
 
 
+def _precision(name: str) -> AbstractContextManager[object]:
+    """Return a context with the given default type of floats. JAX, which has this setting, may stay unloaded."""
+    if name != "float64" and "jax" not in sys.modules:
+        return nullcontext()
+    import jax
+
+    return jax.enable_x64(name == "float64")
+
+
 def _changed_stage(options: argparse.Namespace) -> Stage:
     """Return a stage that runs the MWP paper's method with the changes that the options request."""
-    from jaxsmw.core import solutions
+    from jaxsmw import functional_maps
     from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
     from jaxsmw.matching.stages import Stage
 
     kind, arguments = _SOLUTIONS[options.solution or _PAPER_SOLUTION]
     refiner = WaveletPreservation(
         bank=make_bank(options.bank, options.filters),
-        solution=getattr(solutions, kind)(*arguments),
-        search=options.search or _DEFAULT_SEARCH,
+        solution=getattr(functional_maps, kind)(*arguments),
     )
-    filtering = isinstance(refiner.solution, solutions.Filtering)
+    filtering = isinstance(refiner.solution, functional_maps.Filtering)
     if options.bank and filtering and (bounds := bounds_unless_tight(refiner.bank)):
         lower, upper = bounds
         say(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 from jaxtyping import Int64
 
@@ -22,8 +22,12 @@ from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.matching.starts import make_starts
-from jaxsmw.runtime.batches import check_devices
-from jaxsmw.runtime.compilation import release_programs
+from jaxsmw.runtime.backends import chosen_backend
+
+if TYPE_CHECKING:
+    from jax import Device
+else:
+    Device = Any
 
 # Each device refines this number of pairs before their maps are judged and repaired.
 _PAIRS_PER_DEVICE = 64
@@ -35,7 +39,7 @@ def match_pairs(
     *,
     preset: PresetName | Preset = DEFAULT_PRESET,
     batch_size: int | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Device] | None = None,
 ) -> Iterator[tuple[int, Correspondence]]:
     """Match any pairs of several full shapes.
 
@@ -61,7 +65,10 @@ def match_pairs(
     """
     uncut = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
     checked = check_pairs(pairs, len(uncut), "pair")
-    check_devices(devices)
+    if devices is not None:
+        from jaxsmw.runtime.batches import check_devices
+
+        check_devices(devices)
     if batch_size is not None:
         check_whole_number("batch_size", batch_size, 1)
     preset = choose_preset(preset)
@@ -113,15 +120,14 @@ def match_many(
     preset: Preset,
     *,
     batch_size: int | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Device] | None = None,
 ) -> Iterator[Correspondence | ArithmeticError]:
     """Match prepared pairs, and yield their results in order, or the error of a failed refinement.
 
     The stages run in batches, except on one CPU without a batch size. For each pair, the preset is adapted to
     small meshes. The other arguments are those of `match_pairs`.
     """
-    devices = jax.devices() if devices is None else devices
-    batched = batch_size is not None or len(devices) > 1 or devices[0].platform != "cpu"
+    batched = batch_size is not None or devices is not None or chosen_backend("auto") == "jax"
 
     def fitted() -> Iterator[tuple[Preset, PreparedPair, list[Start]]]:
         for prepared, starts in tasks:
@@ -130,13 +136,15 @@ def match_many(
 
     if not batched:
         for own, prepared, starts in fitted():
-            release_programs()
             yield _matched(prepared, starts, own)
         return
+    if devices is None:
+        import jax
+
+        devices = jax.devices()
     # All pairs of a batch run the same stages.
     for own, group in itertools.groupby(fitted(), key=lambda task: task[0]):
         while waiting := list(itertools.islice(group, _PAIRS_PER_DEVICE * len(devices))):
-            release_programs()
             flat = [(pair.spectra, start) for _, pair, starts in waiting for start in starts]
             outcomes = iter(run_batches(own.before_final, flat, batch_size=batch_size, devices=devices))
             for _, prepared, starts in waiting:

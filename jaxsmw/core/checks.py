@@ -8,26 +8,26 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import ParamSpec, TypeVar
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Bool
+
+from jaxsmw.core.arrays import Array, default_namespace, float_type, is_array, is_tracer, namespace
+from jaxsmw.core.module import Module, leaves
 
 Parameters = ParamSpec("Parameters")
 Returned = TypeVar("Returned")
 
 
-def as_parameter(value: ArrayLike | Sequence[float | int]) -> Array:
+def as_parameter(value: Array | float | Sequence[float | int]) -> Array:
     """Return a continuous parameter as an array of the default float type, which JAX can trace."""
-    return jnp.asarray(value, dtype=float)
+    return default_namespace().asarray(value, dtype=float_type())
 
 
-def all_finite(tree: PyTree) -> Bool[Array, ""]:
-    """Return whether the floating-point arrays of a pytree, at least one, contain only finite numbers."""
-    inexact = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in inexact]))
+def all_finite(tree: object) -> Bool[Array, ""]:
+    """Return whether the arrays of floats in a pytree, at least one, contain only finite numbers."""
+    inexact = [leaf for leaf in leaves(tree) if np.issubdtype(leaf.dtype, np.inexact)]
+    xp = namespace(*inexact)
+    return xp.all(xp.stack([xp.all(xp.isfinite(leaf)) for leaf in inexact]))
 
 
 def check_integer(name: str, value: object) -> None:
@@ -42,13 +42,19 @@ def check_option(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name}={value!r} is unknown: choose one of {', '.join(choices)}")
 
 
-def check_kind(name: str, value: object, *kinds: type) -> None:
-    """Raise `TypeError` if the value has none of the types `kinds`. The message names the first type."""
-    if isinstance(value, kinds):
+def check_array(name: str, value: object) -> None:
+    """Raise `TypeError` if the value is not an array of NumPy or JAX."""
+    if not is_array(value):
+        check_kind(name, value, np.ndarray)
+
+
+def check_kind(name: str, value: object, kind: type) -> None:
+    """Raise `TypeError` if the value does not have the type `kind`."""
+    if isinstance(value, kind):
         return
     shown = repr(value) if isinstance(value, str | int | float | type | None) else type(value).__name__
-    shown = "an array" if isinstance(value, jax.Array) else shown
-    needed = {np.ndarray: "an array", int: "an integer"}.get(kinds[0], f"a {kinds[0].__name__}")
+    shown = "an array" if is_array(value) else shown
+    needed = {np.ndarray: "an array", int: "an integer"}.get(kind, f"a {kind.__name__}")
     raise TypeError(f"the {name} is {shown}, but {needed} is needed")
 
 
@@ -57,18 +63,18 @@ def check_matches(name: str, pointwise_map: Array | np.ndarray, number_of_vertic
 
     **Raises:** `ValueError` if the map has another shape; `TypeError` if it is not an array of integers.
     """
-    check_kind(name, pointwise_map, np.ndarray, jax.Array)
+    check_array(name, pointwise_map)
     if pointwise_map.shape != (number_of_vertices,):
         raise ValueError(
             f"the {name} has shape {pointwise_map.shape}, but X has {number_of_vertices} vertices: give one "
             "vertex of Y for each vertex of X"
         )
-    if not jnp.issubdtype(pointwise_map.dtype, jnp.integer):
+    if not np.issubdtype(pointwise_map.dtype, np.integer):
         raise TypeError(f"the {name} has type {pointwise_map.dtype}, but integer vertex indices are needed")
 
 
 def check_between(
-    owner: eqx.Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
+    owner: Module, name: str, value: Array, *, low: float = 0.0, high: float = math.inf, ndim: int = 0
 ) -> None:
     """Raise `ValueError` unless a parameter has `ndim` dimensions and lies strictly between its limits.
 
@@ -77,7 +83,7 @@ def check_between(
     if value.ndim != ndim:
         wanted = "one number" if ndim == 0 else "a list of numbers"
         raise ValueError(f"the {name} of {type(owner).__name__} must be {wanted}, not of shape {value.shape}")
-    if isinstance(value, jax.core.Tracer):
+    if is_tracer(value):
         return
     # NumPy makes this comparison, because under `jax.jit`, JAX traces even comparisons between constants.
     host = np.asarray(value)

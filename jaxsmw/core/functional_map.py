@@ -38,13 +38,12 @@ the MWP paper. In the area norm, this holds for pushforwards, and for pullbacks 
 
 from __future__ import annotations
 
-from typing import Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
-import equinox as eqx
-import jax.numpy as jnp
-from jax.typing import DTypeLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float, Int
+from numpy.typing import DTypeLike
 
+from jaxsmw.core.arrays import Array, default_namespace, namespace
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import check_option
 from jaxsmw.core.linear_algebra import (
@@ -54,8 +53,15 @@ from jaxsmw.core.linear_algebra import (
     solve_positive_definite,
     symmetric_eigenvalues,
 )
-from jaxsmw.core.soft_maps import PointwiseMap, pull_back
+from jaxsmw.core.module import Module, field
 from jaxsmw.core.spectrum import Spectrum
+
+if TYPE_CHECKING:
+    from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
+
+    PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
+else:
+    PointwiseMap = Any  # the module of soft maps imports JAX
 
 Convention = Literal["pullback", "pushforward"]
 PseudoInverse = Literal["area", "least_squares"]
@@ -136,6 +142,24 @@ def encode_by(
     return product(dual_out.T, eigenvectors_in)
 
 
+def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
+    """Pull functions on Y (n, p) back to X (m, p), along a pointwise map or a soft map from X to Y.
+
+    With a pointwise map, each vertex of X receives the value at its match. With a soft map, each vertex of X
+    receives the mean of the values on Y, weighted with the shares of the vertex. No array of size m x n is
+    stored.
+
+    Entries of a pointwise map are not checked. JAX replaces an index above n - 1 by n - 1, and NumPy raises
+    `IndexError`. Both count a negative index from the end. If a refinement failed, all entries of its map are
+    -1, so check `Refinement.result` first.
+
+    **Raises:** `ValueError` if the map is a soft map and `functions_on_y` has the wrong shape.
+    """
+    if hasattr(pointwise_map, "pull_back"):
+        return pointwise_map.pull_back(functions_on_y)
+    return functions_on_y[pointwise_map]
+
+
 def multiscale_kernel(
     responses_out: Float[Array, "filters k_out"], responses_in: Float[Array, "filters k_in"]
 ) -> Float[Array, "k_out k_in"]:
@@ -148,7 +172,7 @@ def multiscale_kernel(
     return product(responses_out.T, responses_in)
 
 
-class QuadraticEnergy(eqx.Module):
+class QuadraticEnergy(Module):
     """A quadratic function of the functional map C: `E(C) = <C, C gram> - 2 <C, cross> + constant`.
 
     Here `<A, B>` is the sum of the elementwise product of the matrices A and B. Every sum of squares `sum_i
@@ -169,11 +193,13 @@ class QuadraticEnergy(eqx.Module):
     @classmethod
     def zero(cls, k_out: int, k_in: int, dtype: DTypeLike) -> QuadraticEnergy:
         """Return the energy that is zero for every C."""
-        return cls(jnp.zeros((k_in, k_in), dtype), jnp.zeros((k_out, k_in), dtype), jnp.zeros((), dtype))
+        xp = default_namespace()
+        return cls(xp.zeros((k_in, k_in), dtype), xp.zeros((k_out, k_in), dtype), xp.zeros((), dtype))
 
     def __call__(self, functional_map: FunctionalMap) -> Float[Array, ""]:
         """Return the energy of a functional map. Rounding errors can make it slightly negative."""
-        return jnp.sum(functional_map * (product(functional_map, self.gram) - 2 * self.cross)) + self.constant
+        terms = functional_map * (product(functional_map, self.gram) - 2 * self.cross)
+        return namespace(terms).sum(terms) + self.constant
 
     def __add__(self, other: QuadraticEnergy) -> QuadraticEnergy:
         return QuadraticEnergy(
@@ -197,10 +223,10 @@ class QuadraticEnergy(eqx.Module):
     def condition_number(self) -> Float[Array, ""]:
         """Return the ratio of the extreme eigenvalues of the gram matrix, infinite if it is singular."""
         eigenvalues = symmetric_eigenvalues(self.gram)
-        return eigenvalues[-1] / jnp.maximum(eigenvalues[0], 0)
+        return eigenvalues[-1] / namespace(eigenvalues).maximum(eigenvalues[0], 0)
 
 
-class WaveletProblem(eqx.Module):
+class WaveletProblem(Module):
     """The data that a `Solution` needs to compute the functional map C of a pointwise map from X to Y.
 
     The properties `spectra` and `responses` are pairs in the order (out, in): first the shape that C maps to,
@@ -221,8 +247,8 @@ class WaveletProblem(eqx.Module):
     spectrum_y: Spectrum
     responses_x: Float[Array, "filters k_x"]
     responses_y: Float[Array, "filters k_y"]
-    convention: Convention = eqx.field(static=True, default="pullback")
-    sampled: bool = eqx.field(static=True, default=False)
+    convention: Convention = field(static=True, default="pullback")
+    sampled: bool = field(static=True, default=False)
 
     def out_and_in(self, of_x: Side, of_y: Side) -> tuple[Side, Side]:
         """Return the two arguments in the order (out, in), or convert (out, in) to (X, Y)."""
@@ -256,19 +282,20 @@ class WaveletProblem(eqx.Module):
         return QuadraticEnergy(
             product(inputs.T, weights * inputs) * multiscale_kernel(responses_in, responses_in),
             product((weights * outputs).T, inputs) * multiscale_kernel(responses_out, responses_in),
-            product(jnp.sum(weights * outputs**2, axis=0), frame_function(responses_out)),
+            product(namespace(outputs).sum(weights * outputs**2, axis=0), frame_function(responses_out)),
         )
 
     def _weights_inputs_outputs(
         self, pointwise_map: PointwiseMap, norm: Norm
     ) -> tuple[Float[Array, "m 1"], Float[Array, "m k_in"], Float[Array, "m k_out"]]:
         """Return the weights w_x, inputs a_x and outputs b_x that the module docstring defines."""
+        xp = namespace(self.spectrum_x.eigenvectors)
         mask, eigenvectors_x = self.spectrum_x.mask[:, None], self.spectrum_x.eigenvectors
-        areas_x = jnp.where(mask, self.spectrum_x.vertex_areas[:, None], 0)
+        areas_x = xp.where(mask, self.spectrum_x.vertex_areas[:, None], 0)
         if self.convention == "pullback":
             inputs = pull_back(pointwise_map, self.spectrum_y.eigenvectors)
             return areas_x if norm == "area" else mask.astype(areas_x.dtype), inputs, eigenvectors_x
         outputs = pull_back(pointwise_map, dual_eigenvectors(self.spectrum_y, "area"))
         if norm == "area":
-            return areas_x, eigenvectors_x, outputs / jnp.where(areas_x > 0, areas_x, jnp.inf)
-        return jnp.ones_like(areas_x), eigenvectors_x * areas_x, jnp.where(mask, outputs, 0)
+            return areas_x, eigenvectors_x, outputs / xp.where(areas_x > 0, areas_x, xp.inf)
+        return xp.ones_like(areas_x), eigenvectors_x * areas_x, xp.where(mask, outputs, 0)

@@ -1,163 +1,99 @@
 """Matrix products and factorisations, which the whole core takes from here.
 
-All factorisations work under `jax.vmap`, also nested, and all of them except `orthonormal_columns` have
-derivatives of both modes and of any order.
+All factorisations of JAX arrays work under `jax.vmap`, also nested, and all of them have derivatives of both
+modes and of any order. If a factorisation fails, the result is NaN.
 """
 
+from __future__ import annotations
+
+import functools
 from collections.abc import Callable
-from functools import partial
-from typing import TypeVar
+from typing import Any
 
-import jax
-import jax.numpy as jnp
-import jax.scipy as jsp
-from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree
+import numpy as np
+import scipy.linalg
+from jaxtyping import Bool, Float
 
-Factors = TypeVar("Factors", bound=Array | tuple[Array, ...])
-
-# By default, GPUs multiply float32 matrices in lower precision. Distances would then lose digits, and
-# rounding errors could hide that a linear system is singular.
-product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
+from jaxsmw.core.arrays import Array, is_traced, namespace, stop_gradient
 
 
-def _one_by_one(factorize: Callable[..., Factors]) -> Callable[..., Factors]:
-    """Return the function, with a `jax.vmap` that is a loop on CPUs and a batch on accelerators."""
-    # On CPUs, LAPACK calls of jaxlib 0.10 divide a batch among the threads of XLA's pool and wait for them
-    # (`jax::ParallelBatchMap`). If each thread of the pool waits in such a call, none is left to do the work.
-    one = jax.custom_batching.custom_vmap(factorize)
+def _traced() -> Any:
+    from jaxsmw.core import traced_linear_algebra
 
-    @one.def_vmap
-    def batch(size: int, batched: list[bool], *arrays: Array) -> tuple[Factors, PyTree[bool]]:
-        stacked = [
-            array if has_axis else jnp.broadcast_to(array, (size, *array.shape))
-            for array, has_axis in zip(arrays, batched, strict=True)
-        ]
-        factors = lax.platform_dependent(
-            *stacked,
-            cpu=lambda *stacked: lax.map(lambda row: one(*row), stacked),
-            default=jax.vmap(factorize),
-        )
-        return factors, jax.tree.map(lambda _: True, factors)
-
-    return one
+    return traced_linear_algebra
 
 
-# These functions have no derivatives. `_cholesky` reads only the lower triangle.
-_cholesky = _one_by_one(lambda matrix: lax.linalg.cholesky(matrix, symmetrize_input=False))
-_solve_lower = _one_by_one(lambda factor, right: jsp.linalg.solve_triangular(factor, right, lower=True))
-_solve_lower_transposed = _one_by_one(
-    lambda factor, right: jsp.linalg.solve_triangular(factor, right, lower=True, trans="T")
-)
-_svd = _one_by_one(lambda matrix: tuple(jnp.linalg.svd(matrix, full_matrices=False)))
-_eigenvalues = _one_by_one(lambda matrix: jnp.linalg.eigvalsh(matrix))
-_eigenpairs = _one_by_one(lambda matrix: tuple(jnp.linalg.eigh(matrix)))
+def _or_traced(compute: Callable[..., Array]) -> Callable[..., Array]:
+    """Decorate the version for NumPy of a function of `traced_linear_algebra`, to which JAX arrays go."""
 
-orthonormal_columns = _one_by_one(lambda vectors: jnp.linalg.qr(vectors)[0])
-"""Return r orthonormal vectors (d, r) whose span contains the r columns of a matrix (d, r)."""
+    @functools.wraps(compute)
+    def choose(*matrices: Array) -> Array:
+        if is_traced(*matrices):
+            return getattr(_traced(), compute.__name__)(*matrices)
+        try:
+            return compute(*matrices)
+        except np.linalg.LinAlgError:
+            return np.full_like(matrices[-1], np.nan)
+
+    return choose
 
 
+@_or_traced
+def product(a: Float[Array, ...], b: Float[Array, ...]) -> Float[Array, ...]:
+    """Return the matrix product, in full precision also on accelerators."""
+    return np.matmul(a, b)
+
+
+@_or_traced
 def solve_lower(factor: Float[Array, "k k"], right: Float[Array, "k c"]) -> Float[Array, "k c"]:
     """Return `factor^-1 right` for a lower triangular matrix `factor`."""
-    return lax.custom_linear_solve(
-        partial(product, jnp.tril(factor)),
-        right,
-        lambda _, right: _solve_lower(lax.stop_gradient(factor), right),
-        lambda _, right: _solve_lower_transposed(lax.stop_gradient(factor), right),
-    )
+    return scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
 
 
-@jax.custom_jvp
+@_or_traced
 def cholesky(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
     """Return the lower Cholesky factor of a positive definite matrix, or NaN if there is none."""
-    return _cholesky((matrix + matrix.T) / 2)
+    return scipy.linalg.cholesky((matrix + matrix.T) / 2, lower=True, check_finite=False)
 
 
-@cholesky.defjvp
-def _cholesky_derivative(
-    primals: tuple[Array], tangents: tuple[Array]
-) -> tuple[Float[Array, "k k"], Float[Array, "k k"]]:
-    # Murray 2016, "Differentiation of the Cholesky decomposition".
-    factor = cholesky(*primals)
-    (change,) = tangents
-    inside = solve_lower(factor, solve_lower(factor, (change + change.T) / 2).T)
-    lower = jnp.tril(inside) - jnp.diag(jnp.diagonal(inside)) / 2
-    return factor, product(factor, lower)
-
-
+@_or_traced
 def solve_positive_definite(matrix: Float[Array, "k k"], right: Float[Array, "k c"]) -> Float[Array, "k c"]:
     """Return `matrix^-1 right` for a positive definite matrix."""
-    factor = _cholesky(lax.stop_gradient(matrix).T)
-    return lax.custom_linear_solve(
-        partial(product, matrix),
-        right,
-        lambda _, right: _solve_lower_transposed(factor, _solve_lower(factor, right)),
-        symmetric=True,
-    )
+    factor = scipy.linalg.cho_factor(matrix, check_finite=False)
+    return scipy.linalg.cho_solve(factor, right, check_finite=False)
+
+
+@_or_traced
+def symmetric_eigenvalues(matrix: Float[Array, "k k"]) -> Float[Array, " k"]:
+    """Return the eigenvalues of a symmetric matrix in ascending order."""
+    return np.linalg.eigvalsh(matrix)
+
+
+@_or_traced
+def nearest_orthogonal(matrix: Float[Array, "k l"]) -> Float[Array, "k l"]:
+    """Return the nearest matrix with orthonormal columns, or with orthonormal rows if k is below l."""
+    left, _, right = np.linalg.svd(matrix, full_matrices=False)
+    return left @ right
 
 
 def rounding(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
     """Return an estimate of the rounding error of a Gram matrix: k times its largest entry times epsilon."""
-    relative = matrix.shape[0] * jnp.finfo(matrix.dtype).eps
-    return jnp.max(jnp.diagonal(matrix)) * jnp.asarray(relative, matrix.dtype)
+    xp = namespace(matrix)
+    relative = matrix.shape[0] * xp.finfo(matrix.dtype).eps
+    return xp.max(xp.diagonal(matrix)) * xp.asarray(relative, matrix.dtype)
 
 
 def is_regular(matrix: Float[Array, "k k"]) -> Bool[Array, ""]:
     """Return whether a Gram matrix is non-singular to working precision."""
+    xp = namespace(matrix)
     # If the matrix is singular, one of its Cholesky pivots is negative or as small as the rounding error. If
     # a pivot is negative, the factor contains NaN, and the comparison below is False.
-    pivots = jnp.diagonal(cholesky(lax.stop_gradient(matrix))) ** 2
-    return jnp.min(pivots) > rounding(matrix)
+    pivots = xp.diagonal(cholesky(stop_gradient(matrix))) ** 2
+    return xp.min(pivots) > rounding(matrix)
 
 
 def regularized(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
     """Add the rounding error to the diagonal of a singular Gram matrix; return a regular one unchanged."""
-    error = jnp.where(is_regular(matrix), 0, lax.stop_gradient(rounding(matrix)))
-    return matrix + error * jnp.eye(matrix.shape[0], dtype=matrix.dtype)
-
-
-@jax.custom_jvp
-def symmetric_eigenvalues(matrix: Float[Array, "k k"]) -> Float[Array, " k"]:
-    """Return the eigenvalues of a symmetric matrix in ascending order."""
-    return _eigenvalues(matrix)
-
-
-@symmetric_eigenvalues.defjvp
-def _derivative_of_eigenvalues(
-    primals: tuple[Array], tangents: tuple[Array]
-) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    values, vectors = _eigenpairs(*primals)
-    return values, jnp.sum(vectors * product(tangents[0], vectors), axis=0)
-
-
-@jax.custom_jvp
-def nearest_orthogonal(matrix: Float[Array, "k l"]) -> Float[Array, "k l"]:
-    """Return the nearest matrix with orthonormal columns, or with orthonormal rows if k is below l."""
-    left, _, right = _svd(matrix)
-    return product(left, right)
-
-
-@nearest_orthogonal.defjvp
-def _derivative_of_nearest_orthogonal(
-    primals: tuple[Array], tangents: tuple[Array]
-) -> tuple[Float[Array, "k l"], Float[Array, "k l"]]:
-    nearest = nearest_orthogonal(*primals)
-    wide = nearest.shape[0] < nearest.shape[1]
-    matrix, tall, change = (part.T if wide else part for part in (*primals, nearest, *tangents))
-    # The matrix is `tall stretch`. A change turns the columns of `tall` within their space, by a skew matrix
-    # that solves a Sylvester equation, and tilts them out of this space.
-    stretch, inside = product(tall.T, matrix), product(tall.T, change)
-    _, sizes, right = _svd(lax.stop_gradient(matrix))
-
-    def solve(_: object, skew: Float[Array, "l l"]) -> Float[Array, "l l"]:
-        rotated = product(product(right, skew), right.T) / (sizes[:, None] + sizes[None, :])
-        return product(product(right.T, rotated), right)
-
-    turn = lax.custom_linear_solve(
-        lambda turn: product(turn, stretch) + product(stretch, turn), inside - inside.T, solve, symmetric=True
-    )
-    derivative = product(tall, turn)
-    if tall.shape[0] > tall.shape[1]:
-        outside = change - product(tall, inside)
-        derivative += solve_positive_definite(stretch, outside.T).T
-    return nearest, derivative.T if wide else derivative
+    xp = namespace(matrix)
+    error = xp.where(is_regular(matrix), 0, stop_gradient(rounding(matrix)))
+    return matrix + error * xp.eye(matrix.shape[0], dtype=matrix.dtype)

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import jax
-from jaxtyping import Array, Float, Int, Int32
+from jaxtyping import Float, Int, Int32
 
-from jaxsmw.choices import Search
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.functional_map import Convention, FunctionalMap, out_and_in
 from jaxsmw.core.linear_algebra import product
-from jaxsmw.core.search import Patches, make_patches, nearest_vertices
+from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.triangles import nearest_point_on_triangles
-
-# `"auto"` uses patches if the geometric mean of the numbers of vertices of X and Y is at least this number.
-# For smaller shapes, the compilation of the search in patches takes more time than the search saves.
-_PATCHES_FROM = 15_000
-# These values gave the fastest search in scripts/benchmark_speed.py. A patch of X has _QUERIES vertices. For
-# Y, the argument `rank` of `make_patches` is _RANK. If Y has _VERTICES_OF_SMALLEST vertices or fewer, a patch
-# of Y has _SMALLEST_PATCH vertices.
-_QUERIES, _RANK = 128, 5
-_SMALLEST_PATCH, _VERTICES_OF_SMALLEST = 52, 5000
 
 
 def spectral_embeddings(
@@ -50,7 +40,6 @@ def decode(
     spectrum_y: Spectrum,
     *,
     convention: Convention = "pullback",
-    patches: tuple[Patches, Patches] | None = None,
 ) -> Int32[Array, " m"]:
     """Recover the pointwise map T: X -> Y from a functional map C by nearest-neighbour search.
 
@@ -61,15 +50,13 @@ def decode(
 
     - `functional_map`: C, without unit, in the given `convention`.
     - `spectrum_x`, `spectrum_y`, `convention`: as in `encode`.
-    - `patches`: the result of `search_patches(spectrum_x, spectrum_y)`, which makes the search faster on
-      large shapes. With None (the default), the search compares all vertices of X with all vertices of Y.
 
     **Returns:** The map T, an int32 array (m,) of 0-based vertices of Y.
 
     **Raises:** `ValueError` for an unknown convention.
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
-    return nearest_vertices(queries, database, spectrum_y.mask, patches)
+    return nearest_neighbor(queries, database, database_mask=spectrum_y.mask)
 
 
 def decode_to_triangles(
@@ -98,33 +85,3 @@ def decode_to_triangles(
     """
     queries, database = spectral_embeddings(functional_map, spectrum_x, spectrum_y, convention=convention)
     return nearest_point_on_triangles(queries, database, faces_y)
-
-
-def search_patches(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Patches, Patches]:
-    """Return patches of X (the queries) and of Y (the database), for the argument `patches` of `decode`.
-
-    A patch is a group of neighbouring vertices, which a nearest-neighbour search can skip as a whole. The
-    same patches can be used for all functional maps between X and Y. Their size on Y grows with the cube root
-    of Y's number of vertices.
-    """
-    n = spectrum_y.mask.shape[0]
-    size = max(_SMALLEST_PATCH, _SMALLEST_PATCH * (n / _VERTICES_OF_SMALLEST) ** (1 / 3))
-    return (
-        make_patches(spectrum_x.eigenvectors, spectrum_x.mask, size=_QUERIES, rank=0),
-        make_patches(spectrum_y.eigenvectors, spectrum_y.mask, size=round(size), rank=_RANK),
-    )
-
-
-def chosen_patches(
-    search: Search, spectrum_x: Spectrum, spectrum_y: Spectrum
-) -> tuple[Patches, Patches] | None:
-    """Return the result of `search_patches` if the setting `search` needs patches, and None otherwise.
-
-    `"auto"` uses patches if the default backend is a CPU and the geometric mean of the two numbers of
-    vertices is at least 15 000.
-    """
-    sizes = spectrum_x.mask.shape[0] * spectrum_y.mask.shape[0]
-    pays = jax.default_backend() == "cpu" and sizes >= _PATCHES_FROM**2
-    if search == "patches" or (search == "auto" and pays):
-        return search_patches(spectrum_x, spectrum_y)
-    return None

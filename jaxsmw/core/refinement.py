@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, TypedDict
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int, Int32
 
 from jaxsmw.choices import ITERATIONS
-from jaxsmw.core.checks import all_finite, check_kind, check_matches, counts_iterations
+from jaxsmw.core.arrays import Array, cond, jitted, namespace, replaced, scan
+from jaxsmw.core.checks import all_finite, check_array, check_kind, check_matches, counts_iterations
+from jaxsmw.core.module import Module
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, Samples, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where
@@ -23,7 +22,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 
 
-class History(eqx.Module):
+class History(NamedTuple):
     """A record of the iterations of `refine`, stored in `Refinement.history` if `history=True`.
 
     If the refinement stopped early, `changed`, `energy` and `objective` are NaN for the skipped iterations.
@@ -48,7 +47,7 @@ class History(eqx.Module):
     pointwise_maps: Int32[Array, "*iterations m"] | None
 
 
-class Refinement(eqx.Module):
+class Refinement(Module):
     """The outcome of `refine`, a pytree.
 
     **Attributes:**
@@ -84,7 +83,7 @@ class Refinement(eqx.Module):
         history = self.history
         if history is not None and history.pointwise_maps is not None:
             maps = history.pointwise_maps[:, :number_of_vertices]
-            history = dataclasses.replace(history, pointwise_maps=maps)
+            history = history._replace(pointwise_maps=maps)
         kept = self.pointwise_map[:number_of_vertices]
         return dataclasses.replace(self, pointwise_map=kept, history=history)
 
@@ -102,7 +101,7 @@ class RefineSettings(TypedDict, total=False):
 
 
 @counts_iterations
-@eqx.filter_jit
+@jitted
 def refine(
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
@@ -159,16 +158,17 @@ def refine(
     """
     _check_arguments(spectrum_x, spectrum_y, pointwise_map, refiner, samples)
     check_samples_use(refiner, samples is not None, starts_on_samples, ends_on_samples)
-    pointwise_map = pointwise_map.astype(jnp.int32)
+    xp = namespace(spectrum_x.eigenvectors, spectrum_y.eigenvectors, pointwise_map)
+    pointwise_map = pointwise_map.astype(xp.int32)
     problem = Problem(spectrum_x, spectrum_y, samples, partial)
     prepared = in_full = refiner.prepare(dataclasses.replace(problem, samples=None))
     used, first_map = spectrum_x.mask, pointwise_map
     if samples is not None:
         prepared = refiner.prepare(problem)
-        first_map = jnp.full(samples[0].shape, -1, jnp.int32)
+        first_map = xp.full(samples[0].shape, -1, xp.int32)
     loop = _Loop(refiner, prepared, stop_when_unchanged, history, keeps_maps=history and samples is None)
     if samples is not None and starts_on_samples:
-        used = used & jnp.zeros_like(used).at[samples[0]].set(True)
+        used = used & replaced(xp.zeros_like(used), samples[0], True)
         first_map = pointwise_map[samples[0]]
         progress = loop.start(prepared, first_map, first_map)
     else:
@@ -176,28 +176,40 @@ def refine(
     if samples is None or ends_on_samples:
         # The last search is a part of the loop. Outside the loop, the search would have to be compiled a
         # second time, and a search takes longer to compile than any other part of the program.
-        is_last = jnp.arange(iterations) == iterations - 1
-        progress, records = lax.scan(loop.step, progress, is_last)
+        is_last = xp.arange(iterations) == iterations - 1
+        progress, records = scan(loop.step, progress, is_last)
         refined = progress.pointwise_map
         if samples is not None:
-            refined = jnp.full(pointwise_map.shape, -1, jnp.int32).at[samples[0]].set(refined)
+            refined = replaced(xp.full(pointwise_map.shape, -1, xp.int32), samples[0], refined)
     else:
-        progress, records = lax.scan(loop.step, progress, jnp.zeros(iterations - 1, bool))
+        nothing = xp.zeros(0, loop.undefined.dtype)
+        records = History(nothing, nothing, nothing, None)
+        if iterations > 1:
+            progress, records = scan(loop.step, progress, xp.zeros(iterations - 1, bool))
         refined = refiner.recover(in_full, progress.state)
         objective = loop.recorded(refiner.objective, in_full, progress.state, refined)
-        last = History(loop.undefined, progress.energy, objective, None)  # no map to compare `refined` with
-        records = jax.tree.map(jnp.append, records, last)
+        # There is no map to compare `refined` with.
+        records = History(
+            xp.append(records.changed, loop.undefined),
+            xp.append(records.energy, progress.energy),
+            xp.append(records.objective, objective),
+            None,
+        )
     if samples is not None and not starts_on_samples:
         # The first map of the samples has no predecessor either.
-        records = dataclasses.replace(records, changed=records.changed.at[:1].set(jnp.nan))
+        records = records._replace(changed=replaced(records.changed, slice(1), xp.nan))
     result = diagnose(spectrum_x, spectrum_y, pointwise_map, progress.result, used)
     successful = result == RESULTS.successful
-    refined = jnp.where(successful, refined, -1)
+    refined = xp.where(successful, refined, -1)
     if records.pointwise_maps is not None:
-        maps = jnp.where(successful, records.pointwise_maps, -1)
-        records = dataclasses.replace(records, pointwise_maps=maps)
+        maps = xp.where(successful, records.pointwise_maps, -1)
+        records = records._replace(pointwise_maps=maps)
     recorded = records if history else None
     return Refinement(refined, progress.state, result, progress.iterations, recorded)
+
+
+# `refine` without compilation. The arrays can be of NumPy if the refiner takes its namespace from its arrays.
+refine_at_once = inspect.unwrap(refine)
 
 
 class _Progress(NamedTuple):
@@ -230,22 +242,23 @@ class _Loop:
         self, prepared: Prepared, pointwise_map: Int32[Array, " m"], first_map: Int32[Array, " s"]
     ) -> _Progress:
         """Compute the first state from the initial map. The first step compares its map with `first_map`."""
+        xp = namespace(pointwise_map)
         state, result = self.refiner.update(prepared, pointwise_map, None)
         return _Progress(
             first_map,
             state,
             checked(state, result),
             self.recorded(self.refiner.energy, prepared, state, pointwise_map),
-            iterations=jnp.asarray(1, jnp.int32),
-            unchanged=jnp.asarray(False),
-            finished=jnp.asarray(False),
+            iterations=xp.asarray(1, xp.int32),
+            unchanged=xp.asarray(False),
+            finished=xp.asarray(False),
         )
 
     def step(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, History]:
         """Run one iteration, or do nothing if the loop has finished."""
         if not self.stop_when_unchanged:
             return self._iterate(progress, is_last)
-        return lax.cond(progress.finished, self._stay, self._iterate, progress, is_last | progress.unchanged)
+        return cond(progress.finished, self._stay, self._iterate, progress, is_last | progress.unchanged)
 
     def recorded(
         self, measure: Callable[..., Float[Array, ""]], *arguments: Prepared | State | Int32[Array, " s"]
@@ -255,12 +268,13 @@ class _Loop:
 
     @property
     def undefined(self) -> Float[Array, ""]:
-        return jnp.asarray(jnp.nan, self.prepared.spectrum_x.eigenvectors.dtype)
+        eigenvectors = self.prepared.spectrum_x.eigenvectors
+        return namespace(eigenvectors).asarray(np.nan, eigenvectors.dtype)
 
     def _iterate(self, progress: _Progress, is_last: Bool[Array, ""]) -> tuple[_Progress, History]:
         after, previous = self.refiner.recover_both(self.prepared, progress.state)
-        mask = self.prepared.spectrum_x.mask
-        changed = jnp.sum((after != progress.pointwise_map) & mask) / jnp.sum(mask)
+        mask, xp = self.prepared.spectrum_x.mask, namespace(after)
+        changed = xp.sum((after != progress.pointwise_map) & mask) / xp.sum(mask)
         record = History(
             changed.astype(self.undefined.dtype),
             progress.energy,
@@ -277,7 +291,7 @@ class _Loop:
         def keep() -> tuple[State, RESULTS, Array, Array]:
             return progress.state, progress.result, progress.energy, progress.iterations
 
-        state, result, energy, iterations = lax.cond(is_last, keep, update)
+        state, result, energy, iterations = cond(is_last, keep, update)
         unchanged = (changed == 0) & self.refiner.is_settled(progress.state)
         return _Progress(after, state, result, energy, iterations, unchanged, is_last), record
 
@@ -302,8 +316,8 @@ def _check_arguments(
                 "samples must be a pair: give a tuple of the sampled vertices of X and the sampled vertices "
                 "of Y"
             )
-        check_kind("samples of X", samples[0], np.ndarray, jax.Array)
-        check_kind("samples of Y", samples[1], np.ndarray, jax.Array)
+        check_array("samples of X", samples[0])
+        check_array("samples of Y", samples[1])
 
 
 def check_samples_use(refiner: Refiner, sampled: bool, starts: bool, ends: bool) -> None:
@@ -339,7 +353,8 @@ def checked(state: State, result: RESULTS) -> RESULTS:
     A state is a failure if it contains NaN or infinity, or if its functional map is zero.
     """
     went_well = result == RESULTS.successful
-    finite, zero = all_finite(state), jnp.all(state.functional_map == 0)
+    functional_map = state.functional_map
+    finite, zero = all_finite(state), namespace(functional_map).all(functional_map == 0)
     result = where(went_well & zero, RESULTS.undetermined_functional_map, result)
     return where(went_well & ~finite, RESULTS.nonfinite_functional_map, result)
 
@@ -358,10 +373,11 @@ def diagnose(
     matches.
     """
     if matches is not None:
+        xp = namespace(spectrum_y.mask, matches)
         vertices_y = spectrum_y.mask.shape[0]
         in_range = (matches >= 0) & (matches < vertices_y)
-        valid = in_range & spectrum_y.mask[jnp.clip(matches, 0, vertices_y - 1)]
-        valid = jnp.all(valid.reshape(valid.shape[0], -1), axis=1)
+        valid = in_range & spectrum_y.mask[xp.clip(matches, 0, vertices_y - 1)]
+        valid = xp.all(valid.reshape(valid.shape[0], -1), axis=1)
         checked_vertices = spectrum_x.mask if used is None else used
-        result = where(jnp.all(valid | ~checked_vertices), result, RESULTS.invalid_initial_map)
+        result = where(xp.all(valid | ~checked_vertices), result, RESULTS.invalid_initial_map)
     return where(all_finite((spectrum_x, spectrum_y)), result, RESULTS.nonfinite_spectrum)

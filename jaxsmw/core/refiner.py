@@ -6,11 +6,11 @@ import abc
 import dataclasses
 from typing import Generic, TypeVar
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int, Int32
 
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.functional_map import Convention
+from jaxsmw.core.module import Module, field
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.search import nearest_neighbor
@@ -21,7 +21,7 @@ Samples = tuple[Int[Array, " s_x"], Int[Array, " s_y"]]
 """The indices of the samples of X (s_x,) and of Y (s_y,): the vertices on which a refiner iterates."""
 
 
-class Problem(eqx.Module):
+class Problem(Module):
     """The two shapes that a refiner matches, and the vertices on which the refiner iterates.
 
     **Attributes:**
@@ -36,7 +36,7 @@ class Problem(eqx.Module):
     spectrum_x: Spectrum
     spectrum_y: Spectrum
     samples: Samples | None = None
-    partial: bool = eqx.field(static=True, default=False)
+    partial: bool = field(static=True, default=False)
 
     def query_spectra(self) -> tuple[Spectrum, Spectrum]:
         """Return the spectra of X and of Y at the vertices on which the refiner iterates."""
@@ -45,7 +45,7 @@ class Problem(eqx.Module):
         return self.spectrum_x.sample(self.samples[0]), self.spectrum_y.sample(self.samples[1])
 
 
-class Prepared(eqx.Module):
+class Prepared(Module):
     """The values that a refiner computes once per problem. A refiner may add fields.
 
     The spectra are the result of `Problem.query_spectra`. Pointwise maps have one entry per vertex of
@@ -56,7 +56,7 @@ class Prepared(eqx.Module):
     spectrum_y: Spectrum
 
 
-class State(eqx.Module):
+class State(Module):
     """The values that a refiner passes from one iteration to the next. A refiner may add fields.
 
     The functional map C (k_out, k_in), without unit, has the convention `Refiner.convention`.
@@ -74,7 +74,7 @@ PreparedT = TypeVar("PreparedT", bound=Prepared)
 StateT = TypeVar("StateT", bound=State)
 
 
-class Refiner(eqx.Module, Generic[PreparedT, StateT]):
+class Refiner(Module, Generic[PreparedT, StateT]):
     """A method of refinement for `jaxsmw.refine`: the abstract base class of all refiners.
 
     Ready subclasses are `jaxsmw.WaveletPreservation`, `jaxsmw.FeatureRegression` and `jaxsmw.Registration`. A
@@ -83,9 +83,10 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
     and, if there are samples, once more for the samples. Then it calls `update` and `recover_both` in each
     iteration. JAX traces all methods, so Python code in the methods must not branch on the values of arrays.
 
-    A subclass is an equinox module. It must define `prepare`, `update` and `energy`, and it may override the
-    other methods and properties. In the shapes of arrays, m is the number of vertices of X to be matched, and
-    n is the number of vertices of Y. All entries of maps are 0-based.
+    A subclass is a frozen dataclass and a pytree; see `jaxsmw.core.module.Module`. It must define `prepare`,
+    `update` and `energy`, and it may override the other methods and properties. In the shapes of arrays, m is
+    the number of vertices of X to be matched, and n is the number of vertices of Y. All entries of maps are
+    0-based.
     """
 
     @abc.abstractmethod
@@ -160,8 +161,8 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         state. `jaxsmw.refine` stores the result in `History.objective`.
         """
         queries, database = self.embeddings(prepared, state)
-        areas = prepared.spectrum_x.vertex_areas
-        return jnp.sum(areas * jnp.sum((queries - database[pointwise_map]) ** 2, axis=1)) / jnp.sum(areas)
+        xp, areas = namespace(queries), prepared.spectrum_x.vertex_areas
+        return xp.sum(areas * xp.sum((queries - database[pointwise_map]) ** 2, axis=1)) / xp.sum(areas)
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
         """Return whether all iterations after a state use the same settings; True by default.
@@ -169,7 +170,15 @@ class Refiner(eqx.Module, Generic[PreparedT, StateT]):
         Only then does a map that one iteration leaves unchanged stay unchanged, so that `jaxsmw.refine` may
         stop early.
         """
-        return jnp.asarray(True)
+        return namespace(state.functional_map).asarray(True)
+
+    @property
+    def uses_namespaces(self) -> bool:
+        """Whether the methods take their namespace from their arrays, so that NumPy runs them as well.
+
+        The default is False, for refiners that are written with `jax.numpy`. See `jaxsmw.core.arrays`.
+        """
+        return False
 
     @property
     def matches_samples_with_all(self) -> bool:

@@ -10,10 +10,11 @@ eigenvalue.
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import math
 
+from jaxtyping import Float
+
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.banks import Meyer
 from jaxsmw.core.linear_algebra import product
 from jaxsmw.core.spectrum import Spectrum
@@ -27,9 +28,10 @@ def heat_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
     **Returns:** The signature (n, dimensions), in units of 1 / area. On a surface of area 1, the
     area-weighted mean of each column is 1. All entries are NaN if no eigenvalue is positive.
     """
+    xp = namespace(spectrum.eigenvalues)
     smallest, largest = _positive_range(spectrum)
-    times = 4 * jnp.log(10.0) / jnp.geomspace(largest, smallest, dimensions)
-    return _signature(spectrum, jnp.exp(-times[:, None] * spectrum.eigenvalues[None, :]))
+    times = 4 * math.log(10) / xp.geomspace(largest, smallest, dimensions, dtype=largest.dtype)
+    return _signature(spectrum, xp.exp(-times[:, None] * spectrum.eigenvalues[None, :]))
 
 
 def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
@@ -40,16 +42,17 @@ def wave_kernel_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float
     lambda_max - 2 width`. The `width` (standard deviation) of each Gaussian is 7 steps. The result is as in
     `heat_kernel_signature`.
     """
+    xp = namespace(spectrum.eigenvalues)
     smallest, largest = _positive_range(spectrum)
-    low, high = jnp.log(smallest), jnp.log(largest)
+    low, high = xp.log(smallest), xp.log(largest)
     # The outermost centres are `dimensions - 1` steps apart. The first and the last centre are
     # 2 widths away from the ends of the range. One width is 7 steps.
     width = 7 * (high - low) / (dimensions - 1 + 28)
-    energies = jnp.linspace(low + 2 * width, high - 2 * width, dimensions)
+    energies = xp.linspace(low + 2 * width, high - 2 * width, dimensions, dtype=low.dtype)
     positive = spectrum.eigenvalues >= smallest
-    log_eigenvalues = jnp.log(jnp.where(positive, spectrum.eigenvalues, smallest))
-    weights = jnp.exp(-((energies[:, None] - log_eigenvalues[None, :]) ** 2) / (2 * width**2))
-    return _signature(spectrum, jnp.where(positive[None, :], weights, 0))
+    log_eigenvalues = xp.log(xp.where(positive, spectrum.eigenvalues, smallest))
+    weights = xp.exp(-((energies[:, None] - log_eigenvalues[None, :]) ** 2) / (2 * width**2))
+    return _signature(spectrum, xp.where(positive[None, :], weights, 0))
 
 
 def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Array, "n dimensions"]:
@@ -61,19 +64,21 @@ def wavelet_signature(spectrum: Spectrum, *, dimensions: int = 100) -> Float[Arr
     lambda_min to `lambda_max / 2`. The result is as in `heat_kernel_signature`, and a column is NaN if its
     filter passes no eigenvalue.
     """
+    xp = namespace(spectrum.eigenvalues)
     smallest, largest = _positive_range(spectrum)
-    peaks = jnp.geomspace(smallest, largest / 2, dimensions)
+    peaks = xp.geomspace(smallest, largest / 2, dimensions, dtype=largest.dtype)
     # The second of three Meyer filters on [0, 2 peak] passes the band from peak / 2 to 2 peak.
-    wavelets = jax.vmap(lambda peak: Meyer(3)(spectrum.eigenvalues, 2 * peak[None])[1])(peaks)
+    wavelets = xp.stack([Meyer(3)(spectrum.eigenvalues, 2 * peak[None])[1] for peak in peaks])
     return _signature(spectrum, wavelets**2)
 
 
 def _signature(spectrum: Spectrum, weights: Float[Array, "dimensions k"]) -> Float[Array, "n dimensions"]:
-    return product(spectrum.eigenvectors**2, (weights / jnp.sum(weights, axis=1, keepdims=True)).T)
+    total = namespace(weights).sum(weights, axis=1, keepdims=True)
+    return product(spectrum.eigenvectors**2, (weights / total).T)
 
 
 def _positive_range(spectrum: Spectrum) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the smallest positive and the largest eigenvalue."""
-    largest = spectrum.eigenvalues[-1]
+    xp, largest = namespace(spectrum.eigenvalues), spectrum.eigenvalues[-1]
     positive = spectrum.eigenvalues > 1e-6 * largest
-    return jnp.min(jnp.where(positive, spectrum.eigenvalues, largest)), largest
+    return xp.min(xp.where(positive, spectrum.eigenvalues, largest)), largest

@@ -15,18 +15,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int32
 
-from jaxsmw.core.checks import as_parameter, check_between, check_kind
+from jaxsmw.core.arrays import Array, in_blocks
+from jaxsmw.core.checks import as_parameter, check_between, check_integer
 from jaxsmw.core.linear_algebra import product
-from jaxsmw.core.search import in_blocks, nearest_neighbor
+from jaxsmw.core.module import Module, field
+from jaxsmw.core.search import nearest_neighbor
 
 # The number of queries per block. The distances from all queries of a block to all database rows are stored
 # at the same time.
 _BLOCK = 128
 
 
-class SoftMap(eqx.Module):
+class SoftMap(Module):
     """A soft map from m query points to n database points, in the form of a transport plan.
 
     Entry `P_ij` of the plan P (m, n) is the part of the area of query i that is sent to database row j. The
@@ -98,7 +100,7 @@ class SoftMap(eqx.Module):
         return in_blocks(most_probable, self.queries, _BLOCK)
 
 
-class SparseSoftMap(eqx.Module):
+class SparseSoftMap(Module):
     """A soft map from m query points to n database points, in which each query has at most t nonzero shares.
 
     **Attributes:**
@@ -127,29 +129,7 @@ class SparseSoftMap(eqx.Module):
         return self.rows[:, 0]
 
 
-PointwiseMap = Int[Array, " m"] | SoftMap | SparseSoftMap
-"""A map T: X -> Y: an integer array (m,) with one vertex of Y per vertex of X, or a soft map."""
-
-
-def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) -> Float[Array, "m p"]:
-    """Pull functions on Y (n, p) back to X (m, p), along a pointwise map or a soft map from X to Y.
-
-    With a pointwise map, each vertex of X receives the value at its match. With a soft map, each vertex of X
-    receives the mean of the values on Y, weighted with the shares of the vertex. No array of size m x n is
-    stored.
-
-    Entries of a pointwise map are not checked: JAX replaces an index above n - 1 by n - 1, and counts a
-    negative index from the end. If a refinement failed, all entries of its map are -1, so check
-    `Refinement.result` first.
-
-    **Raises:** `ValueError` if the map is a soft map and `functions_on_y` has the wrong shape.
-    """
-    if isinstance(pointwise_map, (SoftMap, SparseSoftMap)):
-        return pointwise_map.pull_back(functions_on_y)
-    return functions_on_y[pointwise_map]
-
-
-class Recovery(eqx.Module):
+class Recovery(Module):
     """A method that computes a soft map from the distances between two point sets.
 
     This class is the abstract base class of recoveries, for the argument `recovery` of `refine_softly` and
@@ -215,7 +195,7 @@ class Softmax(_Tempered):
     `distance` is the distance between the query and the row; see `Recovery`. The result is a `SoftMap`.
     """
 
-    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
+    temperature: Float[Array, ""] = field(converter=as_parameter, default=0.1)
 
     def _map_from(self, transport: _Transport) -> SoftMap:
         b = transport.database_areas
@@ -237,11 +217,11 @@ class NearestFew(_Tempered):
     - `temperature`: see `Recovery`.
     """
 
-    number: int = eqx.field(static=True, default=10)
-    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
+    number: int = field(static=True, default=10)
+    temperature: Float[Array, ""] = field(converter=as_parameter, default=0.1)
 
     def __check_init__(self) -> None:
-        check_kind("number", self.number, int, np.integer)
+        check_integer("number", self.number)
         if self.number < 1:
             raise ValueError(f"NearestFew needs at least 1 row, not {self.number}")
 
@@ -273,12 +253,12 @@ class Sinkhorn(_Tempered):
     - `iterations`, `tolerance`: as in `sinkhorn`.
     """
 
-    temperature: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.1)
-    iterations: int = eqx.field(static=True, default=10)
-    tolerance: float = eqx.field(static=True, default=0.01)
+    temperature: Float[Array, ""] = field(converter=as_parameter, default=0.1)
+    iterations: int = field(static=True, default=10)
+    tolerance: float = field(static=True, default=0.01)
 
     def __check_init__(self) -> None:
-        check_kind("iterations", self.iterations, int, np.integer)
+        check_integer("iterations", self.iterations)
         if self.iterations < 1 or not self.tolerance > 0:
             raise ValueError(
                 f"Sinkhorn needs at least 1 iteration and a positive tolerance, not {self.iterations} and "

@@ -10,15 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int, Int32
 
-from jaxsmw.core.checks import check_kind, check_option, counts_iterations
-from jaxsmw.core.functional_map import FunctionalMap
+from jaxsmw.core.arrays import Array
+from jaxsmw.core.checks import check_array, check_kind, check_option, counts_iterations
+from jaxsmw.core.functional_map import FunctionalMap, PointwiseMap
+from jaxsmw.core.module import Module, field
 from jaxsmw.core.refinement import check_spectra, checked, diagnose
 from jaxsmw.core.refiner import Problem, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where
-from jaxsmw.core.soft_maps import PointwiseMap, Recovery, SoftMap, Softmax, SparseSoftMap
+from jaxsmw.core.soft_maps import Recovery, SoftMap, Softmax, SparseSoftMap
 from jaxsmw.core.spectrum import Spectrum
 
 Differentiation = Literal["unrolled", "checkpointed", "implicit"]
@@ -26,7 +28,7 @@ Step = Callable[[FunctionalMap], tuple[FunctionalMap, RESULTS]]
 """A function that takes a functional map, and returns the next functional map and a status code."""
 
 
-class SoftRefinement(eqx.Module):
+class SoftRefinement(Module):
     """The outcome of `refine_softly`, a pytree.
 
     **Attributes:**
@@ -146,7 +148,7 @@ def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."]
         return None
     sparse = isinstance(pointwise_map, SparseSoftMap)
     matches = pointwise_map.rows if isinstance(pointwise_map, SparseSoftMap) else pointwise_map
-    check_kind("initial map", matches, np.ndarray, jax.Array)
+    check_array("initial map", matches)
     if matches.shape[0] != m or matches.ndim != 1 + sparse:
         raise ValueError(
             f"the initial map has shape {matches.shape}, but X has {m} vertices: give one row for each "
@@ -155,7 +157,7 @@ def _matches(pointwise_map: PointwiseMap, m: int, n: int) -> Int[Array, "m ..."]
     return matches
 
 
-class WaveletPreservationLayer(eqx.Module):
+class WaveletPreservationLayer(Module):
     """A neural-network layer that matches two shapes by features of their vertices.
 
     The layer computes a soft map from the distances between the features of X and Y, and refines it by
@@ -176,9 +178,9 @@ class WaveletPreservationLayer(eqx.Module):
     refiner: WaveletPreservation = WaveletPreservation()
     recovery_of_features: Recovery = Softmax()
     recovery: Recovery = Softmax()
-    iterations: int = eqx.field(static=True, default=2)
-    differentiation: Differentiation = eqx.field(static=True, default="checkpointed")
-    tolerance: float = eqx.field(static=True, default=1e-4)
+    iterations: int = field(static=True, default=2)
+    differentiation: Differentiation = field(static=True, default="checkpointed")
+    tolerance: float = field(static=True, default=1e-4)
 
     def __check_init__(self) -> None:
         check_kind("recovery of features", self.recovery_of_features, Recovery)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
+
+from jaxsmw.core.arrays import Array, namespace
+from jaxsmw.core.module import Module
 
 
-class Spectrum(eqx.Module):
+class Spectrum(Module):
     """The first k eigenpairs of a shape's Laplacian and the vertex areas, as a pytree of arrays.
 
     `compute_spectrum` computes the spectrum of a mesh. The eigenpairs solve `W phi = lambda A phi`. W is the
@@ -68,7 +69,7 @@ class Spectrum(eqx.Module):
 
     def reflect(self) -> Spectrum:
         """Return the spectrum of the mirror image, which negates the first coordinate of vectors."""
-        flip = jnp.array([[-1, 1, 1]])
+        flip = namespace(self.eigenvectors).asarray([[-1, 1, 1]])
         return dataclasses.replace(
             self,
             positions=None if self.positions is None else self.positions * flip.astype(self.positions.dtype),
@@ -107,6 +108,7 @@ class Spectrum(eqx.Module):
 
         **Raises:** `ValueError` if the shape already has more vertices.
         """
+        xp = namespace(self.eigenvectors)
         rows = number_of_vertices - self.mask.shape[0]
         if rows < 0:
             raise ValueError(
@@ -116,7 +118,7 @@ class Spectrum(eqx.Module):
         if rows == 0:
             return self
         return self._map_vertex_arrays(
-            lambda field: jnp.pad(field, ((0, rows), *((0, 0),) * (field.ndim - 1)))
+            lambda field: xp.pad(field, ((0, rows), *((0, 0),) * (field.ndim - 1)))
         )
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
@@ -125,19 +127,21 @@ class Spectrum(eqx.Module):
         All samples receive the same area, and their areas sum to the area of the shape. The eigenvectors are
         not orthonormal on samples, so their pseudo-inverse must be computed by least squares.
         """
-        share = jnp.sum(self.vertex_areas) / vertices.shape[0]
+        xp = namespace(self.vertex_areas)
+        share = xp.sum(self.vertex_areas) / vertices.shape[0]
         sampled = self._map_vertex_arrays(lambda field: field[vertices])
-        return dataclasses.replace(sampled, vertex_areas=jnp.full(vertices.shape, share))
+        return dataclasses.replace(sampled, vertex_areas=xp.full(vertices.shape, share))
 
     def excluding(self, vertices: Bool[Array, " n"]) -> Spectrum:
         """Return the spectrum with area zero where the mask `vertices` is True, and the same total area."""
-        areas = jnp.where(vertices, 0, self.vertex_areas)
-        return dataclasses.replace(self, vertex_areas=areas * (jnp.sum(self.vertex_areas) / jnp.sum(areas)))
+        xp = namespace(self.vertex_areas)
+        areas = xp.where(vertices, 0, self.vertex_areas)
+        return dataclasses.replace(self, vertex_areas=areas * (xp.sum(self.vertex_areas) / xp.sum(areas)))
 
     def _check_rows(self, name: str, rows: Array | None, columns: int | None = None) -> None:
         if rows is None:
             return
-        n, shape = self.mask.shape[0], jnp.shape(rows)
+        n, shape = self.mask.shape[0], rows.shape
         if len(shape) != 2 or shape[0] != n or columns not in (None, shape[1]):
             needed = f"({n}, {'d' if columns is None else columns})"
             raise ValueError(

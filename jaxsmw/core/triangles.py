@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int, Int32
 
+from jaxsmw.core.arrays import Array, in_blocks, namespace, segment_min
 from jaxsmw.core.linear_algebra import product
-from jaxsmw.core.search import in_blocks
 
 # The number of queries per block. The distances from all queries of a block to all triangles are stored at
 # the same time.
@@ -40,14 +37,16 @@ def nearest_point_on_triangles(
     **Returns:** The 0-based row of `faces` with the nearest point (m,), int32, and the barycentric weights of
     the triangle's corners (m, 3), which are not negative and sum to 1.
     """
+    xp = namespace(queries, points)
+    queries, points, faces = xp.asarray(queries), xp.asarray(points), xp.asarray(faces)
     corners = points[faces]
     edges = corners[:, 1:] - corners[:, :1]
-    lengths = product(edges, jnp.swapaxes(edges, 1, 2))
+    lengths = product(edges, edges.mT)
     grams = (lengths[:, 0, 0], lengths[:, 0, 1], lengths[:, 1, 1])
-    starts = jnp.einsum("fed,fd->ef", edges, corners[:, 0], precision="highest")
+    starts = product(edges, corners[:, 0, :, None])[:, :, 0].T
     # |q - a|² = |q|² + |a|² - 2 q·a. The term |q|² is the same for all triangles, so `search` omits it.
-    norms = jnp.sum(corners[:, 0] ** 2, axis=1)
-    masked = jnp.zeros(len(faces), bool) if face_mask is None else ~face_mask
+    norms = xp.sum(corners[:, 0] ** 2, axis=1)
+    masked = xp.zeros(len(faces), bool) if face_mask is None else ~face_mask
     columns = [value[:, None] for value in (*grams, *starts, norms)]
 
     def search(block: Float[Array, "block d"]) -> Int32[Array, " block"]:
@@ -55,15 +54,15 @@ def nearest_point_on_triangles(
         a, b, c = (products[faces[:, corner]] for corner in range(3))
         uu, uv, vv, start_u, start_v, norm = columns
         squared, _, _ = _closest(norm - 2 * a, b - a - start_u, c - a - start_v, uu, uv, vv)
-        squared = jnp.where(masked[:, None], jnp.inf, squared)
-        return jnp.argmin(squared, axis=0).astype(jnp.int32)
+        squared = xp.where(masked[:, None], xp.inf, squared)
+        return xp.argmin(squared, axis=0).astype(xp.int32)
 
     found = in_blocks(search, queries, _BLOCK)
     # The weights are computed from the differences `queries - corners`, because differences of inner products
     # would lose digits by cancellation.
     away = queries - corners[found, 0]
-    along_u, along_v = (jnp.sum(away * edges[found, edge], axis=1) for edge in (0, 1))
-    _, s, t = _closest(jnp.sum(away**2, axis=1), along_u, along_v, *(gram[found] for gram in grams))
+    along_u, along_v = (xp.sum(away * edges[found, edge], axis=1) for edge in (0, 1))
+    _, s, t = _closest(xp.sum(away**2, axis=1), along_u, along_v, *(gram[found] for gram in grams))
     return found, _weights(s, t)
 
 
@@ -87,26 +86,30 @@ def nearest_point_on_candidates(
     **Returns:** As in `nearest_point_on_triangles`.
     """
 
-    def compare(pair: tuple[Int[Array, ""], Int[Array, ""]]) -> tuple[Float[Array, ""], Float[Array, " 2"]]:
-        row, face = pair
-        corners = points[faces[face]]
-        edges, away = corners[1:] - corners[:1], queries[row] - corners[0]
-        along, gram = product(edges, away), product(edges, edges.T)
-        squared, s, t = _closest(product(away, away), along[0], along[1], gram[0, 0], gram[0, 1], gram[1, 1])
-        return squared, jnp.stack([s, t])
+    xp = namespace(queries, points)
+    rows, candidates = xp.asarray(rows), xp.asarray(candidates)
 
-    squared, inside = lax.map(compare, (rows, candidates), batch_size=_PAIRS)
-    m, p = queries.shape[0], rows.shape[0]
-    least = jax.ops.segment_min(squared, rows, m)
-    best = jax.ops.segment_min(jnp.where(squared == least[rows], jnp.arange(p), p), rows, m)
-    return candidates[best].astype(jnp.int32), _weights(*inside[best].T)
+    def compare(pairs: Int[Array, "block 2"]) -> Float[Array, "block 3"]:
+        corners = points[faces[pairs[:, 1]]]
+        edges, away = corners[:, 1:] - corners[:, :1], queries[pairs[:, 0]] - corners[:, 0]
+        along = product(edges, away[:, :, None])[:, :, 0]
+        gram = product(edges, edges.mT)
+        lengths = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
+        return xp.stack(_closest(xp.sum(away**2, axis=1), along[:, 0], along[:, 1], *lengths), axis=1)
+
+    compared = in_blocks(compare, xp.stack([rows, candidates], axis=1), _PAIRS)
+    squared, m, p = compared[:, 0], queries.shape[0], rows.shape[0]
+    least = segment_min(squared, rows, m)
+    best = segment_min(xp.where(squared == least[rows], xp.arange(p), p), rows, m)
+    return candidates[best].astype(xp.int32), _weights(*compared[best, 1:].T)
 
 
 def _weights(s: Float[Array, " m"], t: Float[Array, " m"]) -> Float[Array, "m 3"]:
     """Return the barycentric weights of points `a + s u + t v` in triangles with corner a and edges u, v."""
     # Rounding errors can make 1 - s - t slightly negative.
-    weights = jnp.stack([jnp.maximum(1 - s - t, 0), s, t], axis=1)
-    return weights / jnp.sum(weights, axis=1, keepdims=True)
+    xp = namespace(s)
+    weights = xp.stack([xp.maximum(1 - s - t, 0), s, t], axis=1)
+    return weights / xp.sum(weights, axis=1, keepdims=True)
 
 
 def _closest(
@@ -122,27 +125,29 @@ def _closest(
     `squared` is `|q - a|²` up to a constant, and `along_u` is `(q - a)·u`.
     """
 
+    xp = namespace(squared, along_u, uu)
+
     def at(s: Array, t: Array) -> Array:
         change = s * (s * uu + 2 * t * uv - 2 * along_u) + t * (t * vv - 2 * along_v)
         return squared + change
 
     def share(along: Array, length: Array) -> Array:
-        return jnp.clip(along / jnp.where(length > 0, length, 1), 0, 1)
+        return xp.clip(along / xp.where(length > 0, length, 1), 0, 1)
 
     on_u, on_v = share(along_u, uu), share(along_v, vv)
     across = share(along_v - along_u + uu - uv, uu - 2 * uv + vv)
     determinant = uu * vv - uv**2
     flat = determinant <= 0
-    scale = jnp.where(flat, 1, determinant)
+    scale = xp.where(flat, 1, determinant)
     s = (vv * along_u - uv * along_v) / scale
     t = (uu * along_v - uv * along_u) / scale
     inside = ~flat & (s >= 0) & (t >= 0) & (s + t <= 1)
 
-    zero = jnp.zeros_like(on_u)
+    zero = xp.zeros_like(on_u)
     best, best_s, best_t = at(on_u, zero), on_u, zero
     for s_there, t_there, allowed in ((zero, on_v, True), (1 - across, across, True), (s, t, inside)):
         there = at(s_there, t_there)
         better = (there < best) & allowed
-        best = jnp.where(better, there, best)
-        best_s, best_t = jnp.where(better, s_there, best_s), jnp.where(better, t_there, best_t)
+        best = xp.where(better, there, best)
+        best_s, best_t = xp.where(better, s_there, best_s), xp.where(better, t_there, best_t)
     return best, best_s, best_t

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from typing import Literal
 
-import jax
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
@@ -15,6 +14,7 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, splu
 
 from jaxsmw.choices import APPROXIMATE_FROM, NUMBER_OF_EIGENVECTORS, Eigensolver, Laplacian
+from jaxsmw.core.arrays import on_host
 from jaxsmw.core.checks import check_kind
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_choice
@@ -87,8 +87,11 @@ def compute_spectrum(
     unknown, if faces without area make the cotangent Laplacian undefined, or if the eigenproblem cannot be
     solved accurately. `TypeError` if `mesh` is not a `Mesh`.
     """
+
+    import jax
+
     pairs = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
-    return as_spectrum(mesh, *pairs)
+    return jax.device_put(as_spectrum(mesh, *pairs))
 
 
 def as_spectrum(
@@ -97,16 +100,15 @@ def as_spectrum(
     eigenvectors: Float64[np.ndarray, "n k"],
     vertex_areas: Float64[np.ndarray, " n"],
 ) -> Spectrum:
-    """Return the `eigenpairs` of a mesh as a `Spectrum` of JAX's default float type, with outward normals."""
+    """Return the `eigenpairs` of a mesh as a `Spectrum` of NumPy arrays, of JAX's default float type."""
     referenced = mesh.referenced_vertices
     # Positions are relative to the centroid. In single precision, absolute positions of a mesh far from the
     # origin would be inaccurate.
     centered = mesh.vertices - mesh.average(mesh.vertices)
     positions = np.where(referenced[:, None], centered / np.sqrt(mesh.area), 0)
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
-    # Unlike `device_put`, `jnp.asarray` would compile a program anew for each array size.
-    arrays = map(jax.device_put, (eigenvalues, eigenvectors, vertex_areas, referenced))
-    return Spectrum(*arrays).with_positions(*map(jax.device_put, (positions, normals)))
+    arrays = map(on_host, (eigenvalues, eigenvectors, vertex_areas, referenced))
+    return Spectrum(*arrays).with_positions(on_host(positions), on_host(normals))
 
 
 def eigenpairs(

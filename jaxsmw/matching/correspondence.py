@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import functools
 import warnings
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 from numpy.typing import ArrayLike
 
+from jaxsmw.choices import Backend
+from jaxsmw.core.arrays import is_traced, namespace
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.results import RESULTS, sentence
-from jaxsmw.core.soft_maps import SoftMap, sinkhorn
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.core.triangles import nearest_point_on_candidates
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
@@ -29,9 +30,12 @@ from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset, Stage
 from jaxsmw.matching.starts import INITIAL_MAPS
-from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.nearest import nearest_points
 from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, RegisteredMesh, register_mesh
+
+if TYPE_CHECKING:
+    from jaxsmw.core.soft_maps import SoftMap
+else:
+    SoftMap = Any  # its module imports JAX
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -104,7 +108,7 @@ class Correspondence:
         **Raises:** `ArithmeticError` if a stage failed.
         """
         pair, outcome = prepared.given, scored.outcome
-        last = outcome.last.refinement.unpadded(len(pair.mesh_x.vertices))
+        last = outcome.last.refinement
         if last.result != RESULTS.successful:
             cure = ' If the units of length differ, set scale="unknown".' if pair.partial else ""
             raise ArithmeticError(f"{pair.name}: {sentence(last.result)}{cure}")
@@ -120,7 +124,9 @@ class Correspondence:
             spectrum_x=seen.x.reflect() if prepared.mirrored else seen.x,
             spectrum_y=seen.y,
             stage=outcome.last.stage,
-            refinement=replace(last, pointwise_map=jax.device_put(pointwise_map.astype(np.int32))),
+            refinement=replace(
+                last, pointwise_map=namespace(last.pointwise_map).asarray(pointwise_map, np.int32)
+            ),
             iterations=sum(int(run.refinement.iterations) for run in outcome.runs),
             distortion=scored.distortion,
             suspicious=scored.suspicious,
@@ -153,6 +159,11 @@ class Correspondence:
     def matched_pair(self) -> Pair:
         """The pair with the mirror image of X in place of X, if it was matched."""
         return self.pair.mirrored() if self.mirrored else self.pair
+
+    @property
+    def backend(self) -> Backend:
+        """What has run the last stage: `"numpy"` or `"jax"`."""
+        return "jax" if is_traced(self.refinement.pointwise_map) else "numpy"
 
     @property
     def functional_map(self) -> Float[np.ndarray, "k_out k_in"]:
@@ -209,9 +220,9 @@ class Correspondence:
         mesh_y = pair.mesh_y
         # A vertex of a small component of Y is in no face, so the nearest vertex with faces stands for it.
         matches = extend_to_unreferenced(mesh_y, np.arange(len(mesh_y.vertices)))[matches]
-        with self._precision():
-            rows, candidates = mesh_y.faces_around(matches)
-            faces, weights = nearest_points(queries, database, mesh_y.faces, rows, candidates)
+        rows, candidates = mesh_y.faces_around(matches)
+        faces, weights = nearest_point_on_candidates(queries, database, mesh_y.faces, rows, candidates)
+        faces, weights = np.asarray(faces, np.int64), np.asarray(weights, np.float64)
         return SurfacePoints(faces, weights / weights.sum(axis=1, keepdims=True))
 
     def registered_mesh(self, *, stiffness: float = DEFAULT_STIFFNESS) -> RegisteredMesh:
@@ -287,14 +298,19 @@ class Correspondence:
                 f"a soft map cannot have temperature {temperature} and {iterations} iterations: give a "
                 "positive temperature, such as 0.3, and at least 1 iteration."
             )
+        import jax
+
+        from jaxsmw.core.soft_maps import sinkhorn
+        from jaxsmw.runtime.compilation import compiled
+
         with self._precision():
             soft_map = compiled(sinkhorn)(
                 *jax.device_put(self._embeddings()),
-                query_areas=self.spectrum_x.vertex_areas,
-                database_areas=self.spectrum_y.vertex_areas,
-                temperature=jnp.asarray(float(temperature)),
+                query_areas=jax.device_put(self.spectrum_x.vertex_areas),
+                database_areas=jax.device_put(self.spectrum_y.vertex_areas),
+                temperature=jax.device_put(float(temperature)),
                 iterations=iterations,
-                tolerance=jnp.asarray(float(tolerance)),
+                tolerance=jax.device_put(float(tolerance)),
             )
         if not soft_map.converged:
             warnings.warn(
@@ -384,5 +400,9 @@ class Correspondence:
         return StageRun(self.stage, spectra, self.refinement)
 
     def _precision(self) -> AbstractContextManager[None]:
-        """Return a context manager in which JAX uses the float type of the functional map."""
+        """Return a context manager in which JAX, if it is used, has the float type of the functional map."""
+        if not is_traced(self.refinement.functional_map):
+            return nullcontext()
+        import jax
+
         return jax.enable_x64(self.functional_map.dtype == np.float64)

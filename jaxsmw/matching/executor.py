@@ -1,8 +1,4 @@
-"""Runs stages: one compiled program per stage on one pair, or batches of pairs.
-
-Shapes of similar sizes are padded to one size, so that they share compiled programs. All maps that go in and
-come out have one entry per vertex of X.
-"""
+"""Runs stages: by NumPy or JAX on one pair, or by JAX on batches of pairs."""
 
 from __future__ import annotations
 
@@ -10,41 +6,47 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Int64
+from jaxtyping import Int
 
-from jaxsmw.core.refinement import refine
+from jaxsmw.core.arrays import Array
+from jaxsmw.core.refinement import Refinement, refine, refine_at_once
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.matching.outcome import Outcome, StageRun, Start
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
-from jaxsmw.runtime.batches import pad_rows, program_size, refine_pairs
-from jaxsmw.runtime.compilation import compile_ahead, compiled
 
 
 def run(stages: Sequence[Stage], spectra: SpectralPair, start: Start) -> Outcome:
     """Run stages on one pair, in their order, until one of them fails.
 
-    The function does not wait for the last stage, so that the device refines further starts while the host
-    looks at a finished one.
+    NumPy runs a stage if the spectra are arrays of NumPy and the refiner takes its namespace from its arrays.
+    JAX runs all other stages, and the function does not wait for the last of them.
     """
     runs: list[StageRun] = []
-    matches = padded_map(start.pointwise_map)
+    matches: Int[Array, " m"] = start.pointwise_map.astype(np.int32)
     for stage in stages:
         if runs and runs[-1].refinement.result != RESULTS.successful:
             break
-        seen = spectra.padded.seen_by(stage)
+        seen = spectra.seen_by(stage)
         if not runs and start.excluded is not None:
-            excluded = jnp.asarray(pad_rows(start.excluded, len(seen.x.mask)))
-            seen = replace(seen, x=seen.x.excluding(excluded))
-        settings = stage.settings(partial=seen.partial)
-        refinement = compiled(refine)(*seen.both, matches, samples=seen.samples, **settings)
+            seen = replace(seen, x=seen.x.excluding(start.excluded))
+        refinement = refine_stage(stage, seen, matches)
         runs.append(StageRun(stage, spectra, refinement))
         matches = refinement.pointwise_map
     return Outcome(start.pointwise_map, tuple(runs))
+
+
+def refine_stage(stage: Stage, seen: SpectralPair, matches: Int[Array, " m"]) -> Refinement:
+    """Run a stage on the spectra that it sees, from a map (m,), by NumPy if possible."""
+    settings = stage.settings(partial=seen.partial)
+    if seen.on_host and stage.refiner.uses_namespaces:
+        with np.errstate(all="ignore"):  # status codes report failures
+            return refine_at_once(*seen.both, np.asarray(matches), samples=seen.samples, **settings)
+    from jaxsmw.runtime.compilation import compiled
+
+    return compiled(refine)(*seen.both, matches, samples=seen.samples, **settings)
 
 
 def run_batches(
@@ -52,7 +54,7 @@ def run_batches(
     tasks: Sequence[tuple[SpectralPair, Start]],
     *,
     batch_size: int | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
 ) -> list[Outcome]:
     """Run stages on many pairs of full shapes in batches, each stage for all pairs before the next stage.
 
@@ -68,6 +70,8 @@ def run_batches(
     """
     if any(pair.partial or start.excluded is not None for pair, start in tasks):
         raise ValueError("batches contain only full shapes and starts that use all vertices")
+    from jaxsmw.runtime.batches import refine_pairs
+
     maps = [np.asarray(start.pointwise_map) for _, start in tasks]
     outcomes = [Outcome(start.pointwise_map) for _, start in tasks]
     for stage in stages:
@@ -110,40 +114,3 @@ def _seen_by(stage: Stage, pairs: Sequence[SpectralPair]) -> list[SpectralPair]:
         )
         restricted.append(replace(seen, x=x, y=y))
     return restricted
-
-
-def padded_map(pointwise_map: Int64[np.ndarray, " m"]) -> Int[Array, " p"]:
-    """Return a map as a padded JAX array of the type that refinement returns, as programs expect it."""
-    padded = pad_rows(pointwise_map, program_size(len(pointwise_map)))
-    return jax.device_put(padded.astype(np.int32))
-
-
-def compile_stage(stage: Stage, number_x: int, number_y: int, *, partial: bool = False) -> None:
-    """Compile the program of a stage in the background. Both shapes must have its number of eigenvectors.
-
-    **Arguments:**
-
-    - `stage`: the stage.
-    - `number_x`, `number_y`: the numbers of vertices of X and of Y.
-    - `partial`: whether one of the shapes is a partial shape.
-    """
-    sizes = program_size(number_x), program_size(number_y)
-
-    def arguments() -> tuple[tuple, dict[str, Any]]:
-        samples = None
-        if (s := stage.number_of_samples) is not None:
-            samples = (jnp.zeros(s, int),) * 2
-        x, y = (_outline(stage, size) for size in sizes)
-        return (x, y, jnp.zeros(sizes[0], jnp.int32)), {"samples": samples}
-
-    compile_ahead(refine, arguments, **stage.settings(partial=partial))
-
-
-def _outline(stage: Stage, number_of_vertices: int) -> Spectrum:
-    """Return a spectrum of zeros, of which only the sizes matter."""
-    n, k, d = number_of_vertices, stage.number_of_eigenvectors, stage.number_of_descriptors
-    c = stage.number_of_crease_eigenvectors
-    spectrum = Spectrum(jnp.zeros(k), jnp.zeros((n, k)), jnp.zeros(n), jnp.zeros(n, bool))
-    described = spectrum.with_descriptors(jnp.zeros((n, d)) if d else None)
-    creased = described.with_crease_eigenvectors(jnp.zeros((n, c)) if c else None)
-    return creased.with_positions(jnp.zeros((n, 3)), jnp.zeros((n, 3)))

@@ -9,14 +9,15 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 
-import jax
 from numpy.typing import ArrayLike
 
 from jaxsmw.choices import (
+    DEFAULT_BACKEND,
     DEFAULT_INITIAL_MAP,
     DEFAULT_MATCH_INIT,
     DEFAULT_MIRROR,
     DEFAULT_PRESET,
+    Backend,
     Eigensolver,
     Laplacian,
     MatchInit,
@@ -28,18 +29,17 @@ from jaxsmw.geometry.mesh import Mesh, MeshLike
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.advice import advice
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.executor import compile_stage, run
+from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import Judge, Scored, estimate_error
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, prepare
 from jaxsmw.matching.search.chirality import Decision, Hands
 from jaxsmw.matching.search.repair import refine_further, repair_map
-from jaxsmw.matching.search.trimming import match_trimmed, trimmed_stage
+from jaxsmw.matching.search.trimming import match_trimmed
 from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
 from jaxsmw.matching.starts import check_initial_map, make_starts
-from jaxsmw.runtime.memory import return_free_memory
 from jaxsmw.runtime.progress import Step, no_step, timed
 from jaxsmw.runtime.threads import one_blas_thread
 
@@ -58,6 +58,7 @@ def match(
     scale: float | Scale = 1.0,
     mirror: Mirror = DEFAULT_MIRROR,
     history: bool = False,
+    backend: Backend = DEFAULT_BACKEND,
 ) -> Correspondence:
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
@@ -110,6 +111,9 @@ def match(
 
     - `history`: whether to record a `History` of the last stage. The result contains the record in its
       attribute `refinement.history`.
+    - `backend`: what runs the stages. `"numpy"` runs them at once, and `"jax"` compiles them for the sizes of
+      the meshes first. The maps differ by rounding. Refiners that are written for JAX always run in JAX; see
+      `Refiner.uses_namespaces`. `"auto"` (the default) is `"jax"` if JAX has an accelerator, else `"numpy"`.
 
     **Returns:** A `Correspondence`, whose attribute `pointwise_map` (m,) is an int64 array of 0-based
     vertices of Y. Small components, such as eyes, move with their surroundings and are matched to their
@@ -121,6 +125,7 @@ def match(
     computation of the initial map or the refinement fails numerically.
     """
     check_choice(mirror, Mirror, "a mirror setting")
+    check_choice(backend, Backend, "a backend")
     pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
     adapts = isinstance(preset, str | Preset)
     method = choose_preset(preset)
@@ -133,12 +138,17 @@ def match(
     automatic = isinstance(init, str) and init == "auto"
     # The check runs before the slow computation of the eigenbases.
     first_init = check_initial_map(pair, DEFAULT_INITIAL_MAP if automatic else init)
-    _compile_ahead(pair, method)
 
     seconds: dict[str, float] = {}
     step = functools.partial(timed, seconds=seconds)
     prepared = prepare(
-        surfaces, method.sizes, given=pair, laplacian=laplacian, eigensolver=eigensolver, step=step
+        surfaces,
+        method.sizes,
+        given=pair,
+        laplacian=laplacian,
+        eigensolver=eigensolver,
+        backend=backend,
+        step=step,
     )
     aligns = automatic and method.repair is not None  # "aligned" is used only for asymmetric shapes
     decision = Decision(mirror == "yes")
@@ -190,7 +200,6 @@ def match_prepared(
     **Raises:** `ArithmeticError` if refinement fails numerically from every start, or in the final stages.
     """
     preset = prepared.usable(preset)
-    return_free_memory()
     known: Sequence[Outcome | None] = outcomes or [None] * len(starts)
     candidates = []
     with step("refinement"), one_blas_thread():
@@ -209,7 +218,6 @@ def match_prepared(
         else:
             scored = refine_further(prepared, start, preset, scored)
             scored = _run_final(prepared, preset, scored)
-        jax.block_until_ready(scored.outcome.last.refinement)
     return Correspondence.of(prepared, start, preset, scored)
 
 
@@ -250,22 +258,3 @@ def _run_final(prepared: PreparedPair, preset: Preset, scored: Scored) -> Scored
     after = run(preset.final, prepared.spectra, Start(scored.pointwise_map))
     judge = Judge.of(prepared, preset.final, preset.criteria)
     return judge.measured(scored.outcome.followed_by(after), suspicious=scored.suspicious)
-
-
-def _compile_ahead(pair: Pair, preset: Preset) -> None:
-    """Compile in the background the programs of all stages, or of the trimmed stage of a partial pair.
-
-    The other programs of a partial pair are not compiled, because its numbers of eigenvectors are not known
-    yet. If a mesh has too few vertices for the preset, nothing is compiled, because `prepare` then raises an
-    error.
-    """
-    if preset.sizes.number_of_eigenvectors >= min(len(mesh.vertices) for mesh in pair.meshes):
-        return
-    # The last stage is compiled first, because its compilation takes the longest time.
-    stages = [*reversed(preset.stages)]
-    if pair.partial:
-        trimmed = trimmed_stage(pair, preset)
-        stages = [] if trimmed is None else [trimmed]
-    numbers = [len(mesh.vertices) for mesh in pair.meshes]
-    for stage in stages:
-        compile_stage(stage, *numbers, partial=pair.partial)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int32, Int64
+from jaxtyping import Bool, Float, Int32, Int64
 
+from jaxsmw.core.arrays import Array, is_traced
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
-from jaxsmw.runtime.compilation import compiled
+
+Computed = TypeVar("Computed")
 
 
 class Start(NamedTuple):
@@ -45,8 +48,8 @@ class StageRun:
     **Attributes:**
 
     - `stage`: the `Stage`.
-    - `spectra`: the spectra of the pair, without padding.
-    - `refinement`: the `Refinement`, whose vertices may be padded.
+    - `spectra`: the spectra of the pair.
+    - `refinement`: the `Refinement`, with arrays of the executor that has run the stage.
     """
 
     stage: Stage
@@ -60,19 +63,22 @@ class StageRun:
 
     def reverse_map(self) -> Int64[np.ndarray, " n"]:
         """Return the map Y -> X (n,) of all vertices, 0-based vertices of X, from the last state."""
-        reverse = compiled(_reverse_map)(*self._arguments)
-        return np.asarray(reverse)[: self.spectra.y.mask.shape[0]].astype(np.int64)
+        return np.asarray(self._computed(_reverse_map)).astype(np.int64)
 
     def embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:
         """Return the embeddings of X and Y in which the last search has compared vertices."""
-        x, y = (np.asarray(points) for points in compiled(_embeddings)(*self._arguments))
-        return x[: self.spectra.x.mask.shape[0]], y[: self.spectra.y.mask.shape[0]]
+        x, y = self._computed(_embeddings)
+        return np.asarray(x), np.asarray(y)
 
-    @property
-    def _arguments(self) -> tuple[Refiner, Problem, State]:
-        problem = Problem(*self.seen.padded.both, partial=self.spectra.partial)
-        # Stages with other levels share the program.
-        return self.stage.refiner.with_traced_levels(), problem, self.refinement.state
+    def _computed(self, function: Callable[[Refiner, Problem, State], Computed]) -> Computed:
+        problem = Problem(*self.seen.both, partial=self.spectra.partial)
+        if is_traced(self.refinement.pointwise_map):
+            from jaxsmw.runtime.compilation import compiled
+
+            # Stages with other levels share the program.
+            return compiled(function)(self.stage.refiner.with_traced_levels(), problem, self.refinement.state)
+        with np.errstate(all="ignore"):  # status codes report failures
+            return function(self.stage.refiner, problem, self.refinement.state)
 
 
 def _reverse_map(refiner: Refiner, problem: Problem, state: State) -> Int32[Array, " n"]:
@@ -108,8 +114,7 @@ class Outcome:
         """The map of the last stage that has run (m,), or the initial map if no stage has run."""
         if not self.runs:
             return self.initial_map
-        padded = np.asarray(self.last.refinement.pointwise_map)
-        return padded[: len(self.initial_map)].astype(np.int64)
+        return np.asarray(self.last.refinement.pointwise_map).astype(np.int64)
 
     @property
     def last(self) -> StageRun:

@@ -9,13 +9,12 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import NamedTuple, TypeVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from jaxtyping import Array, Float, Float64, Int, Int64, Shaped
+from jaxtyping import Float, Float64, Int, Int64, Shaped
 
-from jaxsmw.choices import Eigensolver, Laplacian
+from jaxsmw.choices import DEFAULT_BACKEND, Backend, Eigensolver, Laplacian
+from jaxsmw.core.arrays import Array, namespace, on_host
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.creases import crease_eigenvectors
@@ -26,6 +25,7 @@ from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.spectral_pair import SpectralPair, common_range
 from jaxsmw.matching.stages import Preset, Sizes
+from jaxsmw.runtime.backends import chosen_backend
 from jaxsmw.runtime.progress import Step, no_step
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
@@ -78,7 +78,7 @@ class PreparedShape:
         """The spectrum at the compared vertices."""
         if self.compared is None:
             return self.spectrum
-        return self.spectrum.sample(jnp.asarray(self.compared.vertices))
+        return self.spectrum.sample(self.compared.vertices)
 
     def compared_rows(self, vertices: Int64[np.ndarray, " v"]) -> Int64[np.ndarray, " v"]:
         """Return the row of each vertex (v,), or of the sample nearest to it, among the compared vertices."""
@@ -112,8 +112,8 @@ class PreparedShape:
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], name: str) -> PreparedShape:
         """Return the shape, given the result of the method `arrays`."""
         names = [field.name for field in fields(Spectrum) if field.name in arrays]
-        spectrum = Spectrum(**{name: jax.device_put(arrays[name]) for name in names})
-        samples = jax.device_put(arrays["samples"]) if "samples" in arrays else None
+        spectrum = Spectrum(**{name: arrays[name] for name in names})
+        samples = arrays.get("samples")
         mesh = Mesh(arrays["mesh_vertices"], arrays["mesh_faces"], name)
         return cls(mesh, spectrum, compared_samples(mesh), samples)
 
@@ -124,6 +124,7 @@ def prepare_shapes(
     *,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
+    backend: Backend = DEFAULT_BACKEND,
     step: Step = no_step,
 ) -> list[PreparedShape]:
     """Compute the spectra, crease eigenvectors and samples of shapes; two shapes side by side.
@@ -134,6 +135,7 @@ def prepare_shapes(
     - `sizes`: the numbers of eigenvectors, crease eigenvectors and samples of each shape.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`. All meshes get the same eigensolver, because
       their spectra are compared.
+    - `backend`: see `jaxsmw.match`. The arrays of the spectra are of NumPy or JAX.
     - `step`: reports and measures the steps.
 
     **Returns:** One `PreparedShape` per mesh, without descriptors, in units in which its area is 1.
@@ -156,17 +158,23 @@ def prepare_shapes(
         with step("samples"):
             vertices = each(lambda mesh: farthest_point_samples(mesh, samples))
         shapes = [
-            replace(shape, samples=jax.device_put(chosen))
-            for shape, chosen in zip(shapes, vertices, strict=True)
+            replace(shape, samples=on_host(chosen)) for shape, chosen in zip(shapes, vertices, strict=True)
         ]
     if creases:
         with step("crease eigenvectors"):
             vectors = each(lambda mesh: crease_eigenvectors(mesh, creases))
         shapes = [
-            replace(shape, spectrum=shape.spectrum.with_crease_eigenvectors(jax.device_put(columns)))
+            replace(shape, spectrum=shape.spectrum.with_crease_eigenvectors(on_host(columns)))
             for shape, columns in zip(shapes, vectors, strict=True)
         ]
-    return shapes
+    if chosen_backend(backend) == "numpy":
+        return shapes
+    import jax
+
+    return [
+        replace(shape, spectrum=jax.device_put(shape.spectrum), samples=jax.device_put(shape.samples))
+        for shape in shapes
+    ]
 
 
 def _shape(
@@ -241,7 +249,8 @@ class DescriptorAxes(NamedTuple):
 def with_descriptors(shape: PreparedShape, components: Float[np.ndarray, "a d"]) -> PreparedShape:
     """Return a shape with descriptors, given at its compared vertices (a, d)."""
     everywhere = shape.everywhere(components) * np.asarray(shape.spectrum.mask)[:, None]
-    return replace(shape, spectrum=shape.spectrum.with_descriptors(jax.device_put(everywhere)))
+    descriptors = namespace(shape.spectrum.eigenvectors).asarray(everywhere)
+    return replace(shape, spectrum=shape.spectrum.with_descriptors(descriptors))
 
 
 def weights(shapes: Sequence[PreparedShape]) -> list[Float[np.ndarray, " a"]]:
@@ -497,6 +506,7 @@ def prepare(
     given: Pair | None = None,
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
+    backend: Backend = DEFAULT_BACKEND,
     step: Step = no_step,
 ) -> PreparedPair:
     """Prepare both shapes of a pair, and pair them.
@@ -507,6 +517,7 @@ def prepare(
     - `sizes`: the numbers of eigenvectors, crease eigenvectors and samples of each shape.
     - `given`: the pair to whose vertices the result refers, if `pair` is cut; by default `pair`.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
+    - `backend`: see `jaxsmw.match`.
     - `step`: reports and measures the steps.
 
     **Returns:** A `PreparedPair` without descriptors.
@@ -520,7 +531,9 @@ def prepare(
             f"area {pair.mesh_y.area:.3g}, so their units of length probably differ: scale one of the "
             'meshes, or set scale="unknown".'
         )
-    x, y = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver, step=step)
+    x, y = prepare_shapes(
+        pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver, backend=backend, step=step
+    )
     return PreparedPair.of(pair, x, y, given=given, laplacian=laplacian, eigensolver=eigensolver)
 
 
@@ -552,7 +565,8 @@ def paired_spectra(
     eigenvalues of a mesh are zero. For a partial pair, `InputError` is also raised if the area of one mesh is
     less than a thousandth of the other area.
     """
-    prepared = prepare(pair, Sizes(number_of_eigenvectors), laplacian=laplacian, eigensolver=eigensolver)
+    sizes = Sizes(number_of_eigenvectors)
+    prepared = prepare(pair, sizes, laplacian=laplacian, eigensolver=eigensolver, backend="jax")
     return prepared.x.spectrum, prepared.y.spectrum
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxsmw.core.arrays import Array, is_traced
 from jaxsmw.core.refiner import Samples
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.matching.stages import Stage
-from jaxsmw.runtime.batches import program_size
-from jaxsmw.runtime.compilation import compiled
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +37,10 @@ class SpectralPair:
         """The spectra of X and Y."""
         return self.x, self.y
 
-    @cached_property
-    def padded(self) -> SpectralPair:
-        """The pair with padded spectra."""
-        pad = compiled(Spectrum.pad)
-        x, y = (pad(spectrum, program_size(spectrum.mask.shape[0])) for spectrum in (self.x, self.y))
-        return replace(self, x=x, y=y)
+    @property
+    def on_host(self) -> bool:
+        """Whether the arrays are of NumPy, so that refiners with namespaces run at once."""
+        return not is_traced(self.x.eigenvectors, self.y.eigenvectors)
 
     def seen_by(self, stage: Stage) -> SpectralPair:
         """Return the pair, restricted to the eigenvectors, descriptors and samples that a stage uses.

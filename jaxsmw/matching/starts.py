@@ -6,16 +6,16 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple, get_args
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Int64
+from jaxtyping import Float, Int, Int64
 from numpy.typing import ArrayLike
 
 from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
+from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
-from jaxsmw.core.solutions import DescriptorPair, RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.alignment import align_rigidly
@@ -26,7 +26,6 @@ from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, c
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.runtime.nearest import nearest_rows
 
 INITIAL_MAPS: tuple[InitialMap, ...] = get_args(InitialMap)
 """The names of the initial maps."""
@@ -178,7 +177,13 @@ def _functional_features(prepared: PreparedPair) -> _Features:
 
     **Raises:** `ArithmeticError` if the functional map cannot be computed.
     """
-    spectrum_x, spectrum_y = (shape.compared_spectrum for shape in prepared.shapes)
+    import jax
+    import jax.numpy as jnp
+
+    from jaxsmw.core.solutions.descriptors import DescriptorPair
+    from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
+
+    spectrum_x, spectrum_y = jax.device_put([shape.compared_spectrum for shape in prepared.shapes])
     dtype = spectrum_x.eigenvectors.dtype
     shot_x, shot_y = (jnp.asarray(descriptors, dtype) for descriptors in prepared.shot)
     on_samples = any(shape.compared is not None for shape in prepared.shapes)
@@ -290,12 +295,9 @@ def _check_landmarks(pair: Pair, landmarks: np.ndarray) -> None:
 
 
 def nearest_map(prepared: PreparedPair, features: _Features) -> Int64[np.ndarray, " m"]:
-    """Compute a pointwise map of all vertices of X (m,) by nearest-neighbour search in feature space.
-
-    **Raises:** `ArithmeticError` if the search is wrong; see `jaxsmw.runtime.nearest.check_nearest`.
-    """
+    """Compute a pointwise map of all vertices of X (m,) by nearest-neighbour search in feature space."""
     x, y = prepared.shapes
     dtype, mask = y.spectrum.eigenvectors.dtype, np.asarray(y.compared_spectrum.mask)
     of_x, of_y = (of_shape.astype(dtype) for of_shape in features)
-    nearest = nearest_rows(of_x, of_y, mask)
+    nearest = np.asarray(nearest_neighbor(of_x, of_y, database_mask=mask), np.int64)
     return x.everywhere(nearest if y.compared is None else y.compared.vertices[nearest])

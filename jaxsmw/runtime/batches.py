@@ -13,12 +13,13 @@ import numpy as np
 from jax import lax
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int, Int32, Shaped
+from jaxtyping import Int, Int32, Shaped
 
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.checks import check_matches
 from jaxsmw.core.refinement import Refinement, RefineSettings, refine
-from jaxsmw.core.search import BLOCK, queries_per_block
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.core.traced_search import BLOCK, queries_per_block
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.threads import one_blas_thread
@@ -33,9 +34,6 @@ _USUAL_MEMORY = 8 * 2**30
 # vertices have only 17 different padded sizes.
 _SUBDIVISION = 8
 
-# Shapes with more vertices than this number are not padded, because padding would need too much memory.
-_PADDED_UP_TO = 50_000
-
 Tree = TypeVar("Tree")
 
 
@@ -47,11 +45,6 @@ def padded_size(number_of_vertices: int) -> int:
     power = 2 ** max(number_of_vertices - 1, 1).bit_length() // 2
     step = max(power // _SUBDIVISION, BLOCK)
     return -(-number_of_vertices // step) * step
-
-
-def program_size(number_of_vertices: int) -> int:
-    """Return the number of vertices to which a shape that is refined alone is padded."""
-    return number_of_vertices if number_of_vertices > _PADDED_UP_TO else padded_size(number_of_vertices)
 
 
 def pad_rows(rows: Shaped[np.ndarray, "n ..."], number_of_rows: int) -> Shaped[np.ndarray, "p ..."]:

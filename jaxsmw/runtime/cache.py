@@ -23,7 +23,6 @@ import platformdirs
 
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write, can_lock
-from jaxsmw.runtime.program_checksums import CHECKSUMS, remove_damaged_programs
 
 # Every key is a hash that includes this number. Increment this number when a change of the code changes the
 # results for the same inputs.
@@ -34,7 +33,7 @@ _FORMAT = 4
 _OWN_FILES = re.compile(r"(?:([a-z-]+)-[0-9a-f]{64}|\.[0-9a-f]{32})\.npz")
 # JAX stores compiled programs in one subdirectory for each type of processor.
 _PROGRAMS = re.compile(r"programs-[0-9a-f]{16}")
-_PROGRAM_FILES = ("-cache", "-atime", CHECKSUMS)
+_PROGRAM_FILES = ("-cache", "-atime")
 
 
 Inputs = Sequence[np.ndarray | str | int | float]
@@ -172,7 +171,6 @@ def cache_compiled_programs() -> None:
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
     if settings.keys().isdisjoint(os.environ):
-        remove_damaged_programs(directory)
         os.environ.update(settings)
         # On a full disk, or without the directory, JAX warns once for each program. `cached` warns about the
         # same directory.

@@ -20,7 +20,6 @@ from typing import TypeVar
 from urllib.parse import urlsplit
 
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.compilation import release_programs
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -127,10 +126,6 @@ _warnings: list[Warning] = []
 
 def _run_in_worker(function: Callable[[Task], Result], task: Task) -> tuple[Result, list[Warning]]:
     """Return the result of a task, and the worker's warnings since the last task."""
-    # Pairs of different sizes need different programs, which would fill the memory of a worker. An executor
-    # that runs tasks in the calling process must not release the programs of the caller.
-    if multiprocessing.parent_process() is not None or _runs_in_dask():
-        release_programs()
     result = function(task)
     issued = _warnings.copy()
     _warnings.clear()

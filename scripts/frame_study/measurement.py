@@ -31,7 +31,8 @@ from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
 from jaxsmw.core.results import RESULTS, sentence
-from jaxsmw.core.solutions import LeastSquares, RegularizedLeastSquares
+from jaxsmw.core.solutions.closed_form import LeastSquares
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.evaluation.ground_truth import GroundTruth, read_ground_truth
 from jaxsmw.evaluation.metrics import GeodesicError

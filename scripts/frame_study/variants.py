@@ -35,18 +35,17 @@ from jaxsmw.core.banks import (
     frame_function,
     tighten,
 )
-from jaxsmw.core.functional_map import Convention, multiscale_kernel
+from jaxsmw.core.functional_map import Convention, WaveletProblem, multiscale_kernel
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.solutions import (
+from jaxsmw.core.solutions.closed_form import (
     Filtering,
     LeastSquares,
     NearestOrthogonal,
     PreparedFiltering,
-    RegularizedLeastSquares,
     Solution,
-    WaveletProblem,
 )
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 
 CONVENTIONS: tuple[Convention, ...] = ("pullback", "pushforward")

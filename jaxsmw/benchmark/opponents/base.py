@@ -12,17 +12,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
 
-import jax
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int, Int64
+from jaxtyping import Float, Float64, Int, Int64
 
 from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MATCH_INIT
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced, make_mesh
-from jaxsmw.matching.executor import padded_map
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.spectral_pair import SpectralPair
@@ -42,7 +41,7 @@ class MethodInput:
     **Attributes:**
 
     - `spectra`: the spectra and samples of X and Y, with at least as many eigenvectors as any method uses.
-      Spectra and maps may be padded. `SpectralPair.seen_by` makes the spectra of a partial pair comparable.
+      `SpectralPair.seen_by` makes the spectra of a partial pair comparable.
     - `initial_map`: the initial map X -> Y (m,), 0-based vertices of Y.
     - `meshes`: the meshes of X and Y, for methods that need edges or faces.
     - `names`: the names of X and Y, for methods that read maps from files.
@@ -78,7 +77,8 @@ class MethodInput:
         start = make_start(prepared, DEFAULT_INITIAL_MAP if automatic else init)
         if number_of_descriptors:
             prepared = prepared.describe(number_of_descriptors)
-        return cls(prepared.spectra.padded, padded_map(start.pointwise_map), pair.meshes, names, init)
+        initial_map = start.pointwise_map.astype(np.int32)
+        return cls(prepared.spectra, initial_map, pair.meshes, names, init)
 
 
 class Method(abc.ABC):
@@ -103,7 +103,7 @@ class Method(abc.ABC):
 
     @abc.abstractmethod
     def __call__(self, pair: MethodInput) -> PointwiseMap:
-        """Return the pointwise map X -> Y (m,), 0-based vertices of Y, which may be padded.
+        """Return the pointwise map X -> Y (m,), 0-based vertices of Y.
 
         **Raises:** `ArithmeticError` if the method fails numerically.
         """
@@ -116,7 +116,7 @@ class Method(abc.ABC):
     def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
         """Return the map, and the seconds from the initial map to it; NaN if it was computed elsewhere."""
         began = time.perf_counter()
-        pointwise_map = jax.block_until_ready(self(pair))
+        pointwise_map = np.asarray(self(pair))  # waits for JAX
         return pointwise_map, time.perf_counter() - began
 
     def check(self, pairs: Sequence[DataPair]) -> None:
@@ -140,13 +140,13 @@ def successful(pointwise_map: Int[Array, " m"], result: RESULTS) -> Int[Array, "
 
 @dataclass(frozen=True, eq=False)
 class HostShape:
-    """A shape without unreferenced vertices and without padding, in NumPy float64.
+    """A shape without unreferenced vertices, in NumPy float64.
 
     **Attributes:**
 
     - `mesh`: the mesh with its u referenced vertices.
     - `vertices`: the number of each referenced vertex in the given mesh (u,).
-    - `spectrum`: the spectrum of the given mesh, padded or not.
+    - `spectrum`: the spectrum of the given mesh.
     """
 
     mesh: Mesh

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,20 +31,18 @@ from jaxsmw.benchmark.opponents.base import MOST_SAMPLES, Method, MethodInput, P
 from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
-from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.core.solutions import Filtering, NearestOrthogonal
-from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.core.solutions.closed_form import Filtering, NearestOrthogonal
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.maps import read_pointwise_map
 from jaxsmw.matching.correspondence import Correspondence
+from jaxsmw.matching.executor import refine_stage
 from jaxsmw.matching.match import match
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, PresetName, Stage
 from jaxsmw.runtime.cache import recomputing
-from jaxsmw.runtime.compilation import compiled
 
 
 @dataclass(frozen=True)
@@ -118,9 +116,7 @@ class Refined(Method):
             iterations=self.iterations,
             number_of_samples=self.number_of_samples,
         )
-        seen, start = pair.spectra.seen_by(stage), pair.initial_map
-        settings = stage.settings(partial=seen.partial)
-        refinement = compiled(refine)(*seen.both, start, samples=seen.samples, **settings)
+        refinement = refine_stage(stage, pair.spectra.seen_by(stage), pair.initial_map)
         return successful(refinement.pointwise_map, refinement.result)
 
 
@@ -183,14 +179,15 @@ class ZoomOut(Method):
         pointwise_map, refiner = pair.initial_map, _UNFILTERED
         if self.number_of_samples is not None:
             refiner, first = _UNFILTERED_ON_SAMPLES, self._seen(pair, self.first)
-            functional_map = compiled(encode)(pair.initial_map, *first.both)
-            pointwise_map = compiled(decode)(functional_map, *_at_samples(first))
+            functional_map = encode(pair.initial_map, *first.both)
+            pointwise_map = decode(functional_map, *_at_samples(first).both)
         for k in range(self.first, self.number_of_eigenvectors + 1, self.step):
             seen = self._seen(pair, k)
-            refined = compiled(refine)(*_at_samples(seen), pointwise_map, refiner=refiner, iterations=1)
+            stage = Stage(refiner, number_of_eigenvectors=k, iterations=1)
+            refined = refine_stage(stage, _at_samples(seen), pointwise_map)
             pointwise_map = refined.pointwise_map
         if self.number_of_samples is not None:
-            pointwise_map = compiled(decode)(refined.functional_map, *seen.both)
+            pointwise_map = decode(refined.functional_map, *seen.both)
         return successful(pointwise_map, refined.result)
 
     def _seen(self, pair: MethodInput, k: int) -> SpectralPair:
@@ -198,11 +195,12 @@ class ZoomOut(Method):
         return pair.spectra.seen_by(stage)
 
 
-def _at_samples(pair: SpectralPair) -> tuple[Spectrum, Spectrum]:
-    """Restrict both spectra to the samples. Without samples, return both spectra unchanged."""
+def _at_samples(pair: SpectralPair) -> SpectralPair:
+    """Restrict both spectra to the samples. Without samples, return the pair unchanged."""
     if pair.samples is None:
-        return pair.both
-    return pair.x.sample(pair.samples[0]), pair.y.sample(pair.samples[1])
+        return pair
+    x, y = (spectrum.sample(rows) for spectrum, rows in zip(pair.both, pair.samples, strict=True))
+    return replace(pair, x=x, y=y, samples=None)
 
 
 UNREFINED = Unrefined()

@@ -45,15 +45,16 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import jax.scipy as jsp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Int32
+from jaxtyping import Bool, Float, Int, Int32
 
 from jaxsmw.benchmark.opponents.baselines import Refined
+from jaxsmw.core.arrays import Array, replaced
 from jaxsmw.core.banks import FilterBank, Identity
 from jaxsmw.core.linear_algebra import product
+from jaxsmw.core.module import Module, field
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.refiner import State
 from jaxsmw.core.refiners.wavelet_preservation import PreparedWavelets, WaveletPreservation
@@ -67,7 +68,7 @@ _BLOCK = 128
 _LEAST_VARIANCE = 1e-8
 
 
-class Drift(eqx.Module):
+class Drift(Module):
     """The result of `coherent_point_drift`.
 
     **Attributes:**
@@ -195,7 +196,7 @@ def kernel_factor(
         row = kernel - product(rows[:, pivot], rows)
         row = row / jnp.sqrt(jnp.maximum(unexplained[pivot], rounding))
         row = jnp.where(unexplained > rounding, row, 0)
-        return rows.at[step].set(row), (unexplained - row**2).at[pivot].set(0)
+        return replaced(rows, step, row), replaced(unexplained - row**2, pivot, 0)
 
     nothing = jnp.zeros((rank, n), points.dtype), mask.astype(points.dtype)
     rows, _ = lax.fori_loop(0, rank, eliminate, nothing)
@@ -243,8 +244,8 @@ class DriftRecovery(WaveletPreservation):
     """
 
     bank: FilterBank = Identity()
-    rank: int = eqx.field(static=True, default=300)
-    drift_iterations: int = eqx.field(static=True, default=50)
+    rank: int = field(static=True, default=300)
+    drift_iterations: int = field(static=True, default=50)
 
     def __check_init__(self) -> None:
         if self.convention != "pullback":
@@ -329,7 +330,7 @@ def _expectation(
 
     padded = jnp.pad(data, ((0, blocks * _BLOCK - m), (0, 0))).reshape(blocks, _BLOCK, d)
     counts = jnp.pad(data_mask, (0, blocks * _BLOCK - m)).reshape(blocks, _BLOCK).astype(dtype)
-    moments, (per_point, logs) = lax.scan(add, jnp.zeros((n, d + 1), dtype), (padded, counts))
+    moments, (per_point, logs) = lax.scan(add, jnp.zeros((n, d + 1), dtype), (padded, counts))  # type: ignore[arg-type]
     return _Expected(moments[:, :-1], moments[:, -1], per_point.reshape(-1)[:m], jnp.sum(logs))
 
 

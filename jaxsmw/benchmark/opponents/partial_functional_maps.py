@@ -62,16 +62,17 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, Int32
+from jaxtyping import Float, Int, Int32
 
 from jaxsmw.benchmark.opponents.base import Method, MethodInput, PointwiseMap, successful
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.checks import all_finite
 from jaxsmw.core.functional_map import dual_eigenvectors, encode
 from jaxsmw.core.linear_algebra import product
+from jaxsmw.core.module import Module
 from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refinement import diagnose
 from jaxsmw.core.results import RESULTS, where
@@ -99,7 +100,7 @@ _MAP_STEPS, _REGION_STEPS = 100, 60
 _MAP_TOLERANCE, _REGION_TOLERANCE = 1e-4, 1e-6
 
 
-class SurfaceGradient(eqx.Module):
+class SurfaceGradient(Module):
     """The gradient operator for piecewise linear functions on a mesh.
 
     **Attributes:**
@@ -150,7 +151,7 @@ class SurfaceGradient(eqx.Module):
         return jnp.sum(self.areas * _smoothed_norm(gradient, axis=1))
 
 
-class PartialMap(eqx.Module):
+class PartialMap(Module):
     """The result of `partial_functional_map`.
 
     **Attributes:**
@@ -225,7 +226,7 @@ def partial_functional_map(
     return PartialMap(jnp.where(result == RESULTS.successful, recovered, -1), functional_map, region, result)
 
 
-class _Energies(eqx.Module):
+class _Energies(Module):
     """The data of one pair, with methods that minimise the energy over C and over v."""
 
     spectrum_x: Spectrum
@@ -385,7 +386,7 @@ def _minimum(
     import optimistix as optx  # optimistix is imported here because its import is slow
 
     solver: optx.LBFGS = optx.LBFGS(tolerance, tolerance)
-    return optx.minimise(lambda y, _: energy(y), solver, initial, max_steps=steps, throw=False).value
+    return optx.minimise(lambda y, _: energy(y), solver, initial, max_steps=steps, throw=False).value  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Float64, Int64
@@ -56,9 +55,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
-from jaxsmw.runtime.batches import pad_rows
 from jaxsmw.runtime.cache import recomputing
-from jaxsmw.runtime.compilation import compiled
 
 # The slope of the sigmoid, and the largest filter value that counts as zero.
 _SLOPE, _NEGLIGIBLE = 0.2, 1e-3
@@ -283,10 +280,8 @@ def _levels(first: int, last: int, growth: float) -> Iterator[int]:
 
 def _nearest(queries: Float64[np.ndarray, "s d"], database: Float64[np.ndarray, "r d"]) -> np.ndarray:
     """Return, for each query, the index of the nearest row of the database."""
-    # JAX compiles one program for each size.
-    columns = 2 ** (queries.shape[1] - 1).bit_length()
-    padded = (jnp.asarray(pad_rows(points.T, columns).T, jnp.float32) for points in (queries, database))
-    return np.asarray(compiled(nearest_neighbor)(*padded)).astype(np.int64)
+    both = (points.astype(np.float32) for points in (queries, database))
+    return np.asarray(nearest_neighbor(*both)).astype(np.int64)
 
 
 def _mapped(x: _Shell, y: _Shell, matches: Int64[np.ndarray, " s"]) -> Float64[np.ndarray, "K d"]:

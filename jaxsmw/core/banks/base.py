@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import abc
 
-import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.checks import check_integer
+from jaxsmw.core.module import Module
 
 Points = Float[Array, " p"]
 Eigenvalues = Float[Array, " k"]
 Responses = Float[Array, "filters p"]
 
 
-class FilterBank(eqx.Module):
+class FilterBank(Module):
     """The base class of filter banks (a scaling function g_0 and wavelet filters g_1 … g_L).
 
     `jaxsmw.banks` contains ready subclasses, such as `Meyer` (the default of `WaveletPreservation`) and
-    `CubicSpline`. A subclass must define `__call__(points, eigenvalues)`. A bank is an Equinox module, and
-    therefore a pytree. The continuous parameters of a bank are arrays, which JAX can trace and differentiate.
+    `CubicSpline`. A subclass must define `__call__(points, eigenvalues)`. A bank is a frozen dataclass and
+    a pytree. The continuous parameters of a bank are arrays, which JAX can trace and differentiate.
     The sizes of a bank, such as the number of filters, are static fields.
 
     **Raises:** The constructor of a ready bank raises `TypeError` if a size is not an integer, and
@@ -45,7 +46,7 @@ def sample_bank(bank: FilterBank, points: Points, eigenvalues: Eigenvalues) -> R
 
     **Raises:** `ValueError` if the responses are not of shape (filters, p).
     """
-    responses = bank(points, eigenvalues)
+    responses = namespace(points).asarray(bank(points, eigenvalues))
     if responses.ndim != 2 or responses.shape[1] != points.shape[0]:
         raise ValueError(
             f"the bank {type(bank).__name__} returned responses of shape {responses.shape} for "

@@ -5,20 +5,20 @@ from __future__ import annotations
 import abc
 import math
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, check_number_of_filters
 from jaxsmw.core.checks import as_parameter, check_between
+from jaxsmw.core.module import field
 
 
 class _LogSpacedDilates(FilterBank):
     """A scaling function below `lambda_max / ratio`, and one wavelet at several log-spaced scales."""
 
-    filters: int = eqx.field(static=True, default=6)
-    ratio: Float[Array, ""] = eqx.field(converter=as_parameter, default=20.0)
-    normalize: bool = eqx.field(static=True, default=False)
+    filters: int = field(static=True, default=6)
+    ratio: Float[Array, ""] = field(converter=as_parameter, default=20.0)
+    normalize: bool = field(static=True, default=False)
 
     def __check_init__(self) -> None:
         check_number_of_filters(self, self.filters, 2)
@@ -33,13 +33,14 @@ class _LogSpacedDilates(FilterBank):
         """Return the scaling function at `scaled`, which is `ratio * lambda / lambda_max`."""
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        relative, ratio = points / eigenvalues[-1], jnp.asarray(self.ratio, points.dtype)
+        xp = namespace(points)
+        relative, ratio = points / eigenvalues[-1], xp.asarray(self.ratio, points.dtype)
         # The scales are in units of 1 / lambda_max.
-        scales = (2 * ratio) ** jnp.linspace(1, 0, self.filters - 1, dtype=points.dtype)
+        scales = (2 * ratio) ** xp.linspace(1, 0, self.filters - 1, dtype=points.dtype)
         wavelets = self.wavelet(scales[:, None] * relative[None, :])
         if self.normalize:
-            wavelets = jnp.sqrt(scales)[:, None] * wavelets
-        return jnp.concatenate([self.scaling_function(ratio * relative)[None, :], wavelets])
+            wavelets = xp.sqrt(scales)[:, None] * wavelets
+        return xp.concatenate([self.scaling_function(ratio * relative)[None, :], wavelets])
 
 
 class CubicSpline(_LogSpacedDilates):
@@ -64,15 +65,16 @@ class CubicSpline(_LogSpacedDilates):
     """
 
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
+        xp = namespace(scaled)
         spline = -5 + 11 * scaled - 6 * scaled**2 + scaled**3
-        # `jnp.maximum` avoids a division by zero in the branch that `jnp.where` does not select.
-        tail = 4 / jnp.maximum(scaled, 2) ** 2
-        return jnp.where(scaled < 1, scaled**2, jnp.where(scaled < 2, spline, tail))
+        # The maximum avoids a division by zero in the branch that `where` does not select.
+        tail = 4 / xp.maximum(scaled, 2) ** 2
+        return xp.where(scaled < 1, scaled**2, xp.where(scaled < 2, spline, tail))
 
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
         # At zero, the scaling function equals the maximum of the wavelet. The wavelet has this maximum at
         # `scaled = 2 - 1 / sqrt(3)`.
-        return (1 + 2 / (3 * math.sqrt(3))) * jnp.exp(-((scaled / 0.6) ** 4))
+        return (1 + 2 / (3 * math.sqrt(3))) * namespace(scaled).exp(-((scaled / 0.6) ** 4))
 
 
 class MexicanHat(_LogSpacedDilates):
@@ -85,10 +87,10 @@ class MexicanHat(_LogSpacedDilates):
     """
 
     def wavelet(self, scaled: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        return scaled * jnp.exp(-scaled)
+        return scaled * namespace(scaled).exp(-scaled)
 
     def scaling_function(self, scaled: Float[Array, " p"]) -> Float[Array, " p"]:
-        return 1.2 / math.e * jnp.exp(-((scaled / 0.4) ** 4))
+        return 1.2 / math.e * namespace(scaled).exp(-((scaled / 0.4) ** 4))
 
 
 class Heat(FilterBank):
@@ -102,7 +104,7 @@ class Heat(FilterBank):
     - `times`: (filters,), one or more positive diffusion times t, in units of 1 / lambda_max.
     """
 
-    times: Float[Array, " filters"] = eqx.field(converter=as_parameter)
+    times: Float[Array, " filters"] = field(converter=as_parameter)
 
     def __check_init__(self) -> None:
         check_between(self, "times", self.times, ndim=1)
@@ -110,5 +112,6 @@ class Heat(FilterBank):
             raise ValueError("the times of Heat must be a list of at least one time")
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
+        xp = namespace(points)
         relative = points / eigenvalues[-1]
-        return jnp.exp(-jnp.asarray(self.times, points.dtype)[:, None] * relative[None, :])
+        return xp.exp(-xp.asarray(self.times, points.dtype)[:, None] * relative[None, :])

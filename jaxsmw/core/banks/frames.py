@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxsmw.core.arrays import Array, default_namespace, float_type, namespace, stop_gradient
 from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, sample_bank
 from jaxsmw.core.checks import as_parameter, check_option
+from jaxsmw.core.module import field
 
 
 def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
@@ -19,7 +18,7 @@ def frame_function(responses: Float[Array, "filters k"]) -> Float[Array, " k"]:
     This is equation (7) of the MWP paper. G has no unit. G is constant for a tight frame, and 1 for a
     Parseval frame. `responses` (filters, k) is `bank(eigenvalues, eigenvalues)`.
     """
-    return jnp.sum(responses**2, axis=0)
+    return namespace(responses).sum(responses**2, axis=0)
 
 
 class FrameBounds(NamedTuple):
@@ -59,13 +58,13 @@ def frame_bounds(
     the bank returns responses that are not of shape (filters, points).
     """
     check_option("over", over, ("eigenvalues", "interval"))
-    points = eigenvalues
+    xp, points = namespace(eigenvalues), eigenvalues
     if over == "interval":
         if resolution < 2:
             raise ValueError(f"over='interval' needs a resolution of at least 2 points, not {resolution}")
-        points = jnp.linspace(0, eigenvalues[-1], resolution, dtype=eigenvalues.dtype)
+        points = xp.linspace(0, eigenvalues[-1], resolution, dtype=eigenvalues.dtype)
     covered = frame_function(sample_bank(bank, points, eigenvalues))
-    return FrameBounds(jnp.min(covered), jnp.max(covered))
+    return FrameBounds(xp.min(covered), xp.max(covered))
 
 
 class Tightened(FilterBank):
@@ -74,15 +73,16 @@ class Tightened(FilterBank):
     bank: FilterBank
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
+        xp = namespace(points)
         responses = self.bank(points, eigenvalues)
         # Division by the largest response prevents underflow of the squares. This divisor cancels in
         # `scaled / sqrt(frame)`.
-        largest = jax.lax.stop_gradient(jnp.max(jnp.abs(responses), axis=0, keepdims=True))
+        largest = stop_gradient(xp.max(xp.abs(responses), axis=0, keepdims=True))
         # `~(largest < tiny)` keeps NaN in the result; `largest >= tiny` would replace NaN by zero.
-        covered = ~(largest < jnp.finfo(points.dtype).tiny)
-        scaled = jnp.where(covered, responses, 0) / jnp.where(covered, largest, 1)
-        frame = jnp.where(covered, frame_function(scaled)[None, :], 1)
-        return scaled / jnp.sqrt(frame)
+        covered = ~(largest < xp.finfo(points.dtype).tiny)
+        scaled = xp.where(covered, responses, 0) / xp.where(covered, largest, 1)
+        frame = xp.where(covered, frame_function(scaled)[None, :], 1)
+        return scaled / xp.sqrt(frame)
 
 
 def tighten(bank: FilterBank) -> FilterBank:
@@ -115,7 +115,7 @@ class SoftmaxFrame(FilterBank):
     **Raises:** `ValueError` if the logits have another shape.
     """
 
-    logits: Float[Array, "filters knots"] = eqx.field(converter=as_parameter)
+    logits: Float[Array, "filters knots"] = field(converter=as_parameter)
 
     def __check_init__(self) -> None:
         if self.logits.ndim != 2 or self.logits.shape[0] < 1 or self.logits.shape[1] < 2:
@@ -147,11 +147,15 @@ class SoftmaxFrame(FilterBank):
                 "SoftmaxFrame.like needs at least 2 knots and a floor of at least 1e-12 and below 1, not "
                 f"knots={knots} and floor={floor}"
             )
-        points = jnp.linspace(0, 1, knots)
-        return cls(2 * jnp.log(jnp.maximum(jnp.abs(sample_bank(bank, points, points)), floor)))
+        xp = default_namespace()
+        points = xp.linspace(0, 1, knots, dtype=float_type())
+        return cls(2 * xp.log(xp.maximum(xp.abs(sample_bank(bank, points, points)), floor)))
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        knots = jnp.linspace(0, 1, self.logits.shape[1], dtype=points.dtype)
-        relative, logits = points / eigenvalues[-1], self.logits.astype(points.dtype)
-        heights = jax.vmap(lambda z: jnp.interp(relative, knots, z))(logits)
-        return jnp.exp(jax.nn.log_softmax(heights, axis=0) / 2)
+        xp = namespace(points)
+        knots = xp.linspace(0, 1, self.logits.shape[1], dtype=points.dtype)
+        relative, logits = points / eigenvalues[-1], xp.asarray(self.logits, points.dtype)
+        heights = xp.stack([xp.interp(relative, knots, row) for row in logits])
+        largest = stop_gradient(xp.max(heights, axis=0))
+        log_sum = largest + xp.log(xp.sum(xp.exp(heights - largest), axis=0))
+        return xp.exp((heights - log_sum) / 2).astype(points.dtype)

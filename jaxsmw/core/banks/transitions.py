@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import abc
+import math
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, check_number_of_filters
 from jaxsmw.core.checks import as_parameter, check_between, check_integer
+from jaxsmw.core.module import field
 
 
 class _Transitions(FilterBank):
@@ -26,9 +26,10 @@ class _Transitions(FilterBank):
         """Return the angle of each transition, divided by pi / 2. The quotient rises from 0 to 1."""
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        theta = jnp.pi / 2 * self.transitions(points, eigenvalues[-1])
-        fall, rise = jnp.cos(theta), jnp.sin(theta)
-        return jnp.concatenate([fall[:1], rise[:-1] * fall[1:], rise[-1:]])
+        xp = namespace(points)
+        theta = math.pi / 2 * self.transitions(points, eigenvalues[-1])
+        fall, rise = xp.cos(theta), xp.sin(theta)
+        return xp.concatenate([fall[:1], rise[:-1] * fall[1:], rise[-1:]])
 
 
 class _DyadicBands(_Transitions):
@@ -37,7 +38,7 @@ class _DyadicBands(_Transitions):
     The first filter only falls, and the last filter only rises.
     """
 
-    filters: int = eqx.field(static=True, default=6)
+    filters: int = field(static=True, default=6)
 
     def __check_init__(self) -> None:
         check_number_of_filters(self, self.filters, 2)
@@ -49,9 +50,10 @@ class _DyadicBands(_Transitions):
     def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
         # The limit of 100 octaves prevents overflow of `2.0**octaves`. It does not change the responses,
         # because no positive eigenvalue is 100 octaves below lambda_max.
+        xp = namespace(points)
         octaves = np.minimum(np.arange(self.filters - 1, 0, -1), 100)
-        ratios = (points / lambda_max)[None, :] * jnp.asarray(2.0**octaves, points.dtype)[:, None]
-        return self.profile(jnp.clip(ratios - 1, 0, 1))
+        ratios = (points / lambda_max)[None, :] * xp.asarray(2.0**octaves, points.dtype)[:, None]
+        return self.profile(xp.clip(ratios - 1, 0, 1))
 
 
 def meyer_polynomial(ramp: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -88,16 +90,17 @@ class SimpleTight(_DyadicBands):
     """
 
     def profile(self, ramp: Float[Array, "wavelets p"]) -> Float[Array, "wavelets p"]:
-        sine, cosine = jnp.sin(jnp.pi / 2 * ramp), jnp.cos(jnp.pi / 2 * ramp)
+        xp = namespace(ramp)
+        sine, cosine = xp.sin(math.pi / 2 * ramp), xp.cos(math.pi / 2 * ramp)
         # This is `2 / pi * arcsin(sine**2)`, written with `arctan2`, which is smooth at both ends of the
         # ramp.
-        return 2 / jnp.pi * jnp.arctan2(sine**2, cosine * jnp.sqrt(1 + sine**2))
+        return 2 / math.pi * xp.arctan2(sine**2, cosine * xp.sqrt(1 + sine**2))
 
 
 class _TwoBands(_Transitions):
     """A low-pass and a high-pass filter, with a transition that starts at `edge`."""
 
-    edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=1 / 3)
+    edge: Float[Array, ""] = field(converter=as_parameter, default=1 / 3)
 
     def __check_init__(self) -> None:
         check_between(self, "edge", self.edge, high=1.0)
@@ -107,7 +110,7 @@ class _TwoBands(_Transitions):
         """Return `theta / (pi / 2)` for each value of `excess`, which is `lambda / edge - 1`."""
 
     def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
-        edge = lambda_max * jnp.asarray(self.edge, points.dtype)
+        edge = lambda_max * namespace(points).asarray(self.edge, points.dtype)
         return self.profile(points / edge - 1)[None, :]
 
 
@@ -125,7 +128,7 @@ class Held(_TwoBands):
     """
 
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
-        ramp = jnp.clip(excess, 0, 1)
+        ramp = namespace(excess).clip(excess, 0, 1)
         return ramp**2 * (3 - 2 * ramp)
 
 
@@ -138,7 +141,8 @@ class Simoncelli(_TwoBands):
     """
 
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
-        return jnp.log2(1 + jnp.clip(excess, 0, 1))
+        xp = namespace(excess)
+        return xp.log2(1 + xp.clip(excess, 0, 1))
 
 
 class Papadakis(_TwoBands):
@@ -154,10 +158,10 @@ class Papadakis(_TwoBands):
       default 3/8. If the edge is above 3/5, the high-pass filter does not reach 1 on [0, lambda_max].
     """
 
-    edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=3 / 8)
+    edge: Float[Array, ""] = field(converter=as_parameter, default=3 / 8)
 
     def profile(self, excess: Float[Array, " p"]) -> Float[Array, " p"]:
-        return jnp.clip(1.5 * excess, 0, 1)
+        return namespace(excess).clip(1.5 * excess, 0, 1)
 
 
 class Regular(_Transitions):
@@ -173,7 +177,7 @@ class Regular(_Transitions):
       the transition steeper.
     """
 
-    degree: int = eqx.field(static=True, default=3)
+    degree: int = field(static=True, default=3)
 
     def __check_init__(self) -> None:
         check_integer("the degree of Regular", self.degree)
@@ -181,9 +185,10 @@ class Regular(_Transitions):
             raise ValueError(f"the degree of Regular cannot be negative, but is {self.degree}")
 
     def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
-        sine = jnp.clip(2 * points / lambda_max - 1, -1, 1)
+        xp = namespace(points)
+        sine = xp.clip(2 * points / lambda_max - 1, -1, 1)
         for _ in range(self.degree):
-            sine = jnp.sin(jnp.pi / 2 * sine)
+            sine = xp.sin(math.pi / 2 * sine)
         return (1 + sine)[None, :] / 2
 
 
@@ -203,19 +208,21 @@ class ExponentialWindow(FilterBank):
       filter with respect to `lambda / lambda_max` is `-2 slope / edge`.
     """
 
-    edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.2)
-    slope: Float[Array, ""] = eqx.field(converter=as_parameter, default=1.0)
+    edge: Float[Array, ""] = field(converter=as_parameter, default=0.2)
+    slope: Float[Array, ""] = field(converter=as_parameter, default=1.0)
 
     def __check_init__(self) -> None:
         check_between(self, "edge", self.edge)
         check_between(self, "slope", self.slope)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        edge, slope = (jnp.asarray(leaf, points.dtype) for leaf in (self.edge, self.slope))
+        xp = namespace(points)
+        edge, slope = (xp.asarray(leaf, points.dtype) for leaf in (self.edge, self.slope))
         # Clipping excludes u = 0 and u = 1, where an exponent is infinite and has no gradient.
-        tiny = jnp.finfo(points.dtype).eps
-        u = jnp.clip(1 - points / (eigenvalues[-1] * edge), tiny, 1 - tiny)
-        return jax.nn.sigmoid(slope / (1 - u) - slope / u)[None, :]
+        tiny = xp.finfo(points.dtype).eps
+        u = xp.clip(1 - points / (eigenvalues[-1] * edge), tiny, 1 - tiny)
+        # The logistic function, without overflow.
+        return xp.exp(-xp.logaddexp(0, slope / u - slope / (1 - u)))[None, :]
 
 
 class LowPass(FilterBank):
@@ -229,16 +236,17 @@ class LowPass(FilterBank):
     - `edge`: the end of the pass band as a fraction of lambda_max, in (0, 1), by default 0.25.
     """
 
-    edge: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.25)
+    edge: Float[Array, ""] = field(converter=as_parameter, default=0.25)
 
     def __check_init__(self) -> None:
         check_between(self, "edge", self.edge, high=1.0)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        edge = eigenvalues[-1] * jnp.asarray(self.edge, points.dtype)
+        xp = namespace(points)
+        edge = eigenvalues[-1] * xp.asarray(self.edge, points.dtype)
         # Beyond twice the edge, this sine is exactly zero, but the equivalent `cos(pi / 2)` has a rounding
         # error.
-        return jnp.sin(jnp.pi / 2 * (1 - meyer_polynomial(jnp.clip(points / edge - 1, 0, 1))))[None, :]
+        return xp.sin(math.pi / 2 * (1 - meyer_polynomial(xp.clip(points / edge - 1, 0, 1))))[None, :]
 
 
 class Identity(FilterBank):
@@ -248,4 +256,4 @@ class Identity(FilterBank):
     """
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        return jnp.ones_like(points)[None, :]
+        return namespace(points).ones_like(points)[None, :]

@@ -5,19 +5,19 @@ from __future__ import annotations
 import abc
 import math
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, check_number_of_filters
 from jaxsmw.core.checks import as_parameter, check_between, check_integer
+from jaxsmw.core.module import field
 
 
 class _UniformTranslates(FilterBank):
     """Evenly spaced translates of one window, of which `overlap` cover each point of [0, lambda_max]."""
 
-    filters: int = eqx.field(static=True, default=6)
-    overlap: int = eqx.field(static=True, default=2)
+    filters: int = field(static=True, default=6)
+    overlap: int = field(static=True, default=2)
 
     def __check_init__(self) -> None:
         check_integer(f"the overlap of {type(self).__name__}", self.overlap)
@@ -28,10 +28,11 @@ class _UniformTranslates(FilterBank):
         """Return the window at positions in (-1/2, 1/2), which are in units of the window's width."""
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
+        xp = namespace(points)
         steps = points / eigenvalues[-1] * (self.filters - self.overlap + 1)
-        centres = jnp.arange(self.filters, dtype=points.dtype) + (1 - self.overlap / 2)
+        centres = xp.arange(self.filters, dtype=points.dtype) + (1 - self.overlap / 2)
         position = (steps[None, :] - centres[:, None]) / self.overlap
-        return jnp.where(jnp.abs(position) < 0.5, self.window(position), 0)
+        return xp.where(xp.abs(position) < 0.5, self.window(position), 0)
 
 
 class Itersine(_UniformTranslates):
@@ -54,7 +55,8 @@ class Itersine(_UniformTranslates):
             raise ValueError(f"the overlap of Itersine must be even and positive, not {self.overlap}")
 
     def window(self, position: Float[Array, "filters p"]) -> Responses:
-        return math.sqrt(2 / self.overlap) * jnp.sin(jnp.pi / 2 * jnp.cos(jnp.pi * position) ** 2)
+        xp = namespace(position)
+        return math.sqrt(2 / self.overlap) * xp.sin(math.pi / 2 * xp.cos(math.pi * position) ** 2)
 
 
 class HalfCosine(_UniformTranslates):
@@ -70,14 +72,14 @@ class HalfCosine(_UniformTranslates):
     - `overlap`: the number of windows that overlap at each eigenvalue, at least 3, by default 3.
     """
 
-    overlap: int = eqx.field(static=True, default=3)
+    overlap: int = field(static=True, default=3)
 
     def __check_init__(self) -> None:
         if self.overlap < 3:
             raise ValueError(f"the overlap of HalfCosine must be at least 3, not {self.overlap}")
 
     def window(self, position: Float[Array, "filters p"]) -> Responses:
-        return math.sqrt(8 / (3 * self.overlap)) * jnp.cos(jnp.pi * position) ** 2
+        return math.sqrt(8 / (3 * self.overlap)) * namespace(position).cos(math.pi * position) ** 2
 
 
 class Gabor(FilterBank):
@@ -94,15 +96,16 @@ class Gabor(FilterBank):
       positive, by default 0.5.
     """
 
-    filters: int = eqx.field(static=True, default=6)
-    width: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.5)
+    filters: int = field(static=True, default=6)
+    width: Float[Array, ""] = field(converter=as_parameter, default=0.5)
 
     def __check_init__(self) -> None:
         check_number_of_filters(self, self.filters, 2)
         check_between(self, "width", self.width)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
+        xp = namespace(points)
         steps = points / eigenvalues[-1] * (self.filters - 1)
-        centres = jnp.arange(self.filters, dtype=points.dtype)
-        offsets = (steps[None, :] - centres[:, None]) / jnp.asarray(self.width, points.dtype)
-        return jnp.exp(-(offsets**2) / 2)
+        centres = xp.arange(self.filters, dtype=points.dtype)
+        offsets = (steps[None, :] - centres[:, None]) / xp.asarray(self.width, points.dtype)
+        return xp.exp(-(offsets**2) / 2)

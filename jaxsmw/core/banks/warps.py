@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import abc
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses
 from jaxsmw.core.checks import as_parameter, check_between
+from jaxsmw.core.module import Module, field
 
 
-class Warp(eqx.Module):
+class Warp(Module):
     """The base class of warps: monotone maps of the eigenvalue axis, for use in `Warped(bank, warp)`.
 
     Ready subclasses are `Logarithm`, `Power` and `SpectralDistribution`. A subclass must define
@@ -54,13 +54,14 @@ class Logarithm(Warp):
     eigenvalues. The `strength` is a positive number, by default 10; others raise `ValueError`.
     """
 
-    strength: Float[Array, ""] = eqx.field(converter=as_parameter, default=10.0)
+    strength: Float[Array, ""] = field(converter=as_parameter, default=10.0)
 
     def __check_init__(self) -> None:
         check_between(self, "strength", self.strength)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
-        return jnp.log1p(jnp.asarray(self.strength, points.dtype) * (points / eigenvalues[-1]))
+        xp = namespace(points)
+        return xp.log1p(xp.asarray(self.strength, points.dtype) * (points / eigenvalues[-1]))
 
 
 class Power(Warp):
@@ -70,16 +71,17 @@ class Power(Warp):
     turns eigenvalues into frequencies.
     """
 
-    exponent: Float[Array, ""] = eqx.field(converter=as_parameter, default=0.5)
+    exponent: Float[Array, ""] = field(converter=as_parameter, default=0.5)
 
     def __check_init__(self) -> None:
         check_between(self, "exponent", self.exponent)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
+        xp = namespace(points)
         relative = points / eigenvalues[-1]
         # For exponents below 1 the slope at the eigenvalue 0 is infinite, so gradients use the slope 0 there.
-        positive = jnp.where(relative > 0, relative, 1)
-        return jnp.where(relative > 0, positive ** jnp.asarray(self.exponent, points.dtype), 0)
+        positive = xp.where(relative > 0, relative, 1)
+        return xp.where(relative > 0, positive ** xp.asarray(self.exponent, points.dtype), 0)
 
 
 class SpectralDistribution(Warp):
@@ -96,10 +98,11 @@ class SpectralDistribution(Warp):
     """
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
+        xp = namespace(points)
         # Eigensolvers return repeated eigenvalues as nearly equal numbers, so eigenvalues are compared with a
         # tolerance.
         tolerance = 1e-6 * eigenvalues[-1]
-        below = jnp.searchsorted(eigenvalues, eigenvalues - tolerance, side="left")
-        not_above = jnp.searchsorted(eigenvalues, eigenvalues + tolerance, side="right")
+        below = xp.searchsorted(eigenvalues, eigenvalues - tolerance, side="left")
+        not_above = xp.searchsorted(eigenvalues, eigenvalues + tolerance, side="right")
         index = (below + not_above - 1).astype(points.dtype) / 2
-        return jnp.interp(points, eigenvalues, index)
+        return xp.interp(points, eigenvalues, index).astype(points.dtype)

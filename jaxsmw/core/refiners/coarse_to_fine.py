@@ -5,15 +5,13 @@ from __future__ import annotations
 import dataclasses
 import operator
 from collections.abc import Iterable
-from typing import Generic, TypeVar, get_args
+from typing import Generic, TypeVar
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int32
+from jaxtyping import Bool, Float, Int32
 
-from jaxsmw.choices import Search
-from jaxsmw.core.checks import check_option
+from jaxsmw.core.arrays import Array, namespace
+from jaxsmw.core.module import field
 from jaxsmw.core.refiner import PreparedT, Refiner, State
 from jaxsmw.core.spectrum import Spectrum
 
@@ -32,7 +30,7 @@ class CoarseToFineState(State):
     """
 
     iteration: Int32[Array, ""]
-    reverse_map: Int32[Array, " n"] | None = eqx.field(default=None, kw_only=True)
+    reverse_map: Int32[Array, " n"] | None = field(default=None, kw_only=True)
 
 
 CoarseStateT = TypeVar("CoarseStateT", bound=CoarseToFineState)
@@ -51,18 +49,13 @@ class CoarseToFine(Refiner[PreparedT, CoarseStateT], Generic[PreparedT, CoarseSt
       and Y have different numbers of eigenvectors, a level applies to the shape with more eigenvectors, and
       the other shape uses a proportional number. Iterations after the last level use all eigenvectors, as do
       all iterations if `levels` is empty (the default).
-    - `search`: the nearest-neighbour search that matches all vertices; see `WaveletPreservation`. Samples are
-      always matched by exhaustive search.
 
-    **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1 or
-    `search` is unknown.
+    **Raises:** `TypeError` if `levels` is not an iterable of integers; `ValueError` if a level is below 1.
     """
 
-    levels: tuple[int, ...] = eqx.field(default=(), converter=_whole_numbers)
-    search: Search = eqx.field(static=True, default="auto")
+    levels: tuple[int, ...] = field(default=(), converter=_whole_numbers)
 
     def __check_init__(self) -> None:
-        check_option("search", self.search, get_args(Search))
         if any(level < 1 for level in self.levels):
             raise ValueError(f"the levels are {self.levels}, but each level needs at least 1 eigenvector")
 
@@ -77,6 +70,8 @@ class CoarseToFine(Refiner[PreparedT, CoarseStateT], Generic[PreparedT, CoarseSt
 
     def with_traced_levels(self) -> CoarseToFine[PreparedT, CoarseStateT]:
         """Return the refiner with levels as an array."""
+        import equinox as eqx
+
         return eqx.tree_at(lambda refiner: refiner.levels, self, np.array(self.levels, np.int32))
 
     def active_eigenvectors(
@@ -84,13 +79,12 @@ class CoarseToFine(Refiner[PreparedT, CoarseStateT], Generic[PreparedT, CoarseSt
     ) -> tuple[Bool[Array, " k_x"], Bool[Array, " k_y"]]:
         """Return masks of the eigenvectors of X (k_x,) and of Y (k_y,) that an iteration uses."""
         sizes = prepared.spectrum_x.eigenvalues.shape[0], prepared.spectrum_y.eigenvalues.shape[0]
-        largest = max(sizes)
-
-        levels = jnp.append(jnp.asarray(self.levels, jnp.int32), largest)
-        level = jnp.minimum(levels[jnp.minimum(iteration, len(self.levels))], largest)
+        xp, largest = namespace(iteration), max(sizes)
+        levels = xp.append(xp.asarray(self.levels, xp.int32), largest)
+        level = xp.minimum(levels[xp.minimum(iteration, len(self.levels))], largest)
 
         def active(size: int) -> Bool[Array, " k"]:
-            return jnp.arange(size, dtype=jnp.int32) < -(-level * size // largest)
+            return xp.arange(size, dtype=xp.int32) < -(-level * size // largest)
 
         return active(sizes[0]), active(sizes[1])
 
@@ -126,11 +120,12 @@ def partial_matching_weights(
     use the same unit. Then the weights of the full shape are scaled so that they sum to 1, as the given
     weights do. The weights of the other shape stay the same.
     """
-    mean_x, mean_y = jnp.sum(weights_x * residuals_x), jnp.sum(weights_y * residuals_y)
+    xp = namespace(weights_x)
+    mean_x, mean_y = xp.sum(weights_x * residuals_x), xp.sum(weights_y * residuals_y)
 
     def reweighted(weights: Array, residuals: Array, mean: Array, other: Array) -> Array:
-        falling = weights / (1 + (residuals / jnp.maximum(other, jnp.finfo(other.dtype).tiny)) ** 2)
-        return jnp.where(mean > other, falling / jnp.sum(falling), weights)
+        falling = weights / (1 + (residuals / xp.maximum(other, xp.finfo(other.dtype).tiny)) ** 2)
+        return xp.where(mean > other, falling / xp.sum(falling), weights)
 
     return (
         reweighted(weights_x, residuals_x, mean_x, mean_y),

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Int32
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int32
 
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.linear_algebra import cholesky, product, solve_lower, solve_positive_definite
-from jaxsmw.core.pointwise_map import chosen_patches
+from jaxsmw.core.module import field
 from jaxsmw.core.refiner import Prepared, Problem
 from jaxsmw.core.refiners.coarse_to_fine import (
     CoarseToFine,
@@ -19,7 +19,7 @@ from jaxsmw.core.refiners.coarse_to_fine import (
     partial_matching_weights,
 )
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import Patches, SearchProblem, nearest_in_both, nearest_vertices
+from jaxsmw.core.search import SearchProblem, nearest_in_both, nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 
 # _RIDGE is the ridge of the regression, and _LEAST_RESIDUAL is added to the variances of the residuals.
@@ -46,9 +46,13 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
     `WaveletPreservation`, refinement makes the map more accurate (docs/accuracy.md). On partial pairs,
     vertices of the full shape with large residuals receive smaller weights (`partial_matching_weights`).
 
-    **Arguments:** `levels` and `search`, which `CoarseToFine` describes. The search in patches compares only
-    eigenvectors and ignores descriptors, so its matches can differ from those of `"exhaustive"`.
+    **Arguments:** `levels`, which `CoarseToFine` describes.
     """
+
+    @property
+    def uses_namespaces(self) -> bool:
+        """Always True."""
+        return True
 
     def prepare(self, problem: Problem) -> PreparedFeatures:
         """Collect the features of all vertices and of the samples.
@@ -61,18 +65,17 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         spectrum_x, spectrum_y = problem.query_spectra()
         if problem.samples is None:
             x, y = all_x, all_y
-            patches = chosen_patches(self.search, spectrum_x, spectrum_y)
         else:
-            x, y, patches = _Features.of(spectrum_x), _Features.of(spectrum_y), None
-        return PreparedFeatures(spectrum_x, spectrum_y, x, y, all_x, all_y, patches, problem.partial)
+            x, y = _Features.of(spectrum_x), _Features.of(spectrum_y)
+        return PreparedFeatures(spectrum_x, spectrum_y, x, y, all_x, all_y, problem.partial)
 
     def update(
         self, prepared: PreparedFeatures, pointwise_map: Int[Array, " m"], previous: Regression | None
     ) -> tuple[Regression, RESULTS]:
         """Compute both regressions from matched features. Return the next state and `RESULTS.successful`."""
         x, y, all_x, all_y = prepared.x, prepared.y, prepared.all_x, prepared.all_y
-        iteration = jnp.asarray(0, jnp.int32)
         if previous is None:
+            iteration = namespace(pointwise_map).asarray(0, np.int32)
             moments = _Moments.along(x.values, all_y.values[pointwise_map], x.weights)
         else:
             iteration = previous.iteration + 1
@@ -92,11 +95,12 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         functional_map, prediction = _regress(moments, active_x, active_y)
         _, reverse_prediction = _regress(moments.reversed, active_y, active_x)
         state = Regression(functional_map, iteration, prediction, reverse_prediction)
-        return state, RESULTS.successful  # type: ignore[return-value]
+        return state, RESULTS.successful
 
     def recover(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " m"]:
         """Return, for each vertex of X, the nearest vertex of Y in the Mahalanobis distance, (m,)."""
-        return nearest_vertices(*self._forward_search(prepared, state))
+        queries, database = self.embeddings(prepared, state)
+        return nearest_neighbor(queries, database, database_mask=prepared.all_y.mask)
 
     def recover_both(
         self, prepared: PreparedFeatures, state: Regression
@@ -105,15 +109,16 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
 
         Distances of the reverse map are computed by the prediction of the features of Y.
         """
-        backward = state.backward.search(prepared.y, prepared.all_x)
-        pointwise_map, reverse_map = nearest_in_both(self._forward_search(prepared, state), backward)
+        pointwise_map, reverse_map = nearest_in_both(
+            SearchProblem(*self.embeddings(prepared, state), prepared.all_y.mask),
+            SearchProblem(*state.backward.embeddings(prepared.y, prepared.all_x), prepared.all_x.mask),
+        )
         return pointwise_map, replace(state, reverse_map=reverse_map)
 
     def recover_reverse(self, prepared: PreparedFeatures, state: Regression) -> Int32[Array, " n"]:
         """Return, for each vertex of Y, the nearest vertex of X in the `embeddings`, (n,)."""
-        patches = chosen_patches(self.search, prepared.spectrum_y, prepared.spectrum_x)
-        database, queries = self._searched(prepared, state, patches)
-        return nearest_vertices(queries, database, prepared.all_x.mask, patches)
+        database, queries = self.embeddings(prepared, state)
+        return nearest_neighbor(queries, database, database_mask=prepared.all_x.mask)
 
     def energy(
         self, prepared: PreparedFeatures, state: Regression, pointwise_map: Int[Array, " m"]
@@ -131,20 +136,6 @@ class FeatureRegression(CoarseToFine["PreparedFeatures", "Regression"]):
         """
         return state.forward.embeddings(prepared.x, prepared.all_y)
 
-    def _forward_search(self, prepared: PreparedFeatures, state: Regression) -> SearchProblem:
-        points = self._searched(prepared, state, prepared.patches)
-        return SearchProblem(*points, prepared.all_y.mask, prepared.patches)
-
-    def _searched(
-        self, prepared: PreparedFeatures, state: Regression, patches: tuple[Patches, Patches] | None
-    ) -> tuple[Float[Array, "m d"], Float[Array, "n d"]]:
-        """Return the `embeddings`. With patches, only eigenvectors count, because they define patches."""
-        queries, database = self.embeddings(prepared, state)
-        if patches is None:
-            return queries, database
-        k = prepared.spectrum_x.eigenvalues.shape[0]
-        return queries[:, :k], database[:, :k]
-
 
 class _Features(NamedTuple):
     """The eigenvectors, descriptors and crease eigenvectors of a shape, and vertex weights with sum 1."""
@@ -155,26 +146,23 @@ class _Features(NamedTuple):
 
     @classmethod
     def of(cls, spectrum: Spectrum) -> _Features:
-        area = jnp.sum(spectrum.vertex_areas)
+        xp = namespace(spectrum.eigenvectors)
+        area = xp.sum(spectrum.vertex_areas)
         # The square root of the area scales each eigenvector to mean square 1, whatever the unit of length.
-        values = spectrum.eigenvectors * jnp.sqrt(area)
+        values = spectrum.eigenvectors * xp.sqrt(area)
         further = [spectrum.descriptors, spectrum.crease_eigenvectors]
-        values = jnp.concatenate([values, *(f for f in further if f is not None)], axis=1)
+        values = xp.concatenate([values, *(f for f in further if f is not None)], axis=1)
         return cls(values, spectrum.vertex_areas / area, spectrum.mask)
 
 
 class PreparedFeatures(Prepared):
-    """The features of the vertices to be matched (`x`, `y`) and of all vertices (`all_x`, `all_y`).
-
-    `patches` are the `Patches` of X and of Y, or None if the search uses no patches.
-    """
+    """The features of the vertices to be matched (`x`, `y`) and of all vertices (`all_x`, `all_y`)."""
 
     x: _Features
     y: _Features
     all_x: _Features
     all_y: _Features
-    patches: tuple[Patches, Patches] | None
-    partial: bool = eqx.field(static=True)
+    partial: bool = field(static=True)
 
 
 class Prediction(NamedTuple):
@@ -194,15 +182,12 @@ class Prediction(NamedTuple):
     ) -> tuple[Float[Array, "m d_out"], Float[Array, "n d_out"]]:
         return product(queries.values, self.queries), product(targets.values, self.database)
 
-    def search(self, queries: _Features, targets: _Features) -> SearchProblem:
-        return SearchProblem(*self.embeddings(queries, targets), targets.mask)
-
     def residuals(
         self, queries: _Features, targets: _Features, matches: Int[Array, " m"]
     ) -> Float[Array, " m"]:
         """Return the squared distance from each query vertex to its match, (m,), without unit."""
         points, database = self.embeddings(queries, targets)
-        return jnp.sum((points - database[matches]) ** 2, axis=1)
+        return namespace(points).sum((points - database[matches]) ** 2, axis=1)
 
 
 class Regression(CoarseToFineState):
@@ -244,24 +229,25 @@ def _regress(
     moments: _Moments, active_x: Bool[Array, " k_x"], active_y: Bool[Array, " k_y"]
 ) -> tuple[Float[Array, "k_x k_y"], Prediction]:
     """Return the functional map and the prediction of X from Y, which use only active eigenvectors."""
+    xp = namespace(moments.xx)
     k_x, k_y = active_x.shape[0], active_y.shape[0]
     descriptors = moments.xx.shape[0] - k_x
-    keep_x, keep_y = (jnp.pad(k, (0, descriptors), constant_values=True) for k in (active_x, active_y))
-    xx = jnp.where(keep_x[:, None] & keep_x[None, :], moments.xx, 0)
-    xy = jnp.where(keep_x[:, None] & keep_y[None, :], moments.xy, 0)
-    yy = jnp.where(keep_y[:, None] & keep_y[None, :], moments.yy, 0)
+    keep_x, keep_y = (xp.pad(k, (0, descriptors), constant_values=True) for k in (active_x, active_y))
+    xx = xp.where(keep_x[:, None] & keep_x[None, :], moments.xx, 0)
+    xy = xp.where(keep_x[:, None] & keep_y[None, :], moments.xy, 0)
+    yy = xp.where(keep_y[:, None] & keep_y[None, :], moments.yy, 0)
     # Eigenvectors are regressed only on eigenvectors, and descriptors only on descriptors.
-    eigenvectors_x, eigenvectors_y = (jnp.arange(len(keep)) < k for keep, k in ((keep_x, k_x), (keep_y, k_y)))
-    gram = jnp.where(eigenvectors_y[:, None] == eigenvectors_y[None, :], yy, 0)
-    gram = gram + _RIDGE * jnp.eye(yy.shape[0], dtype=yy.dtype)
-    cross = jnp.where(eigenvectors_x[:, None] == eigenvectors_y[None, :], xy, 0)
+    eigenvectors_x, eigenvectors_y = (xp.arange(len(keep)) < k for keep, k in ((keep_x, k_x), (keep_y, k_y)))
+    gram = xp.where(eigenvectors_y[:, None] == eigenvectors_y[None, :], yy, 0)
+    gram = gram + _RIDGE * xp.eye(yy.shape[0], dtype=yy.dtype)
+    cross = xp.where(eigenvectors_x[:, None] == eigenvectors_y[None, :], xy, 0)
     matrix = solve_positive_definite(gram, cross.T).T
     explained = product(matrix, xy.T)
     residual = xx - explained - explained.T + product(product(matrix, yy), matrix.T)
-    identity = jnp.eye(residual.shape[0], dtype=residual.dtype)
+    identity = xp.eye(residual.shape[0], dtype=residual.dtype)
     factor = cholesky(residual + _LEAST_RESIDUAL * identity)
     # The whitening is triangular, so coordinate i depends only on features 0 to i. Inactive features are set
     # to zero, because they would add only a constant and rounding errors to the distances.
-    whitening = jnp.where(keep_x[:, None], solve_lower(factor, identity).T, 0)
-    uncertainty = jnp.sum(jnp.where(keep_x, jnp.log(jnp.diagonal(factor)), 0))
+    whitening = xp.where(keep_x[:, None], solve_lower(factor, identity).T, 0)
+    uncertainty = xp.sum(xp.where(keep_x, xp.log(xp.diagonal(factor)), 0))
     return matrix[:k_x, :k_y], Prediction(whitening, product(matrix.T, whitening), uncertainty)

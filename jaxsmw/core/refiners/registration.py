@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float, Float64, Int, Int32
+from jaxtyping import Bool, Float, Float64, Int, Int32
 
+from jaxsmw.core.arrays import Array, fori_loop, namespace
 from jaxsmw.core.functional_map import dual_eigenvectors
 from jaxsmw.core.linear_algebra import product, solve_positive_definite
-from jaxsmw.core.pointwise_map import chosen_patches
+from jaxsmw.core.module import field
 from jaxsmw.core.refiner import Prepared, Problem, Samples
 from jaxsmw.core.refiners.coarse_to_fine import (
     CoarseToFine,
@@ -24,7 +22,7 @@ from jaxsmw.core.refiners.coarse_to_fine import (
     partial_matching_weights,
 )
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.search import Patches, SearchProblem, nearest_in_both, nearest_vertices
+from jaxsmw.core.search import SearchProblem, nearest_in_both, nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
 
 # Positions have weight 1, in units of the square root of the area. _NORMALS is the weight of unit normals.
@@ -70,8 +68,13 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
     full shape with large residuals receive smaller weights (`partial_matching_weights`). A residual is the
     squared distance from a vertex to its match in the joint space, without descriptors.
 
-    **Arguments:** `levels` and `search`, which `CoarseToFine` describes.
+    **Arguments:** `levels`, which `CoarseToFine` describes.
     """
+
+    @property
+    def uses_namespaces(self) -> bool:
+        """Always True."""
+        return True
 
     def prepare(self, problem: Problem) -> PreparedSurfaces:
         """Scale both surfaces and prepare the search.
@@ -81,45 +84,33 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
         """
         spectrum_x, spectrum_y = problem.spectrum_x, problem.spectrum_y
         check_features(spectrum_x, spectrum_y)
-        areas = [jnp.sum(spectrum.vertex_areas) for spectrum in (spectrum_x, spectrum_y)]
+        xp = namespace(spectrum_x.eigenvectors)
+        areas = [xp.sum(spectrum.vertex_areas) for spectrum in (spectrum_x, spectrum_y)]
         if problem.partial:
-            areas = [jnp.maximum(*areas)] * 2
+            areas = [xp.maximum(*areas)] * 2
         all_x, all_y = _Surface.of(spectrum_x, areas[0]), _Surface.of(spectrum_y, areas[1])
-        x, y, patches, reverse_patches = all_x, all_y, None, None
+        x, y = all_x, all_y
         spectrum_x, spectrum_y = problem.query_spectra()
-        if problem.samples is None:
-            patches = chosen_patches(self.search, spectrum_x, spectrum_y)
-            reverse_patches = chosen_patches(self.search, spectrum_y, spectrum_x)
-        else:
+        if problem.samples is not None:
             x = all_x.sample(spectrum_x, problem.samples[0])
             y = all_y.sample(spectrum_y, problem.samples[1])
-        return PreparedSurfaces(
-            spectrum_x,
-            spectrum_y,
-            x,
-            y,
-            all_x,
-            all_y,
-            problem.samples,
-            patches,
-            reverse_patches,
-            problem.partial,
-        )
+        return PreparedSurfaces(spectrum_x, spectrum_y, x, y, all_x, all_y, problem.samples, problem.partial)
 
     def update(
         self, prepared: PreparedSurfaces, pointwise_map: Int[Array, " m"], previous: Registered | None
     ) -> tuple[Registered, RESULTS]:
         """Compute the deformations from the matches. Return the next state and `RESULTS.successful`."""
         x, y, all_x, all_y = prepared.x, prepared.y, prepared.all_x, prepared.all_y
-        patches = prepared.reverse_patches
-        iteration = jnp.asarray(0, jnp.int32) if previous is None else previous.iteration + 1
+        xp = namespace(pointwise_map)
+        iteration = xp.asarray(0, xp.int32) if previous is None else previous.iteration + 1
         active_x, active_y = self.active_eigenvectors(prepared, iteration)
-        level = jnp.maximum(jnp.sum(active_x), jnp.sum(active_y)).astype(x.weights.dtype)
+        level = xp.maximum(xp.sum(active_x), xp.sum(active_y)).astype(x.weights.dtype)
         weight = _DESCRIPTORS / level**_FALLING
         if previous is None:
             # Y is not deformed yet, so the first reverse map uses only the deformation of X.
             (forward,) = _deformations(_Matched(x, all_y, pointwise_map, active_x))
-            reverse_map = nearest_vertices(y.points, _deformed((forward, all_x))[0], all_x.mask, patches)
+            (deformed,) = _deformed((forward, all_x))
+            reverse_map = nearest_neighbor(y.points, deformed, database_mask=all_x.mask)
             (backward,) = _deformations(_Matched(y, all_x, reverse_map, active_y))
         else:
             assert previous.reverse_map is not None  # `recover_both` adds it
@@ -131,12 +122,12 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
             )
         functional_map = product(x.dual.T, all_y.eigenvectors[pointwise_map])
         state = Registered(functional_map, iteration, forward, backward, weight)
-        return state, RESULTS.successful  # type: ignore[return-value]
+        return state, RESULTS.successful
 
     def recover(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " m"]:
         """Return, for each vertex of X, the nearest vertex of Y in the `embeddings`, (m,)."""
         queries, database = self.embeddings(prepared, state)
-        return nearest_vertices(queries, database, prepared.all_y.mask, prepared.patches)
+        return nearest_neighbor(queries, database, database_mask=prepared.all_y.mask)
 
     def recover_both(
         self, prepared: PreparedSurfaces, state: Registered
@@ -149,15 +140,15 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
                 points[rows] for points, rows in zip((points_x, points_y), prepared.samples, strict=True)
             )
         pointwise_map, reverse_map = nearest_in_both(
-            SearchProblem(queries_x, points_y, prepared.all_y.mask, prepared.patches),
-            SearchProblem(queries_y, points_x, prepared.all_x.mask, prepared.reverse_patches),
+            SearchProblem(queries_x, points_y, prepared.all_y.mask),
+            SearchProblem(queries_y, points_x, prepared.all_x.mask),
         )
         return pointwise_map, replace(state, reverse_map=reverse_map)
 
     def recover_reverse(self, prepared: PreparedSurfaces, state: Registered) -> Int32[Array, " n"]:
         """Return, for each vertex of Y, the nearest vertex of X in the `embeddings`, (n,)."""
         database, queries = self.embeddings(prepared, state)
-        return nearest_vertices(queries, database, prepared.x.mask, prepared.reverse_patches)
+        return nearest_neighbor(queries, database, database_mask=prepared.x.mask)
 
     def energy(
         self, prepared: PreparedSurfaces, state: Registered, pointwise_map: Int[Array, " m"]
@@ -204,33 +195,33 @@ class _Surface(NamedTuple):
                 "Registration needs positions and normals, but a spectrum lacks them: use compute_spectrum, "
                 "which provides them, or add them by Spectrum.with_positions"
             )
-        dtype = spectrum.eigenvectors.dtype
-        weights = spectrum.vertex_areas / jnp.sum(spectrum.vertex_areas)
+        xp, dtype = namespace(spectrum.eigenvectors), spectrum.eigenvectors.dtype
+        weights = spectrum.vertex_areas / xp.sum(spectrum.vertex_areas)
         center = product(weights, spectrum.positions)
-        positions = (spectrum.positions - center[None]) / jnp.sqrt(area)
-        eigenvalues, eigenvectors = spectrum.eigenvalues * area, spectrum.eigenvectors * jnp.sqrt(area)
+        positions = (spectrum.positions - center[None]) / xp.sqrt(area)
+        eigenvalues, eigenvectors = spectrum.eigenvalues * area, spectrum.eigenvectors * xp.sqrt(area)
         first = slice(min(_NUMBER_OF_EIGENFUNCTIONS, eigenvalues.shape[0]))
-        smooth = eigenvectors[:, first] / jnp.sqrt(1 + eigenvalues[None, first])
+        smooth = eigenvectors[:, first] / xp.sqrt(1 + eigenvalues[None, first])
         points = [positions, _NORMALS * spectrum.normals, _EIGENFUNCTIONS * smooth]
         last = eigenvalues[-1]
-        time = jnp.maximum(_HEAT_TIME, jnp.where(last > 0, _DECAY / last, 0))
+        time = xp.maximum(_HEAT_TIME, xp.where(last > 0, _DECAY / last, 0))
         return cls(
             spectrum.eigenvectors,
             dual_eigenvectors(spectrum, "area"),
             weights,
-            jnp.exp(-time * eigenvalues),
+            xp.exp(-time * eigenvalues),
             time,
             positions,
             spectrum.normals,
-            jnp.concatenate(points, axis=1).astype(dtype),
-            jnp.zeros((len(weights), 0), dtype) if spectrum.descriptors is None else spectrum.descriptors,
+            xp.concatenate(points, axis=1).astype(dtype),
+            xp.zeros((len(weights), 0), dtype) if spectrum.descriptors is None else spectrum.descriptors,
             spectrum.mask,
         )
 
     def sample(self, spectrum: Spectrum, vertices: Int[Array, " s"]) -> _Surface:
         """Return the data of the given vertices (s,), of which `spectrum` is the spectrum."""
         dual = dual_eigenvectors(spectrum, "least_squares")
-        weights = jnp.full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
+        weights = namespace(vertices).full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
         return _Surface(
             spectrum.eigenvectors, dual, weights, self.heat, self.time, *(field[vertices] for field in fields)
@@ -240,25 +231,20 @@ class _Surface(NamedTuple):
         """Return the same vertices with new weights for the least-squares fit of coefficients."""
         weighted = self.eigenvectors * weights[:, None]
         gram = product(self.eigenvectors.T, weighted)
-        ridge = _RIDGE * jnp.trace(gram) / gram.shape[0] * jnp.eye(gram.shape[0], dtype=gram.dtype)
+        xp = namespace(gram)
+        ridge = _RIDGE * xp.trace(gram) / gram.shape[0] * xp.eye(gram.shape[0], dtype=gram.dtype)
         return self._replace(dual=solve_positive_definite(gram + ridge, weighted.T).T)
 
 
 class PreparedSurfaces(Prepared):
-    """The vertices to be matched (`x`, `y`), and all vertices (`all_x`, `all_y`).
-
-    `patches` and `reverse_patches` are the pairs of `Patches` for searches among the vertices of Y and of X;
-    None if these searches are exhaustive.
-    """
+    """The vertices to be matched (`x`, `y`), and all vertices (`all_x`, `all_y`)."""
 
     x: _Surface
     y: _Surface
     all_x: _Surface
     all_y: _Surface
     samples: Samples | None
-    patches: tuple[Patches, Patches] | None
-    reverse_patches: tuple[Patches, Patches] | None
-    partial: bool = eqx.field(static=True)
+    partial: bool = field(static=True)
 
 
 class Deformation(NamedTuple):
@@ -288,25 +274,26 @@ class _Matched(NamedTuple):
 def _deformations(*given: _Matched) -> list[Deformation]:
     """Compute the deformation of each surface onto its other surface.
 
-    Most rows of all surfaces form one array, because two arrays would take twice as long to compile.
+    Most rows of all surfaces form one array, because JAX would take twice as long to compile two arrays.
     """
 
     def products(own: Float[Array, "s 3"], matched: Float[Array, "s 3"]) -> Float[Array, "s 9"]:
         return (own[:, :, None] * matched[:, None, :]).reshape(-1, 9)
 
+    xp = namespace(given[0].surface.positions)
     surfaces = [one.surface for one in given]
     points = [one.other.points[one.matches] for one in given]
-    own = jnp.concatenate([surface.positions for surface in surfaces])
-    matched = jnp.concatenate([rows[:, :3] for rows in points])
-    normals = jnp.concatenate([surface.normals for surface in surfaces])
-    matched_normals = jnp.concatenate([one.other.normals[one.matches] for one in given])
-    averaged = jnp.concatenate(
+    own = xp.concatenate([surface.positions for surface in surfaces])
+    matched = xp.concatenate([rows[:, :3] for rows in points])
+    normals = xp.concatenate([surface.normals for surface in surfaces])
+    matched_normals = xp.concatenate([one.other.normals[one.matches] for one in given])
+    averaged = xp.concatenate(
         [own, matched, products(own, matched), products(normals, matched_normals)], axis=1
     )
     found = []
     for one, rows, of_matches in zip(given, _split(averaged, surfaces), points, strict=True):
-        coefficients = product(one.surface.dual.T, jnp.concatenate([rows, of_matches], axis=1))
-        active = jnp.where(one.active[:, None], coefficients, 0)
+        coefficients = product(one.surface.dual.T, xp.concatenate([rows, of_matches], axis=1))
+        active = xp.where(one.active[:, None], coefficients, 0)
         moments = one.surface.heat[:, None] * coefficients[:, :24]
         found.append(Deformation(active[:, :3], active[:, 24:], moments))
     return found
@@ -314,7 +301,7 @@ def _deformations(*given: _Matched) -> list[Deformation]:
 
 def _split(rows: Float[Array, "r ..."], surfaces: Sequence[_Surface]) -> list[Float[Array, "_ ..."]]:
     """Divide an array that contains the rows of several surfaces, one surface after the other."""
-    return jnp.split(rows, np.cumsum([len(surface.weights) for surface in surfaces])[:-1])
+    return namespace(rows).split(rows, np.cumsum([len(surface.weights) for surface in surfaces])[:-1])
 
 
 class Registered(CoarseToFineState):
@@ -337,9 +324,10 @@ def _product_space(
     deformed y is close to x on X.
     """
     deformed_x, deformed_y = _deformed((state.forward, x), (state.backward, y))
+    xp = namespace(x.points)
     return (
-        jnp.concatenate([deformed_x, x.points, weight * x.descriptors], axis=1),
-        jnp.concatenate([y.points, deformed_y, weight * y.descriptors], axis=1),
+        xp.concatenate([deformed_x, x.points, weight * x.descriptors], axis=1),
+        xp.concatenate([y.points, deformed_y, weight * y.descriptors], axis=1),
     )
 
 
@@ -349,20 +337,21 @@ def _deformed(*given: tuple[Deformation, _Surface]) -> list[Float[Array, "_ d"]]
     Most rows of all surfaces form one array, as in `_deformations`.
     """
     surfaces = [surface for _, surface in given]
-    low = [product(surface.eigenvectors, jnp.concatenate(deformed, axis=1)) for deformed, surface in given]
+    xp = namespace(surfaces[0].positions)
+    low = [product(surface.eigenvectors, xp.concatenate(deformed, axis=1)) for deformed, surface in given]
 
     def together(columns: slice) -> Float[Array, "r c"]:
-        return jnp.concatenate([rows[:, columns] for rows in low])
+        return xp.concatenate([rows[:, columns] for rows in low])
 
     rotations = _rotations(together(slice(-24, None)), surfaces)
-    details = jnp.concatenate([surface.positions for surface in surfaces]) - together(slice(3))
-    normals = jnp.concatenate([surface.normals for surface in surfaces])
-    details, normals = (jnp.sum(rotations * vectors[:, None, :], axis=2) for vectors in (details, normals))
-    turned = jnp.concatenate([together(slice(3, 6)) + details, _NORMALS * normals], axis=1)
+    details = xp.concatenate([surface.positions for surface in surfaces]) - together(slice(3))
+    normals = xp.concatenate([surface.normals for surface in surfaces])
+    details, normals = (xp.sum(rotations * vectors[:, None, :], axis=2) for vectors in (details, normals))
+    turned = xp.concatenate([together(slice(3, 6)) + details, _NORMALS * normals], axis=1)
     # Each row of `low` contains the own position, the position, normal and eigenfunctions of the match, and
     # the moments.
     return [
-        jnp.concatenate([rows, smooth[:, 9:-24]], axis=1)
+        xp.concatenate([rows, smooth[:, 9:-24]], axis=1)
         for rows, smooth in zip(_split(turned, surfaces), low, strict=True)
     ]
 
@@ -375,11 +364,12 @@ def _without_missing_parts(
 ) -> tuple[_Surface, _Surface]:
     """Return both surfaces, with the vertex weights of `partial_matching_weights`."""
     x, y = prepared.x, prepared.y
-    no_descriptors = jnp.zeros_like(state.descriptor_weight)
+    xp = namespace(state.descriptor_weight)
+    no_descriptors = xp.zeros_like(state.descriptor_weight)
     targets, queries = _product_space(prepared.all_x, y, state, no_descriptors)
-    residuals_y = jnp.sum((queries - targets[reverse_map]) ** 2, axis=1)
+    residuals_y = xp.sum((queries - targets[reverse_map]) ** 2, axis=1)
     queries, targets = _product_space(x, prepared.all_y, state, no_descriptors)
-    residuals_x = jnp.sum((queries - targets[pointwise_map]) ** 2, axis=1)
+    residuals_x = xp.sum((queries - targets[pointwise_map]) ** 2, axis=1)
     weights_x, weights_y = partial_matching_weights(x.weights, residuals_x, y.weights, residuals_y)
     return x.reweighted(weights_x), y.reweighted(weights_y)
 
@@ -389,21 +379,27 @@ def _rotations(moments: Float[Array, "r 24"], surfaces: Sequence[_Surface]) -> F
 
     If one surface is a mirror image of the other, all rotations include a reflection.
     """
+    xp = namespace(moments)
     own, matched = moments[:, :3], moments[:, 3:6]
     products, normals = (part.reshape(-1, 3, 3) for part in (moments[:, 6:15], moments[:, 15:]))
     # The moments are averages, weighted by the heat kernel around each vertex. In each direction of the
     # tangent plane, the weighted variance of positions is twice the heat time. After the division by twice
     # the heat time, the variance is 1, like the squared length of a unit normal.
-    times = jnp.concatenate([jnp.broadcast_to(one.time, one.weights.shape) for one in surfaces])
+    times = xp.concatenate([xp.broadcast_to(one.time, one.weights.shape) for one in surfaces])
     variances = (products - own[:, :, None] * matched[:, None, :]) / (2 * times[:, None, None])
     covariances = variances + normals
-    weights = jnp.concatenate([surface.weights for surface in surfaces])
+    weights = xp.concatenate([surface.weights for surface in surfaces])
     signs = [
-        jnp.where(jnp.sum(rows) < 0, -jnp.ones_like(rows), jnp.ones_like(rows))
-        for rows in _split(weights * jnp.linalg.det(covariances), surfaces)
+        xp.where(xp.sum(rows) < 0, -xp.ones_like(rows), xp.ones_like(rows))
+        for rows in _split(weights * _determinants(covariances), surfaces)
     ]
-    sign = jnp.concatenate(signs)[:, None, None]
+    sign = xp.concatenate(signs)[:, None, None]
     return sign * _nearest_rotations(sign * covariances)
+
+
+def _determinants(matrices: Float[Array, "s 3 3"]) -> Float[Array, " s"]:
+    a, b, c = (matrices[:, row] for row in range(3))
+    return namespace(matrices).sum(a * namespace(matrices).linalg.cross(b, c), axis=1)
 
 
 def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 3"]:
@@ -412,22 +408,28 @@ def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 
     The trace is a quadratic form in the unit quaternion of R. The best quaternion is the eigenvector for the
     largest eigenvalue of this form.
     """
-    table = jnp.asarray(_rotations_of_quaternions(), covariances.dtype)
-    quadratic = product(covariances.mT.reshape(-1, 9), table).reshape(-1, 4, 4)
-    sizes = jnp.sqrt(jnp.sum(quadratic**2, axis=(1, 2), keepdims=True))
+    xp = namespace(covariances)
+    table = xp.asarray(_rotations_of_quaternions(), covariances.dtype)
+    quadratic = product(covariances.mT.reshape(-1, 9), table)
+    sizes = xp.sqrt(xp.sum(quadratic**2, axis=1))
     # Adding the identity makes all eigenvalues non-negative, so the largest eigenvalue dominates the powers
-    # of the matrix.
-    powers = quadratic / jnp.where(sizes > 0, sizes, 1) + jnp.eye(4, dtype=covariances.dtype)[None]
+    # of the matrix. The vertices are on the last axis, along which processors compute several at once.
+    identity = xp.eye(4, dtype=covariances.dtype).reshape(16, 1)
+    powers = quadratic.T / xp.where(sizes > 0, sizes, 1) + identity
+    powers = fori_loop(_SQUARINGS, lambda _, powers: _squared(powers), powers)
+    largest = xp.argmax(powers[::5], axis=0)
+    quaternions = xp.take_along_axis(powers.reshape(4, 4, -1), largest[None, None], axis=0)[0]
+    products = (quaternions[:, None] * quaternions[None]).reshape(16, -1) / xp.sum(quaternions**2, axis=0)
+    return product(products.T, table.T).reshape(-1, 3, 3)
 
-    def squared(_: Any, powers: Float[Array, "s 4 4"]) -> Float[Array, "s 4 4"]:
-        powers = jnp.sum(powers[:, :, :, None] * powers[:, None, :, :], axis=2)
-        return powers / jnp.trace(powers, axis1=1, axis2=2)[:, None, None]
 
-    powers = lax.fori_loop(0, _SQUARINGS, squared, powers)
-    largest = jnp.argmax(jnp.diagonal(powers, axis1=1, axis2=2), axis=1)
-    quaternions = jnp.take_along_axis(powers, largest[:, None, None], axis=1)
-    products = quaternions.mT * quaternions / jnp.sum(quaternions**2, axis=2, keepdims=True)
-    return product(products.reshape(-1, 16), table.T).reshape(-1, 3, 3)
+def _squared(matrices: Float[Array, "16 s"]) -> Float[Array, "16 s"]:
+    """Return the squares of symmetric matrices (4, 4), divided by their traces."""
+    rows = [[matrices[4 * i + j] for j in range(4)] for i in range(4)]
+    upper = {(i, j): sum(rows[i][k] * rows[k][j] for k in range(4)) for i in range(4) for j in range(i, 4)}
+    trace = sum(upper[i, i] for i in range(4))
+    entries = [upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]
+    return namespace(matrices).stack(entries) / trace
 
 
 @cache

@@ -5,15 +5,15 @@ from __future__ import annotations
 import abc
 from typing import Generic, NamedTuple, TypeVar, get_args
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import check_option
 from jaxsmw.core.functional_map import (
     FunctionalMap,
     Norm,
+    PointwiseMap,
     PseudoInverse,
     WaveletProblem,
     dual_eigenvectors,
@@ -21,13 +21,13 @@ from jaxsmw.core.functional_map import (
     multiscale_kernel,
 )
 from jaxsmw.core.linear_algebra import nearest_orthogonal
+from jaxsmw.core.module import Module, field
 from jaxsmw.core.results import RESULTS, where
-from jaxsmw.core.soft_maps import PointwiseMap
 
 PreparedT = TypeVar("PreparedT")
 
 
-class Solution(eqx.Module, Generic[PreparedT]):
+class Solution(Module, Generic[PreparedT]):
     """The base class of solutions: methods that compute a functional map C from a pointwise map T.
 
     The refiner `WaveletPreservation` takes a solution as its argument `solution`. Ready subclasses are
@@ -36,6 +36,11 @@ class Solution(eqx.Module, Generic[PreparedT]):
     derives from `Solution[Values]`. C maps functions on the shape "in" to functions on the shape "out", which
     are Y and X in the pullback convention (the default).
     """
+
+    @property
+    def uses_namespaces(self) -> bool:
+        """Whether the methods take their namespace from their arrays; see `Refiner.uses_namespaces`."""
+        return False
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:
         """Return the values that `solve` needs and that do not depend on the pointwise map, by default None.
@@ -94,10 +99,15 @@ class Filtering(Solution[PreparedFiltering]):
     **Raises:** `ValueError` if `pseudo_inverse` is unknown.
     """
 
-    pseudo_inverse: PseudoInverse = eqx.field(static=True, default="area")
+    pseudo_inverse: PseudoInverse = field(static=True, default="area")
 
     def __check_init__(self) -> None:
         check_option("pseudo_inverse", self.pseudo_inverse, get_args(PseudoInverse))
+
+    @property
+    def uses_namespaces(self) -> bool:
+        """Always True."""
+        return True
 
     def prepare(self, problem: WaveletProblem) -> PreparedFiltering:
         spectrum_out, _ = problem.spectra
@@ -116,7 +126,7 @@ class Filtering(Solution[PreparedFiltering]):
         _, spectrum_in = problem.spectra
         eigenvectors_in, convention = spectrum_in.eigenvectors, problem.convention
         unfiltered = encode_by(prepared.dual_out, pointwise_map, eigenvectors_in, convention)
-        return unfiltered * prepared.kernel, RESULTS.successful  # type: ignore[return-value]
+        return unfiltered * prepared.kernel, RESULTS.successful
 
 
 class NearestOrthogonal(Solution[PreparedT]):
@@ -133,6 +143,11 @@ class NearestOrthogonal(Solution[PreparedT]):
     """
 
     solution: Solution[PreparedT] = Filtering()  # type: ignore[assignment]
+
+    @property
+    def uses_namespaces(self) -> bool:
+        """Whether the other solution takes its namespace from its arrays."""
+        return self.solution.uses_namespaces
 
     def prepare(self, problem: WaveletProblem) -> PreparedT:
         return self.solution.prepare(problem)
@@ -159,10 +174,15 @@ class LeastSquares(Solution[None]):
     **Raises:** `ValueError` if `norm` is unknown.
     """
 
-    norm: Norm = eqx.field(static=True, default="area")
+    norm: Norm = field(static=True, default="area")
 
     def __check_init__(self) -> None:
         check_option("norm", self.norm, get_args(Norm))
+
+    @property
+    def uses_namespaces(self) -> bool:
+        """Always True."""
+        return True
 
     def solve(
         self,
@@ -174,7 +194,8 @@ class LeastSquares(Solution[None]):
         energy = problem.energy(pointwise_map, norm=self.norm)
         _, responses_in = problem.responses
         frame = frame_function(responses_in)
-        precision = frame.shape[0] * jnp.finfo(frame.dtype).eps
-        covers = jnp.min(frame) > precision * jnp.max(frame)
+        xp = namespace(frame)
+        precision = frame.shape[0] * xp.finfo(frame.dtype).eps
+        covers = xp.min(frame) > precision * xp.max(frame)
         result = where(energy.is_regular(), RESULTS.successful, RESULTS.singular_system)
         return energy.minimizer(), where(covers, result, RESULTS.undetermined_functional_map)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from functools import partial
 
-import equinox as eqx
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.functional_map import PseudoInverse, dual_eigenvectors
 from jaxsmw.core.linear_algebra import product
+from jaxsmw.core.module import Module
 from jaxsmw.core.spectrum import Spectrum
 
 
-class ProjectedDescriptors(eqx.Module):
+class ProjectedDescriptors(Module):
     """Functions f on one shape: their coefficients `Phi^+ f` (k, d), in the unit of f times length.
 
     The `operators` (d, k, k) are the matrices `Phi^+ diag(f) Phi`, which multiply other functions by f
@@ -44,7 +45,7 @@ class ProjectedDescriptors(eqx.Module):
         return cls(product(dual.T, descriptors), made)
 
 
-class DescriptorPair(eqx.Module):
+class DescriptorPair(Module):
     """Corresponding functions on X and Y, such as descriptors, for the terms of `RegularizedLeastSquares`.
 
     `DescriptorPair.project` computes a pair from the values of functions at the vertices.

@@ -10,15 +10,16 @@ from typing import NamedTuple, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike, DTypeLike
-from jaxtyping import Array, Bool, Float
+from jax.typing import DTypeLike
+from jaxtyping import Bool, Float
 
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import as_parameter, check_between, check_option
-from jaxsmw.core.functional_map import FunctionalMap, Norm, QuadraticEnergy, WaveletProblem
+from jaxsmw.core.functional_map import FunctionalMap, Norm, PointwiseMap, QuadraticEnergy, WaveletProblem
 from jaxsmw.core.linear_algebra import cholesky, product, rounding, solve_lower
+from jaxsmw.core.module import field
 from jaxsmw.core.results import RESULTS, where
-from jaxsmw.core.soft_maps import PointwiseMap
 from jaxsmw.core.solutions.closed_form import Solution
 from jaxsmw.core.solutions.descriptors import DescriptorPair
 
@@ -33,7 +34,7 @@ _TERMS = (
 )
 
 
-def _as_weight(value: ArrayLike | None) -> Array | None:
+def _as_weight(value: Array | float | None) -> Array | None:
     return None if value is None else as_parameter(value)
 
 
@@ -79,15 +80,15 @@ class RegularizedLeastSquares(Solution[None]):
     the descriptor terms.
     """
 
-    wavelet_preservation: Weight = eqx.field(converter=_as_weight, default=1.0)
-    laplacian_commutativity: Weight = eqx.field(converter=_as_weight, default=1.0)
-    orthogonality: Weight = eqx.field(converter=_as_weight, default=0.1)
-    descriptor_preservation: Weight = eqx.field(converter=_as_weight, default=None)
-    descriptor_commutativity: Weight = eqx.field(converter=_as_weight, default=None)
+    wavelet_preservation: Weight = field(converter=_as_weight, default=1.0)
+    laplacian_commutativity: Weight = field(converter=_as_weight, default=1.0)
+    orthogonality: Weight = field(converter=_as_weight, default=0.1)
+    descriptor_preservation: Weight = field(converter=_as_weight, default=None)
+    descriptor_commutativity: Weight = field(converter=_as_weight, default=None)
     descriptors: DescriptorPair | None = None
-    norm: Norm = eqx.field(static=True, default="area")
-    tolerance: float = eqx.field(static=True, default=1e-3)
-    max_steps: int = eqx.field(static=True, default=256)
+    norm: Norm = field(static=True, default="area")
+    tolerance: float = field(static=True, default=1e-3)
+    max_steps: int = field(static=True, default=256)
 
     def __check_init__(self) -> None:
         check_option("norm", self.norm, get_args(Norm))

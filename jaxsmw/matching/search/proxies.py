@@ -7,12 +7,12 @@ from dataclasses import replace
 from itertools import permutations
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int64
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial.distance import cdist
 
+from jaxsmw.core.arrays import namespace
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.alignment import nearest_rotations
 from jaxsmw.geometry.mesh import Mesh
@@ -52,12 +52,12 @@ class Proxy:
 
         - `descriptors`: the descriptors of the samples (s, d); by default, the descriptors of `spectrum`.
         """
-        at_samples = self.spectrum.sample(jnp.asarray(self.samples.vertices))
-        dtype = at_samples.eigenvectors.dtype
+        at_samples = self.spectrum.sample(self.samples.vertices)
+        xp, dtype = namespace(at_samples.eigenvectors), at_samples.eigenvectors.dtype
         areas = self.areas * float(np.sum(self.spectrum.vertex_areas))
         if descriptors is not None:
-            at_samples = at_samples.with_descriptors(jnp.asarray(descriptors, dtype))
-        return replace(at_samples, vertex_areas=jnp.asarray(areas, dtype), positions=None, normals=None)
+            at_samples = at_samples.with_descriptors(xp.asarray(descriptors, dtype))
+        return replace(at_samples, vertex_areas=xp.asarray(areas, dtype), positions=None, normals=None)
 
     @functools.cached_property
     def distances(self) -> Float[np.ndarray, "s s"]:

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Int64
 
+from jaxsmw.core.arrays import namespace
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import Judge, Scored
@@ -137,7 +137,9 @@ def _without_creases(spectra: SpectralPair) -> SpectralPair:
 
     def zeroed(spectrum: Spectrum) -> Spectrum:
         creases = spectrum.crease_eigenvectors
-        return spectrum.with_crease_eigenvectors(None if creases is None else jnp.zeros_like(creases))
+        return spectrum.with_crease_eigenvectors(
+            None if creases is None else namespace(creases).zeros_like(creases)
+        )
 
     return replace(spectra, x=zeroed(spectra.x), y=zeroed(spectra.y))
 

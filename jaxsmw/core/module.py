@@ -1,0 +1,142 @@
+"""Frozen dataclasses that JAX treats as pytrees."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any, dataclass_transform
+
+import numpy as np
+
+from jaxsmw.core.arrays import is_array
+
+
+def field(*, static: bool = False, converter: Callable[[Any], Any] | None = None, **options: Any) -> Any:
+    """Declare a field of a `Module`.
+
+    **Arguments:**
+
+    - `static`: whether the field is a constant for JAX, and not a part of the pytree. Its values must be
+      hashable.
+    - `converter`: a function that the constructor applies to the given value or the default.
+    - `options`: see `dataclasses.field`.
+    """
+    return dataclasses.field(metadata={"static": static, "converter": converter}, **options)
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field, dataclasses.field))
+class Module(abc.ABC):  # noqa: B024 (a base of abstract classes)
+    """The base class of the classes of the core: frozen dataclasses, which are pytrees of JAX.
+
+    `equinox.Module` is the model, and the functions of Equinox work with these classes as well. Unlike with
+    Equinox, JAX need not be imported: subclasses become pytrees when JAX is imported and a module is made. If
+    a subclass has a method `__check_init__`, the constructor calls the methods of this name of all classes.
+    Two modules are equal if they have equal fields.
+    """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
+        _unregistered.append(cls)
+        _register()
+
+    def __new__(cls, *_: Any, **__: Any) -> Any:
+        _register()
+        return super().__new__(cls)
+
+    def __post_init__(self) -> None:
+        for one in _fields(type(self)):
+            if (convert := one.metadata.get("converter")) is not None:
+                object.__setattr__(self, one.name, convert(getattr(self, one.name)))
+        for kind in type(self).__mro__:
+            if "__check_init__" in vars(kind):
+                vars(kind)["__check_init__"](self)
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and all(
+            _equal(mine, theirs) for mine, theirs in zip(_values(self), _values(other), strict=True)
+        )
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
+    def __repr__(self) -> str:
+        names = [one.name for one in _fields(type(self))]
+        shown = (f"{name}={_shown(value)}" for name, value in zip(names, _values(self), strict=True))
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+
+def _fields(kind: Any) -> tuple[dataclasses.Field, ...]:
+    return dataclasses.fields(kind)
+
+
+def _dynamic(kind: type) -> list[dataclasses.Field]:
+    """Return the fields of a class that are part of the pytree."""
+    return [one for one in _fields(kind) if not one.metadata.get("static")]
+
+
+def _values(module: Any) -> Iterator[Any]:
+    return (getattr(module, one.name) for one in _fields(type(module)))
+
+
+def leaves(tree: Any) -> Iterator[Any]:
+    """Yield the leaves of a tree of modules and tuples, as `jax.tree.leaves` does."""
+    if isinstance(tree, Module):
+        for one in _dynamic(type(tree)):
+            yield from leaves(getattr(tree, one.name))
+    elif isinstance(tree, tuple):
+        for child in tree:
+            yield from leaves(child)
+    elif tree is not None:
+        yield tree
+
+
+def _equal(mine: Any, theirs: Any) -> bool:
+    if is_array(mine) and is_array(theirs):
+        return mine.dtype == theirs.dtype and np.array_equal(mine, theirs)
+    return bool(mine == theirs)
+
+
+def _shown(value: Any) -> str:
+    """Return the text of a value, but only the type and the shape of an array of several numbers."""
+    return f"{value.dtype}{list(value.shape)}" if is_array(value) and value.ndim else repr(value)
+
+
+# The classes that JAX does not know yet.
+_unregistered: list[type] = []
+
+
+def _register() -> None:
+    """Make pytrees of all classes, if JAX is imported."""
+    jax = sys.modules.get("jax")
+    if jax is None or not hasattr(jax, "tree_util"):  # while JAX is imported, it has no attributes yet
+        return
+    while _unregistered:
+        _register_class(jax.tree_util, _unregistered.pop())
+
+
+def _register_class(tree_util: Any, kind: type) -> None:
+    names = [one.name for one in _dynamic(kind)]
+    constants = [one.name for one in _fields(kind) if one.name not in names]
+
+    def flatten(module: Any) -> tuple[tuple, tuple]:
+        return (
+            tuple(getattr(module, name) for name in names),
+            tuple(getattr(module, name) for name in constants),
+        )
+
+    def flatten_with_keys(module: Any) -> tuple[tuple, tuple]:
+        children, aside = flatten(module)
+        keys = map(tree_util.GetAttrKey, names)
+        return tuple(zip(keys, children, strict=True)), aside
+
+    def unflatten(aside: tuple, children: tuple) -> Any:
+        # The constructor would convert and check placeholders of JAX.
+        module = object.__new__(kind)
+        for name, value in zip((*names, *constants), (*children, *aside), strict=True):
+            object.__setattr__(module, name, value)
+        return module
+
+    tree_util.register_pytree_with_keys(kind, flatten_with_keys, unflatten, flatten)
