@@ -90,8 +90,11 @@ def test_imports_have_no_cycle():
 
 
 def test_the_core_imports_no_host_libraries():
-    """JAX traces the code of the core, so this code must not use files, SciPy's solvers or meshes."""
-    for path in (LIBRARY / "core").rglob("*.py"):
+    """JAX traces the code of the core, so this code must not use files, SciPy's solvers or meshes.
+
+    Only the search in NumPy arrays, which JAX never traces, uses SciPy's trees and counts the cores.
+    """
+    for path in set((LIBRARY / "core").rglob("*.py")) - {LIBRARY / "core" / "host_search.py"}:
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             found = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             found += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
