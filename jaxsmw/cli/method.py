@@ -212,7 +212,7 @@ def match_meshes(
 
 
 def _precision(name: str) -> AbstractContextManager[object]:
-    """Return a context with the given default type of floats. JAX, which has this setting, may stay unloaded."""
+    """Return a context with the given default type of floats, which is a setting of JAX."""
     if name != "float64" and "jax" not in sys.modules:
         return nullcontext()
     import jax

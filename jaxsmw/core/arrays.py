@@ -8,16 +8,13 @@ imports JAX, unless an array of JAX exists already.
 
 from __future__ import annotations
 
-import functools
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Int, Shaped
 
-Parameters = ParamSpec("Parameters")
-Returned = TypeVar("Returned")
 Carry = TypeVar("Carry")
 Value = TypeVar("Value")
 
@@ -161,19 +158,3 @@ def segment_min(values: Shaped[Array, " p"], segments: Int[Array, " p"], number:
     least = np.full(number, values.max(), values.dtype)
     np.minimum.at(least, segments, values)
     return least
-
-
-def jitted(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
-    """Decorate a function, which JAX compiles at its first call by `equinox.filter_jit`."""
-
-    @functools.cache
-    def compiled() -> Any:
-        import equinox as eqx
-
-        return eqx.filter_jit(function)
-
-    @functools.wraps(function)
-    def call(*arguments: Parameters.args, **options: Parameters.kwargs) -> Returned:
-        return compiled()(*arguments, **options)
-
-    return call

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any, dataclass_transform
+from typing import Any, ParamSpec, TypeVar, dataclass_transform
 
 import numpy as np
 
 from jaxsmw.core.arrays import is_array
+
+Parameters = ParamSpec("Parameters")
+Returned = TypeVar("Returned")
 
 
 def field(*, static: bool = False, converter: Callable[[Any], Any] | None = None, **options: Any) -> Any:
@@ -104,6 +108,31 @@ def _shown(value: Any) -> str:
     return f"{value.dtype}{list(value.shape)}" if is_array(value) and value.ndim else repr(value)
 
 
+def import_jax() -> Any:
+    """Import JAX, which then knows all modules as pytrees, and return it."""
+    import jax
+
+    _register()
+    return jax
+
+
+def jitted(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
+    """Decorate a function, which JAX compiles at its first call by `equinox.filter_jit`."""
+
+    @functools.cache
+    def compiled() -> Any:
+        import_jax()
+        import equinox as eqx
+
+        return eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def call(*arguments: Parameters.args, **options: Parameters.kwargs) -> Returned:
+        return compiled()(*arguments, **options)
+
+    return call
+
+
 # The classes that JAX does not know yet.
 _unregistered: list[type] = []
 
@@ -132,9 +161,9 @@ def _register_class(tree_util: Any, kind: type) -> None:
         keys = map(tree_util.GetAttrKey, names)
         return tuple(zip(keys, children, strict=True)), aside
 
-    def unflatten(aside: tuple, children: tuple) -> Any:
+    def unflatten(aside: tuple, children: tuple) -> object:
         # The constructor would convert and check placeholders of JAX.
-        module = object.__new__(kind)
+        module: Any = object.__new__(kind)
         for name, value in zip((*names, *constants), (*children, *aside), strict=True):
             object.__setattr__(module, name, value)
         return module

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
 
 from jaxsmw.choices import ITERATIONS
-from jaxsmw.core.arrays import Array, cond, jitted, namespace, replaced, scan
+from jaxsmw.core.arrays import Array, cond, namespace, replaced, scan
 from jaxsmw.core.checks import all_finite, check_array, check_kind, check_matches, counts_iterations
-from jaxsmw.core.module import Module
+from jaxsmw.core.module import Module, jitted
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, Samples, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS, where

@@ -16,6 +16,7 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, spl
 from jaxsmw.choices import APPROXIMATE_FROM, NUMBER_OF_EIGENVECTORS, Eigensolver, Laplacian
 from jaxsmw.core.arrays import on_host
 from jaxsmw.core.checks import check_kind
+from jaxsmw.core.module import import_jax
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.coarsening import coarsen
@@ -88,7 +89,7 @@ def compute_spectrum(
     solved accurately. `TypeError` if `mesh` is not a `Mesh`.
     """
 
-    import jax
+    jax = import_jax()
 
     pairs = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
     return jax.device_put(as_spectrum(mesh, *pairs))

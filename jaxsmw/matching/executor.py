@@ -40,12 +40,13 @@ def run(stages: Sequence[Stage], spectra: SpectralPair, start: Start) -> Outcome
 
 def refine_stage(stage: Stage, seen: SpectralPair, matches: Int[Array, " m"]) -> Refinement:
     """Run a stage on the spectra that it sees, from a map (m,), by NumPy if possible."""
-    settings = stage.settings(partial=seen.partial)
     if seen.on_host and stage.refiner.uses_namespaces:
+        settings = stage.settings(partial=seen.partial, traced=False)
         with np.errstate(all="ignore"):  # status codes report failures
             return refine_at_once(*seen.both, np.asarray(matches), samples=seen.samples, **settings)
     from jaxsmw.runtime.compilation import compiled
 
+    settings = stage.settings(partial=seen.partial)
     return compiled(refine)(*seen.both, matches, samples=seen.samples, **settings)
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Float, Float64, Int, Int64, Shaped
 
 from jaxsmw.choices import DEFAULT_BACKEND, Backend, Eigensolver, Laplacian
 from jaxsmw.core.arrays import Array, namespace, on_host
+from jaxsmw.core.module import import_jax
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.creases import crease_eigenvectors
@@ -169,7 +170,7 @@ def prepare_shapes(
         ]
     if chosen_backend(backend) == "numpy":
         return shapes
-    import jax
+    jax = import_jax()
 
     return [
         replace(shape, spectrum=jax.device_put(shape.spectrum), samples=jax.device_put(shape.samples))

@@ -104,13 +104,14 @@ class Stage:
                 f"{name} is {number!r}, but the refiner's levels require {derived}: leave {name} out."
             )
 
-    def settings(self, *, partial: bool = False) -> RefineSettings:
+    def settings(self, *, partial: bool = False, traced: bool = True) -> RefineSettings:
         """Return the stage as keyword arguments of `jaxsmw.refine`, for two full shapes or a partial pair.
 
-        The levels of the refiner are an array, so stages with equally many levels share a compiled program.
+        If JAX traces the stage, the levels of the refiner are an array, so that stages with equally many
+        levels share a compiled program.
         """
         return RefineSettings(
-            refiner=self.refiner.with_traced_levels(),
+            refiner=self.refiner.with_traced_levels() if traced else self.refiner,
             iterations=self.iterations,
             starts_on_samples=self.starts_on_samples,
             ends_on_samples=self.ends_on_samples,

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap
 from jaxsmw.core.arrays import Array
+from jaxsmw.core.module import import_jax
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.search import nearest_neighbor
@@ -177,7 +178,7 @@ def _functional_features(prepared: PreparedPair) -> _Features:
 
     **Raises:** `ArithmeticError` if the functional map cannot be computed.
     """
-    import jax
+    jax = import_jax()
     import jax.numpy as jnp
 
     from jaxsmw.core.solutions.descriptors import DescriptorPair
