@@ -43,6 +43,9 @@ class Module(abc.ABC):  # noqa: B024 (a base of abstract classes)
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
+        for one in _fields(cls):
+            if one.metadata.get("converter") is not None:
+                cls.__init__.__annotations__[one.name] = Any  # the constructor accepts what can be converted
         _unregistered.append(cls)
         _register()
 

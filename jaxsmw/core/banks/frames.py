@@ -156,6 +156,6 @@ class SoftmaxFrame(FilterBank):
         knots = xp.linspace(0, 1, self.logits.shape[1], dtype=points.dtype)
         relative, logits = points / eigenvalues[-1], xp.asarray(self.logits, points.dtype)
         heights = xp.stack([xp.interp(relative, knots, row) for row in logits])
-        largest = stop_gradient(xp.max(heights, axis=0))
-        log_sum = largest + xp.log(xp.sum(xp.exp(heights - largest), axis=0))
+        largest = stop_gradient(xp.max(heights, axis=0, keepdims=True))
+        log_sum = largest + xp.log(xp.sum(xp.exp(heights - largest), axis=0, keepdims=True))
         return xp.exp((heights - log_sum) / 2).astype(points.dtype)

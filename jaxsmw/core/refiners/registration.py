@@ -411,15 +411,17 @@ def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 
     xp = namespace(covariances)
     table = xp.asarray(_rotations_of_quaternions(), covariances.dtype)
     quadratic = product(covariances.mT.reshape(-1, 9), table)
-    sizes = xp.sqrt(xp.sum(quadratic**2, axis=1))
+    sizes = xp.sqrt(xp.sum(quadratic**2, axis=1))[None]
     # Adding the identity makes all eigenvalues non-negative, so the largest eigenvalue dominates the powers
     # of the matrix. The vertices are on the last axis, along which processors compute several at once.
     identity = xp.eye(4, dtype=covariances.dtype).reshape(16, 1)
     powers = quadratic.T / xp.where(sizes > 0, sizes, 1) + identity
     powers = fori_loop(_SQUARINGS, lambda _, powers: _squared(powers), powers)
     largest = xp.argmax(powers[::5], axis=0)
-    quaternions = xp.take_along_axis(powers.reshape(4, 4, -1), largest[None, None], axis=0)[0]
-    products = (quaternions[:, None] * quaternions[None]).reshape(16, -1) / xp.sum(quaternions**2, axis=0)
+    each = xp.arange(len(largest))
+    quaternions = powers.reshape(4, 4, -1)[largest, :, each].T
+    products = (quaternions[:, None] * quaternions[None]).reshape(16, -1)
+    products = products / xp.sum(quaternions**2, axis=0)[None]
     return product(products.T, table.T).reshape(-1, 3, 3)
 
 
@@ -429,7 +431,7 @@ def _squared(matrices: Float[Array, "16 s"]) -> Float[Array, "16 s"]:
     upper = {(i, j): sum(rows[i][k] * rows[k][j] for k in range(4)) for i in range(4) for j in range(i, 4)}
     trace = sum(upper[i, i] for i in range(4))
     entries = [upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]
-    return namespace(matrices).stack(entries) / trace
+    return namespace(matrices).stack(entries) / trace[None]
 
 
 @cache
