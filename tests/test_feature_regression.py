@@ -2,7 +2,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
 from synthetic import random_spectrum, stacked
 
@@ -143,24 +142,6 @@ def test_samples_are_queries_and_all_vertices_are_targets(pair):
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.9
 
 
-@pytest.mark.slow
-def test_search_in_patches_ignores_descriptors(pair):
-    x, y, initial_map, truth = pair
-    maps = [
-        refine(x, y, initial_map, refiner=FeatureRegression(search=search), iterations=1).pointwise_map
-        for search in ("exhaustive", "patches")
-    ]
-    blind = refine(
-        x.with_descriptors(None),
-        y.with_descriptors(None),
-        initial_map,
-        refiner=FeatureRegression(),
-        iterations=1,
-    )
-    np.testing.assert_array_equal(maps[1], blind.pointwise_map)
-    assert np.mean(np.asarray(maps[0]) == truth) > np.mean(np.asarray(maps[1]) == truth)
-
-
 def test_vmap_equals_a_loop(pair):
     x, y, initial_map, _ = pair
     pairs = [(x, y), (y, x)]
@@ -195,5 +176,3 @@ def test_invalid_descriptors_and_settings_are_refused(pair):
         refine(x, y.with_descriptors(None), initial_map, refiner=FeatureRegression())
     with pytest.raises(ValueError, match="needs at least 1 eigenvector"):
         FeatureRegression((20, 0))
-    with pytest.raises((ValueError, TypeCheckError), match="search"):
-        FeatureRegression(search="quick")

@@ -3,7 +3,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import TypeCheckError
 from sampled_cases import first_always
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -222,17 +221,6 @@ def test_signs_padding_and_vmap_do_not_change_the_map(pair):
     )
 
 
-@pytest.mark.sampled
-def test_search_in_patches_gives_the_same_map(pair):
-    x, y, initial_map, *_ = pair
-    x, y = (s.with_descriptors(s.positions[:, :1] / s.positions[:, :1].std()) for s in (x, y))
-    maps = [
-        refine(x, y, initial_map, refiner=Registration(search=search)).pointwise_map
-        for search in ("exhaustive", "patches")
-    ]
-    np.testing.assert_array_equal(*maps)
-
-
 def test_samples_are_queries_and_all_vertices_are_targets(pair):
     x, y, initial_map, truth, _ = pair
     generator = np.random.default_rng(1)
@@ -322,8 +310,6 @@ def test_invalid_spectra_and_settings_are_refused(pair):
         refine(x.with_descriptors(x.eigenvectors[:, :2]), y, initial_map, refiner=Registration())
     with pytest.raises(ValueError, match="needs at least 1 eigenvector"):
         Registration((20, 0))
-    with pytest.raises((ValueError, TypeCheckError), match="search"):
-        Registration(search="quick")
     broken = x.with_positions(x.positions.at[3, 1].set(jnp.nan), x.normals)
     found = refine(broken, y, initial_map, refiner=Registration())
     assert found.result == RESULTS.nonfinite_spectrum and (np.asarray(found.pointwise_map) == -1).all()
