@@ -410,13 +410,6 @@ def test_pairs_may_come_from_an_iterator(three, one_by_one):
     np.testing.assert_array_equal(found[0].pointwise_map, one_by_one[0].pointwise_map)
 
 
-def test_programs_are_released_between_pairs(three, monkeypatch):
-    """Each combination of sizes needs its own programs, which would use up the memory maps of the process."""
-    released = []
-    monkeypatch.setattr("jaxsmw.collection.pairs.release_programs", lambda: released.append(1))
-    assert len(dict(match_pairs(three, PAIRS[:2], preset="paper"))) == len(released) == 2
-
-
 @pytest.mark.parametrize("pair", [(0, 3), (0, -1), (0, 1.0), (0,), (0, 1, 2), "01", 1])
 @pytest.mark.usefixtures("unchecked")
 def test_bad_pairs_are_refused(three, pair):
