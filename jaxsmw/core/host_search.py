@@ -18,11 +18,12 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
 from scipy.spatial import KDTree
+
+from jaxsmw.core.search import SearchProblem
 
 # The exhaustive search multiplies _BLOCK queries by at most _CHUNK database points at once, so that the
 # scores stay in the cache.
@@ -43,14 +44,6 @@ _Search = Callable[[Float[np.ndarray, "block d"]], Int[np.ndarray, " block"]]
 _Map = Callable[..., Iterator]
 
 
-class HostProblem(NamedTuple):
-    """The arguments of one search by `nearest_neighbor`."""
-
-    queries: Float[np.ndarray, "m d"]
-    database: Float[np.ndarray, "n d"]
-    database_mask: Bool[np.ndarray, " n"] | None = None
-
-
 def nearest_neighbor(
     queries: Float[np.ndarray, "m d"],
     database: Float[np.ndarray, "n d"],
@@ -61,19 +54,19 @@ def nearest_neighbor(
     If a query is NaN, its index is meaningless. The search uses all cores that the process may use; limit
     the threads of the linear algebra to one meanwhile. The number of cores does not affect the result.
     """
-    (nearest,) = _nearest_of_all(HostProblem(queries, database, database_mask))
+    (nearest,) = _nearest_of_all(SearchProblem(queries, database, database_mask))
     return nearest
 
 
 def nearest_in_both(
-    first: HostProblem, second: HostProblem
+    first: SearchProblem, second: SearchProblem
 ) -> tuple[Int32[np.ndarray, " m_1"], Int32[np.ndarray, " m_2"]]:
     """Return the results of two searches by `nearest_neighbor`, which run at the same time."""
     nearest_first, nearest_second = _nearest_of_all(first, second)
     return nearest_first, nearest_second
 
 
-def _nearest_of_all(*problems: HostProblem) -> list[Int32[np.ndarray, " m"]]:
+def _nearest_of_all(*problems: SearchProblem) -> list[Int32[np.ndarray, " m"]]:
     with _threads() as run:
         searches = list(run(_prepare, problems))
         blocks = [
@@ -108,7 +101,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _prepare(problem: HostProblem) -> _Search:
+def _prepare(problem: SearchProblem) -> _Search:
     """Choose the search for a problem."""
     queries, database, mask = problem
     rows = _distinct_rows(database, mask)
