@@ -15,10 +15,10 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, shot_descriptors
+from jaxsmw.matching.descriptors import PrincipalAxes
 from jaxsmw.matching.executor import run
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import principal_components
 from jaxsmw.matching.search.proxies import Proxy, distance_error
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
@@ -146,13 +146,10 @@ class Hands:
             for own in (shot_x, shot_y)
             for descriptors in (own, [mirrored_descriptors(one) for one in own])
         ]
-        components = principal_components(
-            np.concatenate(shot),
-            np.concatenate([shape.areas for shape in shapes]) / len(shapes),
-            _STAGE.number_of_descriptors,
-        )
-        of_hands = np.split(components, np.cumsum([len(rows) for rows in shot])[:-1])
-        return [_Hand(*hand) for hand in zip(shapes, shot, of_hands, strict=True)]
+        areas = [shape.areas / len(shapes) for shape in shapes]
+        axes = PrincipalAxes.of(zip(shot, areas, strict=True), _STAGE.number_of_descriptors)
+        components = map(axes.components, shot)
+        return [_Hand(*hand) for hand in zip(shapes, shot, components, strict=True)]
 
     @staticmethod
     def _error(
