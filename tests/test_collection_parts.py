@@ -34,8 +34,8 @@ from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.executor import run, run_batches
 from jaxsmw.matching.outcome import Start
-from jaxsmw.matching.preparation import prepare_shapes
 from jaxsmw.matching.search.chirality import Decision
+from jaxsmw.matching.shape import prepare_shapes
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
 

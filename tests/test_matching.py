@@ -28,7 +28,7 @@ from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching import preparation
+from jaxsmw.matching import descriptors, shape
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.match import match, refine_and_judge
 from jaxsmw.matching.pair import Pair
@@ -73,7 +73,7 @@ def test_invalid_arguments_are_refused_before_eigenbases_are_computed(pair, opti
     def refuse(*_, **__):
         raise AssertionError("eigenpairs were computed")
 
-    monkeypatch.setattr("jaxsmw.matching.preparation.eigenpairs", refuse)
+    monkeypatch.setattr("jaxsmw.matching.shape.eigenpairs", refuse)
     mesh_x, mesh_y, _ = pair
     if options == {"partial": True}:
         mesh_y = make_mesh(1000 * mesh_y.vertices, mesh_y.faces)
@@ -103,8 +103,8 @@ def test_initial_maps_of_large_meshes_use_samples(pair, init, monkeypatch):
     if not isinstance(init, str):
         init = np.array([[i, truth[i]] for i, _ in init])
     spectra = paired_spectra(Pair(mesh_x, mesh_y), 30)
-    monkeypatch.setattr(preparation, "_COMPARED", 800)
-    monkeypatch.setattr(preparation, "_COMPARED_FROM", 700)
+    monkeypatch.setattr(shape, "_COMPARED", 800)
+    monkeypatch.setattr(shape, "_COMPARED_FROM", 700)
     start = initial_map(Pair(mesh_x, mesh_y), *spectra, init=init)
     compared = np.unique(start)
     assert 100 < len(compared) < 1000
@@ -431,7 +431,7 @@ def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):
     mesh_x, mesh_y, truth = pair
     spectra = paired_spectra(Pair(mesh_x, mesh_y), 30)
     coarse = describe(Pair(mesh_x, mesh_y), *spectra, 60)
-    monkeypatch.setattr(preparation, "FINE_FROM", 1000)
+    monkeypatch.setattr(descriptors, "FINE_FROM", 1000)
     described = describe(Pair(mesh_x, mesh_y), *spectra, 60)
     assert described[0].descriptors.shape == coarse[0].descriptors.shape == (len(truth), 60)
     for x, y in (described, coarse):  # the mean square over both shapes is 1

@@ -429,7 +429,7 @@ def _squared(matrices: Float[Array, "16 s"]) -> Float[Array, "16 s"]:
     """Return the squares of symmetric matrices (4, 4), divided by their traces."""
     rows = [[matrices[4 * i + j] for j in range(4)] for i in range(4)]
     upper = {(i, j): sum(rows[i][k] * rows[k][j] for k in range(4)) for i in range(4) for j in range(i, 4)}
-    trace = sum(upper[i, i] for i in range(4))
+    trace = upper[0, 0] + upper[1, 1] + upper[2, 2] + upper[3, 3]
     entries = [upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]
     return namespace(matrices).stack(entries) / trace[None]
 
