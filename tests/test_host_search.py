@@ -5,7 +5,7 @@ from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 
 from jaxsmw.core import host_search
-from jaxsmw.core.host_search import HostProblem, nearest_in_both, nearest_neighbor
+from jaxsmw.core.host_search import SearchProblem, nearest_in_both, nearest_neighbor
 from jaxsmw.core.search import nearest_neighbor as nearest_neighbor_jax
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 
@@ -195,7 +195,7 @@ def test_the_tree_is_chosen_where_it_excludes_most_points(spaces, name, expected
 
 @pytest.mark.parametrize("cores", [1, 2, 5])
 def test_the_number_of_cores_changes_nothing(spaces, cores, monkeypatch):
-    problems = [HostProblem(*(points.astype(np.float32) for points in space)) for space in spaces.values()]
+    problems = [SearchProblem(*(points.astype(np.float32) for points in space)) for space in spaces.values()]
     expected = [nearest_neighbor(*problem) for problem in problems]
     monkeypatch.setattr(host_search, "_cores", lambda: cores)
     for found, wanted in zip(nearest_in_both(*problems), expected, strict=True):
@@ -205,7 +205,7 @@ def test_the_number_of_cores_changes_nothing(spaces, cores, monkeypatch):
 def test_two_searches_can_have_different_sizes(method):
     generator = np.random.default_rng(0)
     problems = [
-        HostProblem(generator.normal(size=(m, d)), generator.normal(size=(n, d)), np.arange(n) % 3 != 1)
+        SearchProblem(generator.normal(size=(m, d)), generator.normal(size=(n, d)), np.arange(n) % 3 != 1)
         for m, n, d in ((30, 200, 4), (300, 2, 1))
     ]
     for problem, found in zip(problems, nearest_in_both(*problems), strict=True):

@@ -5,7 +5,7 @@
 - The exhaustive search compares all queries with all database points by matrix products.
 - The search by tree rotates the points to the principal axes of the database and builds a k-d tree. It is
   faster if the first axes exclude most points, as in the joint space of `Registration`.
-- The search in clusters skips most groups of points of large databases, as `search_in_patches` does.
+- The search in clusters skips most groups of points of large databases.
 
 A few queries decide which search is the fastest. CPU times in seconds in float32 on one core of an AMD EPYC,
 on data of a FAUST pair of which the large meshes were subdivided:
@@ -33,6 +33,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
 from scipy.spatial import KDTree
+
+from jaxsmw.core.search import SearchProblem
 
 # The exhaustive search multiplies _BLOCK queries by at most _CHUNK database points at once, so that the
 # scores stay in the cache.
@@ -66,14 +68,6 @@ _Search = Callable[[Float[np.ndarray, "block d"]], Int[np.ndarray, " block"]]
 _Map = Callable[..., Iterator]
 
 
-class HostProblem(NamedTuple):
-    """The arguments of one search by `nearest_neighbor`."""
-
-    queries: Float[np.ndarray, "m d"]
-    database: Float[np.ndarray, "n d"]
-    database_mask: Bool[np.ndarray, " n"] | None = None
-
-
 def nearest_neighbor(
     queries: Float[np.ndarray, "m d"],
     database: Float[np.ndarray, "n d"],
@@ -84,19 +78,19 @@ def nearest_neighbor(
     If a query is NaN, its index is meaningless. The search uses all cores that the process may use; limit
     the threads of the linear algebra to one meanwhile. The number of cores does not affect the result.
     """
-    (nearest,) = _nearest_of_all(HostProblem(queries, database, database_mask))
+    (nearest,) = _nearest_of_all(SearchProblem(queries, database, database_mask))
     return nearest
 
 
 def nearest_in_both(
-    first: HostProblem, second: HostProblem
+    first: SearchProblem, second: SearchProblem
 ) -> tuple[Int32[np.ndarray, " m_1"], Int32[np.ndarray, " m_2"]]:
     """Return the results of two searches by `nearest_neighbor`, which run at the same time."""
     nearest_first, nearest_second = _nearest_of_all(first, second)
     return nearest_first, nearest_second
 
 
-def _nearest_of_all(*problems: HostProblem) -> list[Int32[np.ndarray, " m"]]:
+def _nearest_of_all(*problems: SearchProblem) -> list[Int32[np.ndarray, " m"]]:
     with _threads() as run:
         prepared = list(run(_prepare, problems))
         tasks = [(number, block) for number, (blocks, _) in enumerate(prepared) for block in blocks]
@@ -104,7 +98,7 @@ def _nearest_of_all(*problems: HostProblem) -> list[Int32[np.ndarray, " m"]]:
         def search(task: tuple[int, _Block]) -> Int[np.ndarray, " block"]:
             number, block = task
             with np.errstate(over="ignore", invalid="ignore"):
-                return prepared[number][1](problems[number].queries[block])
+                return prepared[number][1](np.asarray(problems[number].queries)[block])
 
         results = [np.empty(len(problem.queries), np.int32) for problem in problems]
         for (number, block), rows in zip(tasks, run(search, tasks), strict=True):
@@ -127,9 +121,10 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _prepare(problem: HostProblem) -> tuple[Sequence[_Block], _Search]:
+def _prepare(problem: SearchProblem) -> tuple[Sequence[_Block], _Search]:
     """Choose the search for a problem. Return the blocks of queries that it searches for at once, and it."""
-    queries, database, mask = problem
+    queries, database = np.asarray(problem.queries), np.asarray(problem.database)
+    mask = None if problem.database_mask is None else np.asarray(problem.database_mask)
     rows = _distinct_rows(database, mask)
     points = database if len(rows) == len(database) else database[rows]
     center = points.mean(axis=0, dtype=np.float64)
