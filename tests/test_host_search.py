@@ -5,7 +5,8 @@ from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 
 from jaxsmw.core import host_search
-from jaxsmw.core.host_search import SearchProblem, nearest_in_both, nearest_neighbor
+from jaxsmw.core.host_search import nearest_in_both, nearest_neighbor
+from jaxsmw.core.search import SearchProblem
 from jaxsmw.core.search import nearest_neighbor as nearest_neighbor_jax
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 

@@ -34,7 +34,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
 from scipy.spatial import KDTree
 
-from jaxsmw.core.search import SearchProblem
+from jaxsmw.core.arrays import Array
 
 # The exhaustive search multiplies _BLOCK queries by at most _CHUNK database points at once, so that the
 # scores stay in the cache.
@@ -61,6 +61,8 @@ _TRIED_BLOCKS = 8
 # Iterations of the power method for the axes of clusters and for the axes along which clusters are halved.
 _ITERATIONS = 3
 
+# The queries (m, d), the database (n, d) and its mask (n,) of one search.
+_Problem = tuple[Array, Array, Array | None]
 # The rows of a block of queries.
 _Block = slice | Int[np.ndarray, " block"]
 # A prepared search returns the nearest database rows of a block of queries.
@@ -78,19 +80,19 @@ def nearest_neighbor(
     If a query is NaN, its index is meaningless. The search uses all cores that the process may use; limit
     the threads of the linear algebra to one meanwhile. The number of cores does not affect the result.
     """
-    (nearest,) = _nearest_of_all(SearchProblem(queries, database, database_mask))
+    (nearest,) = _nearest_of_all((queries, database, database_mask))
     return nearest
 
 
 def nearest_in_both(
-    first: SearchProblem, second: SearchProblem
+    first: _Problem, second: _Problem
 ) -> tuple[Int32[np.ndarray, " m_1"], Int32[np.ndarray, " m_2"]]:
     """Return the results of two searches by `nearest_neighbor`, which run at the same time."""
     nearest_first, nearest_second = _nearest_of_all(first, second)
     return nearest_first, nearest_second
 
 
-def _nearest_of_all(*problems: SearchProblem) -> list[Int32[np.ndarray, " m"]]:
+def _nearest_of_all(*problems: _Problem) -> list[Int32[np.ndarray, " m"]]:
     with _threads() as run:
         prepared = list(run(_prepare, problems))
         tasks = [(number, block) for number, (blocks, _) in enumerate(prepared) for block in blocks]
@@ -98,9 +100,9 @@ def _nearest_of_all(*problems: SearchProblem) -> list[Int32[np.ndarray, " m"]]:
         def search(task: tuple[int, _Block]) -> Int[np.ndarray, " block"]:
             number, block = task
             with np.errstate(over="ignore", invalid="ignore"):
-                return prepared[number][1](np.asarray(problems[number].queries)[block])
+                return prepared[number][1](np.asarray(problems[number][0])[block])
 
-        results = [np.empty(len(problem.queries), np.int32) for problem in problems]
+        results = [np.empty(len(problem[0]), np.int32) for problem in problems]
         for (number, block), rows in zip(tasks, run(search, tasks), strict=True):
             results[number][block] = rows
     return results
@@ -121,10 +123,10 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _prepare(problem: SearchProblem) -> tuple[Sequence[_Block], _Search]:
+def _prepare(problem: _Problem) -> tuple[Sequence[_Block], _Search]:
     """Choose the search for a problem. Return the blocks of queries that it searches for at once, and it."""
-    queries, database = np.asarray(problem.queries), np.asarray(problem.database)
-    mask = None if problem.database_mask is None else np.asarray(problem.database_mask)
+    queries, database = (np.asarray(points) for points in problem[:2])
+    mask = None if problem[2] is None else np.asarray(problem[2])
     rows = _distinct_rows(database, mask)
     points = database if len(rows) == len(database) else database[rows]
     center = points.mean(axis=0, dtype=np.float64)

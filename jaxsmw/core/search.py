@@ -22,9 +22,9 @@ def nearest_neighbor(
     x n is stored.
 
     JAX compares every query with every row. NumPy leaves rows out if a tree or a few clusters show that they
-    are too far away; see `jaxsmw.core.host_search`. The score of a database row b for a query q is `q·b - |b|²/2`, which is largest for the
-    nearest row. An exhaustive search compares the distances to two of the rows with the best scores, because
-    scores have large rounding errors if `|b|` is large compared to the distance.
+    are too far away; see `jaxsmw.core.host_search`. The score of a database row b for a query q is `q·b -
+    |b|²/2`, which is largest for the nearest row. The search compares the distances to two of the rows with
+    the best scores, because scores have large rounding errors if `|b|` is large compared to the distance.
 
     **Arguments:**
 
@@ -45,7 +45,7 @@ class SearchProblem(NamedTuple):
 
     queries: Float[Array, "m d"]
     database: Float[Array, "n d"]
-    database_mask: Bool[Array, " n"] | None = None
+    database_mask: Bool[Array, " n"]
 
 
 def nearest_in_both(
@@ -55,7 +55,7 @@ def nearest_in_both(
     return _implementation(*first, *second).nearest_in_both(first, second)
 
 
-def _implementation(*arrays: Array) -> Any:
+def _implementation(*arrays: Array | None) -> Any:
     if is_traced(*arrays):
         from jaxsmw.core import traced_search
 
