@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -9,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.shot import SHOT_RADIUS
 from jaxsmw.matching.shape import PreparedShape
-from jaxsmw.runtime.threads import one_blas_thread
+from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
 # On meshes with at least `FINE_FROM` vertices, a neighbourhood of the smaller radius contains at least about
 # ten vertices.
@@ -53,17 +54,13 @@ class PrincipalAxes(NamedTuple):
           blocks together sum to 1. The function reads `blocks` once.
         - `number`: the number d of axes.
         """
-        # Moments about a point near the mean are as accurate as moments about the mean.
         origin, mean, moments = (np.zeros(()) for _ in range(3))
         for values, weight in blocks:
             origin = origin if origin.ndim else values.mean(axis=0)
-            roots = np.sqrt(weight).astype(values.dtype)
-            for start in range(0, len(values), _ROWS_PER_PRODUCT):
-                rows = slice(start, start + _ROWS_PER_PRODUCT)
-                centered = (values[rows] - origin) * roots[rows, None]
-                mean = mean + (roots[rows] @ centered).astype(np.float64)
-                # BLAS multiplies a matrix by its own transpose with half of the operations.
-                moments = moments + (centered.T @ centered).astype(np.float64)
+            middle = len(values) // 2
+            halves = (values[:middle], weight[:middle]), (values[middle:], weight[middle:])
+            for first, second in side_by_side(functools.partial(_moments, origin), *halves):
+                mean, moments = mean + first, moments + second
         covariance = moments - np.outer(mean, mean)
         # On a busy machine, waiting threads make this decomposition up to 50 times slower.
         with one_blas_thread():
@@ -79,6 +76,22 @@ class PrincipalAxes(NamedTuple):
         components = values @ self.axes.astype(values.dtype)
         components -= (self.mean @ self.axes).astype(values.dtype)
         return components
+
+
+def _moments(
+    origin: Float[np.ndarray, " c"], rows: tuple[Float[np.ndarray, "n c"], Float[np.ndarray, " n"]]
+) -> tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, "c c"]]:
+    """Return the weighted sums of rows and of their products, relative to an origin near their mean."""
+    values, weight = rows
+    roots = np.sqrt(weight).astype(values.dtype)[:, None]
+    size = values.shape[1]
+    first, second = np.zeros(size), np.zeros((size, size))
+    for start in range(0, len(values), _ROWS_PER_PRODUCT):
+        part = slice(start, start + _ROWS_PER_PRODUCT)
+        centered = (values[part] - origin) * roots[part]
+        first += roots[part, 0] @ centered
+        second += centered.T @ centered  # BLAS takes half of the operations for such a product
+    return first, second
 
 
 class DescriptorAxes(NamedTuple):
@@ -131,7 +144,7 @@ class DescriptorAxes(NamedTuple):
 
         **Raises:** `InputError` if a mesh is too coarse for SHOT.
         """
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), one_blas_thread():
             if len(self.radii) > 1:
                 warnings.simplefilter("ignore")
             rows = _rows(shapes, self.radii, shot)
