@@ -2,13 +2,11 @@
 
 import concurrent.futures
 import errno
-import json
 import multiprocessing
 import os
 import subprocess
 import sys
 import warnings
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +19,6 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.meshes import write_mesh
 from jaxsmw.runtime.cache import cache_compiled_programs, cache_contents, cached, clear_cache
-from jaxsmw.runtime.program_checksums import remove_damaged_programs
 
 INPUT = np.arange(6.0).reshape(2, 3)
 RESULT = {"values": np.array([0.1, np.nan, -0.0]), "count": np.array(3), "none": np.empty((0, 2), np.int32)}
@@ -252,7 +249,7 @@ def test_commands_cache_compiled_programs(tmp_path):
     mesh = tmp_path / "mesh.off"
     write_mesh(mesh, make_mesh(*sphere_mesh(2)))
     command = [sys.executable, "-m", "jaxsmw", "match", str(mesh), str(mesh), *SMALL]
-    command += ["--init", "wks", "--output", str(tmp_path / "map.txt")]
+    command += ["--init", "wks", "--backend", "jax", "--output", str(tmp_path / "map.txt")]
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX")}
 
     def compiled(place: str) -> list[str]:
@@ -264,59 +261,8 @@ def test_commands_cache_compiled_programs(tmp_path):
     assert compiled("off") == [] and not cache.exists()
     assert compiled(str(cache)) == []
     (programs,) = cache.glob("programs-*")
-    assert len(list(programs.glob("*-cache"))) > 5
-    assert len(compiled(str(cache))) > 5
-    checksums = json.loads((programs / "checksums.json").read_text())
-    assert checksums.keys() == {path.name for path in programs.glob("*-cache")}
-    largest = max(programs.glob("*-cache"), key=lambda path: path.stat().st_size)
-    whole = largest.read_bytes()
-    largest.write_bytes(whole[: len(whole) // 2])
-    hits = len(compiled(str(cache)))
-    assert zlib.decompress(largest.read_bytes())  # the program was compiled and stored again
-    assert len(compiled(str(cache))) == hits + 1
-
-
-def zstandard_frame(contents):
-    """Return contents as a zstandard frame without compression."""
-    header = b"\x28\xb5\x2f\xfd" + bytes([0b00100000, len(contents)])
-    return header + (1 | len(contents) << 3).to_bytes(3, "little") + contents
-
-
-def test_damaged_programs_are_removed(tmp_path):
-    good = zlib.compress(np.random.default_rng(0).bytes(1000))
-    flipped = bytearray(good)
-    flipped[500] ^= 4
-    contents = {
-        "whole": good,
-        "half": good[:500],
-        "empty": b"",
-        "text": b"not a program",
-        "flipped": bytes(flipped),
-        "other-kind": zstandard_frame(b"program"),
-    }
-    for name, content in contents.items():
-        (tmp_path / f"{name}-cache").write_bytes(content)
-    (tmp_path / "notes").write_text("mine")
-
-    def left():
-        remove_damaged_programs(tmp_path)
-        return {path.name for path in tmp_path.iterdir()}
-
-    others = {"notes", "checksums.json"}
-    assert left() == {"whole-cache", "other-kind-cache", *others}
-    # Both programs can be unpacked, but they are not the programs that were recorded.
-    (tmp_path / "whole-cache").write_bytes(zlib.compress(b"foreign"))
-    (tmp_path / "other-kind-cache").write_bytes(zstandard_frame(b"foreign"))
-    (tmp_path / "new-cache").write_bytes(good)
-    assert left() == {"new-cache", *others}
-
-
-@pytest.mark.parametrize("record", ["", "[]", "{", "null", "1"])
-def test_a_damaged_record_of_checksums_is_replaced(record, tmp_path):
-    (tmp_path / "a-cache").write_bytes(zlib.compress(b"program"))
-    (tmp_path / "checksums.json").write_text(record)
-    remove_damaged_programs(tmp_path)
-    assert json.loads((tmp_path / "checksums.json").read_text()).keys() == {"a-cache"}
+    assert list(programs.glob("*-cache"))
+    assert compiled(str(cache))
 
 
 @pytest.fixture

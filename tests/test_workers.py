@@ -12,7 +12,6 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxsmw.runtime import compilation
 from jaxsmw.runtime.workers import Workers, run_tasks
 
 # NumPy and JAX are imported, and an array is made, before the worker runs any function of the library.
@@ -98,22 +97,3 @@ def test_warnings_of_workers_are_issued_in_the_calling_process(capfd):
     texts = [str(warning.message) for warning in issued]
     assert texts.count("the same") >= 1 and {"of 2", "of 3"} < set(texts)
     assert "Warning" not in capfd.readouterr().err
-
-
-def fill(_: None) -> int:
-    """Compiles a program in the worker, and makes the next task release all programs."""
-    compilation._LARGEST_SHARE = 0.0
-    global double
-    double = jax.jit(lambda x: 2 * x)
-    double(1.0)
-    return double._cache_size()
-
-
-def programs(_: None) -> int:
-    return double._cache_size()
-
-
-def test_workers_release_programs_before_each_task():
-    with Workers(1) as workers:
-        assert dict(run_tasks(fill, {"fill": None}, workers)) == {"fill": 1}
-        assert dict(run_tasks(programs, {"count": None}, workers)) == {"count": 0}
