@@ -252,6 +252,21 @@ def _release_programs() -> None:
     jax.clear_caches()
 
 
+@pytest.fixture(params=["jax", "numpy"])
+def namespace(request: pytest.FixtureRequest) -> str:
+    """The namespace of the arrays: tests with this fixture run with JAX and with NumPy."""
+    return request.param
+
+
+@pytest.fixture
+def refine(namespace: str) -> Callable[..., Any]:
+    """The function `refine` for arrays of each namespace."""
+    # The type checks apply only to modules that are imported after this file.
+    from synthetic import refine_in
+
+    return functools.partial(refine_in, namespace)
+
+
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
     """A function that runs the command line in this process."""

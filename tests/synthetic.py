@@ -1,12 +1,15 @@
 """Synthetic spectra and simple meshes that several test files share."""
 
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial import ConvexHull
 
+from jaxsmw.core.refinement import Refinement, refine, refine_at_once
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.matching.judge import Scored
@@ -39,6 +42,25 @@ def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) 
 def stacked(*trees: Any) -> Any:
     """Stack the arrays of several spectra, or of other trees of equal structure."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+Namespace = Literal["jax", "numpy"]
+
+
+def to_namespace(tree: Any, name: Namespace) -> Any:
+    """Convert the arrays of a tree to JAX or NumPy."""
+    return jax.tree.map({"jax": jnp, "numpy": np}[name].asarray, tree)
+
+
+def refine_in(name: Namespace, *arrays: Any, samples: Any = None, **settings: Any) -> Refinement:
+    """Call `refine` for arrays of JAX, or run it at once for the same arrays of NumPy."""
+    arrays, samples = to_namespace((arrays, samples), name)
+    if name == "jax":
+        return refine(*arrays, samples=samples, **settings)
+    if not settings.get("refiner", WaveletPreservation()).uses_namespaces:
+        pytest.skip("the refiner is written for JAX")
+    with np.errstate(all="ignore"):
+        return refine_at_once(*arrays, samples=samples, **settings)
 
 
 def in_precision(tree: Any, dtype: type) -> Any:

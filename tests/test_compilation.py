@@ -1,23 +1,12 @@
-import logging
-from concurrent.futures import wait
-from pathlib import Path
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import body_with_arms
 
 from jaxsmw import compiler_options
-from jaxsmw.core.refinement import refine
 from jaxsmw.functional_maps import nearest_neighbor
-from jaxsmw.geometry.eigenbasis import compute_spectrum
-from jaxsmw.matching.executor import compile_stage, run
-from jaxsmw.matching.outcome import Start
-from jaxsmw.matching.spectral_pair import SpectralPair
-from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime import compilation
-from jaxsmw.runtime.compilation import compile_ahead, compiled, release_programs
+from jaxsmw.runtime.compilation import compiled
 
 
 @pytest.fixture
@@ -67,33 +56,6 @@ def test_compiled_functions_are_traced_once_and_return_the_same_results(points):
     assert traced == [False, True]
 
 
-@pytest.mark.parametrize("x64", [False, True])
-def test_a_program_that_was_compiled_ahead_is_not_compiled_again(caplog, x64):
-    def total(values, *, weights, power):
-        return jnp.sum(weights * values**power)
-
-    with jax.enable_x64(x64):
-        ahead = compile_ahead(total, lambda: ((jnp.zeros(9),), {"weights": jnp.zeros(9)}), power=3)
-        ahead.result()
-        arguments = jax.device_put((np.arange(9.0), np.ones(9)))
-        with jax.log_compiles(), caplog.at_level(logging.WARNING):
-            assert float(compiled(total)(arguments[0], weights=arguments[1], power=3)) == 1296
-            assert "XLA compilation of jit(total)" not in caplog.text
-            assert float(compiled(total)(arguments[0], weights=arguments[1], power=2)) == 204
-            assert "XLA compilation of jit(total)" in caplog.text
-
-
-def test_the_call_raises_the_errors_of_compiling_ahead(points):
-    def refusing(queries):
-        raise ValueError("no such search")
-
-    with pytest.raises(TypeError):
-        compile_ahead(refusing, lambda: ((jnp.zeros((-1, 2)),), {}))
-    wait([compile_ahead(refusing, lambda: ((jnp.zeros((1, 2)),), {}))])
-    with pytest.raises(ValueError, match="no such search"):
-        compiled(refusing)(points[0])
-
-
 def test_unknown_options_are_omitted(monkeypatch):
     assert compilation._options_for("gpu") == {}
     known = "xla_disable_hlo_passes"
@@ -115,30 +77,3 @@ def test_the_options_do_not_raise_the_level_that_the_user_lowered():
 def test_changes_to_the_returned_options_have_no_effect():
     compiler_options()["xla_something"] = True
     assert "xla_something" not in compiler_options()
-
-
-@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="memory maps are counted on Linux only")
-def test_programs_are_released_when_they_use_many_memory_maps(monkeypatch):
-    traced = []
-
-    def total(values):
-        traced.append(values)
-        return jnp.sum(values)
-
-    for part, times in ((0.25, 1), (0.0, 2), (0.25, 2)):
-        monkeypatch.setattr(compilation, "_LARGEST_SHARE", part)
-        compiled(total)(jnp.zeros(7))
-        release_programs()
-        compiled(total)(jnp.zeros(7))
-        assert len(traced) == times
-
-
-def test_a_stage_that_was_compiled_ahead_is_not_compiled_again():
-    mesh = body_with_arms(2)
-    spectrum = compute_spectrum(mesh, 12)
-    stage, n = Stage(number_of_eigenvectors=10, iterations=1), len(mesh.vertices)
-    programs = compilation._compiled(refine, jax.default_backend())._programs
-    before = set(programs)
-    compile_stage(stage, n, n)
-    outcome = run([stage], SpectralPair(spectrum, spectrum), Start(np.arange(n)))
-    assert outcome.successful and len(set(programs) - before) == 1

@@ -2,7 +2,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import TypeCheckError
 from scipy.spatial.distance import cdist
 from synthetic import random_spectrum, stacked
 
@@ -55,7 +54,7 @@ def predicted(moments_xx, moments_xy, moments_yy):
 
 
 @pytest.mark.parametrize("partial", [False, True], ids=["full", "partial"])
-def test_refinement_agrees_with_the_definition(pair, partial):
+def test_refinement_agrees_with_the_definition(pair, partial, refine):
     """The reference computes two iterations without whitening, masks or blocks."""
     x, y, initial_map, _ = pair
     a, b = features(x), features(y)
@@ -93,7 +92,7 @@ def test_refinement_agrees_with_the_definition(pair, partial):
     np.testing.assert_allclose(found.history.energy[1], per_feature, rtol=1e-8)
 
 
-def test_recovers_a_copy_with_mixed_features_better_with_descriptors(pair):
+def test_recovers_a_copy_with_mixed_features_better_with_descriptors(pair, refine):
     x, y, initial_map, truth = pair
     found = refine(x, y, initial_map, refiner=FeatureRegression(), iterations=5)
     assert found.result == RESULTS.successful
@@ -110,7 +109,7 @@ def test_recovers_a_copy_with_mixed_features_better_with_descriptors(pair):
     )
 
 
-def test_a_level_equals_a_truncated_spectrum(pair):
+def test_a_level_equals_a_truncated_spectrum(pair, refine):
     x, y, initial_map, _ = pair
     found = refine(x, y, initial_map, refiner=FeatureRegression((5, 5, 5)), iterations=3)
     truncated = refine(x.truncate(5), y.truncate(5), initial_map, refiner=FeatureRegression(), iterations=3)
@@ -119,7 +118,7 @@ def test_a_level_equals_a_truncated_spectrum(pair):
     assert not found.functional_map[5:].any() and not found.functional_map[:, 5:].any()
 
 
-def test_levels_are_proportionally_smaller_on_the_smaller_spectrum(pair):
+def test_levels_are_proportionally_smaller_on_the_smaller_spectrum(pair, refine):
     x, y, initial_map, _ = pair
     found = refine(x.truncate(6), y, initial_map, refiner=FeatureRegression((4,)), iterations=1)
     assert found.functional_map.shape == (6, K)
@@ -127,38 +126,20 @@ def test_levels_are_proportionally_smaller_on_the_smaller_spectrum(pair):
     assert not found.functional_map[2:].any() and not found.functional_map[:, 4:].any()
 
 
-def test_does_not_stop_before_the_last_level(pair):
+def test_does_not_stop_before_the_last_level(pair, refine):
     x, y, initial_map, _ = pair
     refiner = FeatureRegression((3, 3, 3, 3, 3, 3, 3, 3))
     found = refine(x, y, initial_map, refiner=refiner, iterations=40, stop_when_unchanged=True)
     assert 9 < found.iterations < 40
 
 
-def test_samples_are_queries_and_all_vertices_are_targets(pair):
+def test_samples_are_queries_and_all_vertices_are_targets(pair, refine):
     x, y, initial_map, truth = pair
     samples = jnp.arange(0, M, 2), jnp.arange(1, M, 2)
     found = refine(
         x, y, initial_map, refiner=FeatureRegression(), iterations=4, samples=(samples[0], samples[1])
     )
     assert np.mean(np.asarray(found.pointwise_map) == truth) > 0.9
-
-
-@pytest.mark.slow
-def test_search_in_patches_ignores_descriptors(pair):
-    x, y, initial_map, truth = pair
-    maps = [
-        refine(x, y, initial_map, refiner=FeatureRegression(search=search), iterations=1).pointwise_map
-        for search in ("exhaustive", "patches")
-    ]
-    blind = refine(
-        x.with_descriptors(None),
-        y.with_descriptors(None),
-        initial_map,
-        refiner=FeatureRegression(),
-        iterations=1,
-    )
-    np.testing.assert_array_equal(maps[1], blind.pointwise_map)
-    assert np.mean(np.asarray(maps[0]) == truth) > np.mean(np.asarray(maps[1]) == truth)
 
 
 def test_vmap_equals_a_loop(pair):
@@ -182,18 +163,16 @@ def test_arrays_with_a_wrong_number_of_rows_are_refused(pair):
         x.with_positions(jnp.zeros((M - 1, 3)), jnp.zeros((M - 1, 3)))
 
 
-def test_nan_in_descriptors_is_reported(pair):
+def test_nan_in_descriptors_is_reported(pair, refine):
     x, y, initial_map, _ = pair
     broken = x.with_descriptors(x.descriptors.at[3, 1].set(jnp.nan))
     found = refine(broken, y, initial_map, refiner=FeatureRegression())
     assert found.result == RESULTS.nonfinite_spectrum and (np.asarray(found.pointwise_map) == -1).all()
 
 
-def test_invalid_descriptors_and_settings_are_refused(pair):
+def test_invalid_descriptors_and_settings_are_refused(pair, refine):
     x, y, initial_map, _ = pair
     with pytest.raises(ValueError, match="X has 5 descriptors and Y has 0"):
         refine(x, y.with_descriptors(None), initial_map, refiner=FeatureRegression())
     with pytest.raises(ValueError, match="needs at least 1 eigenvector"):
         FeatureRegression((20, 0))
-    with pytest.raises((ValueError, TypeCheckError), match="search"):
-        FeatureRegression(search="quick")

@@ -35,11 +35,6 @@ SOLUTIONS = {
 }
 REFINERS = {name: WaveletPreservation(solution=solution) for name, solution in SOLUTIONS.items()}
 REFINERS |= {"regression": FeatureRegression(), "registration": Registration()}
-PATCHES = {
-    "wavelets in patches": WaveletPreservation(search="patches"),
-    "regression in patches": FeatureRegression(search="patches"),
-    "registration in patches": Registration(search="patches"),
-}
 
 
 def batch_of_pairs(vertices, eigenvectors, dtype=np.float32):
@@ -59,7 +54,7 @@ def refine_batch(name, vertices, eigenvectors):
     x, y, maps = batch_of_pairs(vertices, eigenvectors)
 
     def run(x, y, t):
-        return refine(x, y, t, refiner=(REFINERS | PATCHES)[name])
+        return refine(x, y, t, refiner=REFINERS[name])
 
     for _ in range(3):
         batch = jax.block_until_ready(jax.vmap(run)(x, y, maps))
@@ -91,15 +86,13 @@ def lapack_calls(function, *arguments):
     return re.findall(r'@lapack_.*num_batch_dims = "(\d+)"', text)
 
 
-@pytest.mark.parametrize(
-    "name", first_always(["registration", *sorted({*REFINERS, *PATCHES} - {"registration"})])
-)
+@pytest.mark.parametrize("name", first_always(sorted(REFINERS, key=lambda name: name != "registration")))
 def test_batches_of_pairs_call_lapack_matrix_by_matrix(name):
     x, y, maps = batch_of_pairs(40, 6)
-    samples = None if name in PATCHES else (jnp.arange(0, 40, 2), jnp.arange(1, 40, 2))
+    samples = jnp.arange(0, 40, 2), jnp.arange(1, 40, 2)
 
     def run(x, y, t, partial=False):
-        refiner = (REFINERS | PATCHES)[name]
+        refiner = REFINERS[name]
         return refine(x, y, t, refiner=refiner, samples=samples, partial=partial, history=True)
 
     calls = lapack_calls(jax.vmap(run), x, y, maps)
@@ -191,13 +184,6 @@ def test_factorisations_and_their_derivatives_equal_those_of_jax(name):
         found, reference = (jax.jit(transform(f))(*arguments) for f in (function, expected))
         np.testing.assert_allclose(found, reference, rtol=1e-9, atol=1e-11)
         assert set(lapack_calls(transform(function), *arguments)) == {"0"}
-
-
-def test_orthonormal_columns_span_the_same_space():
-    vectors = jnp.asarray(np.random.default_rng(0).normal(size=(BATCH, 9, 4)))
-    bases = jax.vmap(linear_algebra.orthonormal_columns)(vectors)
-    np.testing.assert_allclose(bases.mT @ bases, jnp.broadcast_to(jnp.eye(4), (BATCH, 4, 4)), atol=1e-12)
-    np.testing.assert_allclose(bases @ (bases.mT @ vectors), vectors, atol=1e-12)
 
 
 if __name__ == "__main__":

@@ -30,17 +30,6 @@ def test_decode_finds_nearest_neighbours_and_the_objective_is_their_distance(con
     assert worse > objective
 
 
-@pytest.mark.slow
-def test_decode_with_patches_gives_the_same_map():
-    x, y = random_spectrum(200, 30, seed=1), random_spectrum(180, 30, seed=2).pad(256)
-    functional_map = jnp.asarray(np.random.default_rng(0).normal(size=(30, 30)))
-    for convention in ("pullback", "pushforward"):
-        plain, in_patches = (
-            decode(functional_map, x, y, convention=convention, patches=patches) for patches in (None(x, y))
-        )
-        np.testing.assert_array_equal(plain, in_patches)
-
-
 @pytest.mark.parametrize("convention", ["pullback", "pushforward"])
 def test_decode_to_triangles_is_never_farther_than_decode(convention):
     x, y = random_spectrum(40, 8, seed=1), random_spectrum(30, 6, seed=2)

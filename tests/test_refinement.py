@@ -73,7 +73,7 @@ SIMPLEST_FIRST = first_always(
 )
 
 
-def test_recovers_a_disturbed_copy(pair):
+def test_recovers_a_disturbed_copy(pair, refine):
     x, y, initial_map, truth = pair
     refined = refine(x, y, initial_map, iterations=5)
     assert refined.result == RESULTS.successful
@@ -87,7 +87,7 @@ def test_recovers_a_disturbed_copy(pair):
         sorted(REFINERS, key=lambda name: name not in ("default", "exact", "regularized")), always=3
     ),
 )
-def test_refine_equals_a_plain_loop(pair, name):
+def test_refine_equals_a_plain_loop(pair, name, refine):
     x, y, initial_map, _ = pair
     refiner = REFINERS[name]
     problem = refiner.problem(x, y)
@@ -109,7 +109,7 @@ def test_refine_equals_a_plain_loop(pair, name):
 
 
 @pytest.mark.parametrize("name", [name for name in REFINERS if name != "default"])
-def test_every_option_changes_the_result(name):
+def test_every_option_changes_the_result(name, refine):
     x, y = random_spectrum(M, K, seed=1), random_spectrum(M, K, seed=2)
     y = eqx.tree_at(lambda s: s.eigenvalues, y, y.eigenvalues * 1.5)
     initial_map = jnp.asarray(np.random.default_rng(0).integers(0, M, M))
@@ -146,7 +146,7 @@ def test_products_use_the_highest_precision(pair, refiner):
 
 
 @pytest.mark.parametrize("name", SIMPLEST_FIRST)
-def test_signs_of_eigenvectors_do_not_matter(pair, name):
+def test_signs_of_eigenvectors_do_not_matter(pair, name, refine):
     x, y, initial_map, _ = pair
     refiner = ALL_REFINERS[name]
     generator = np.random.default_rng(4)
@@ -160,7 +160,7 @@ def test_signs_of_eigenvectors_do_not_matter(pair, name):
     )
 
 
-def test_basis_within_an_eigenspace_does_not_matter(pair):
+def test_basis_within_an_eigenspace_does_not_matter(pair, refine):
     """The two eigenvectors of a double eigenvalue are determined only up to a rotation."""
     x, y, initial_map, _ = pair
     x, y = (
@@ -175,7 +175,7 @@ def test_basis_within_an_eigenspace_does_not_matter(pair):
     )
 
 
-def test_renumbering_vertices_renumbers_the_map(pair):
+def test_renumbering_vertices_renumbers_the_map(pair, refine):
     x, y, initial_map, _ = pair
     generator = np.random.default_rng(4)
     order_x, order_y = generator.permutation(M), generator.permutation(M)
@@ -187,7 +187,7 @@ def test_renumbering_vertices_renumbers_the_map(pair):
 
 
 @pytest.mark.parametrize("factor", [1e-2, 1e3])
-def test_common_scale_does_not_matter(pair, factor):
+def test_common_scale_does_not_matter(pair, factor, refine):
     x, y, initial_map, _ = pair
     scaled = [
         Spectrum(s.eigenvalues / factor**2, s.eigenvectors / factor, s.vertex_areas * factor**2, s.mask)
@@ -199,7 +199,7 @@ def test_common_scale_does_not_matter(pair, factor):
 
 
 @pytest.mark.parametrize("name", SIMPLEST_FIRST)
-def test_padding_changes_nothing(pair, name):
+def test_padding_changes_nothing(pair, name, refine):
     x, y, initial_map, _ = pair
     refiner = ALL_REFINERS[name]
     plain = refine(x, y, initial_map, refiner=refiner, history=True)
@@ -212,7 +212,7 @@ def test_padding_changes_nothing(pair, name):
         )
 
 
-def test_different_numbers_of_vertices_and_eigenvectors():
+def test_different_numbers_of_vertices_and_eigenvectors(refine):
     x, y = random_spectrum(80, 12, seed=1), random_spectrum(90, 10, seed=2)
     initial_map = jnp.asarray(np.random.default_rng(0).integers(0, 90, 80))
     refined = refine(x, y, initial_map)
@@ -221,7 +221,7 @@ def test_different_numbers_of_vertices_and_eigenvectors():
     assert refine(x, y, initial_map, refiner=REFINERS["pushforward"]).functional_map.shape == (10, 12)
 
 
-def test_history_describes_every_iteration(pair):
+def test_history_describes_every_iteration(pair, refine):
     x, y, initial_map, _ = pair
     refiner = WaveletPreservation()
     maps = [initial_map, *(refine(x, y, initial_map, iterations=i).pointwise_map for i in range(1, 5))]
@@ -237,7 +237,7 @@ def test_history_describes_every_iteration(pair):
     assert refine(x, y, initial_map).history is None
 
 
-def test_stops_when_the_map_no_longer_changes(pair):
+def test_stops_when_the_map_no_longer_changes(pair, refine):
     x, y, initial_map, _ = pair
     patient = refine(x, y, initial_map, iterations=40)
     stopped = refine(x, y, initial_map, iterations=40, stop_when_unchanged=True, history=True)
@@ -251,7 +251,7 @@ def test_stops_when_the_map_no_longer_changes(pair):
     assert np.all(np.asarray(stopped.history.pointwise_maps[done:]) == np.asarray(stopped.pointwise_map))
 
 
-def test_refinement_iterates_on_samples_and_ends_on_all_vertices(pair):
+def test_refinement_iterates_on_samples_and_ends_on_all_vertices(pair, refine):
     x, y, initial_map, _ = pair
     generator = np.random.default_rng(1)
     samples_x, samples_y = (jnp.asarray(generator.choice(M, 60, replace=False)) for _ in range(2))
@@ -272,7 +272,7 @@ def test_refinement_iterates_on_samples_and_ends_on_all_vertices(pair):
 
 
 @pytest.mark.slow
-def test_refinement_can_start_and_end_on_samples(pair):
+def test_refinement_can_start_and_end_on_samples(pair, refine):
     x, y, initial_map, _ = pair
     generator = np.random.default_rng(1)
     samples = tuple(jnp.asarray(generator.choice(M, 60, replace=False)) for _ in range(2))
@@ -300,7 +300,7 @@ def test_refinement_can_start_and_end_on_samples(pair):
     assert invalid.result == RESULTS.invalid_initial_map
 
 
-def test_refinement_that_starts_in_full_and_ends_on_samples_has_no_first_change(pair):
+def test_refinement_that_starts_in_full_and_ends_on_samples_has_no_first_change(pair, refine):
     x, y, initial_map, _ = pair
     samples = (jnp.arange(0, M, 4), jnp.arange(1, M, 4))
     options = dict(refiner=FeatureRegression(), iterations=3, samples=samples, history=True)
@@ -322,7 +322,7 @@ def test_refinement_that_starts_in_full_and_ends_on_samples_has_no_first_change(
     ],
     ids=str,
 )
-def test_starting_and_ending_on_samples_is_refused_without_them(pair, options, fault):
+def test_starting_and_ending_on_samples_is_refused_without_them(pair, options, fault, refine):
     x, y, initial_map, _ = pair
     with pytest.raises(ValueError, match=fault):
         refine(x, y, initial_map, **options)
@@ -387,7 +387,7 @@ def test_compiles_once_per_size_and_setting():
     assert len(traces) > traced
 
 
-def test_float32_in_float32_out():
+def test_float32_in_float32_out(refine):
     x, y = (random_spectrum(M, K, seed=s, dtype=np.float32) for s in (0, 1))
     refined = refine(x, y, jnp.zeros(M, jnp.int32), history=True)
     assert refined.functional_map.dtype == jnp.float32
@@ -405,7 +405,7 @@ def test_float32_in_float32_out():
         (lambda x, y, t: (eqx.tree_at(lambda s: s.vertex_areas, x, x.vertex_areas * 1e307), eqx.tree_at(lambda s: s.eigenvectors, y, y.eigenvectors * 1e10), t), RESULTS.nonfinite_functional_map),
     ],
 )  # fmt: skip
-def test_failures_are_reported_and_return_no_map(pair, damage, result):
+def test_failures_are_reported_and_return_no_map(pair, damage, result, refine):
     x, y, initial_map, _ = pair
     refined = refine(*damage(x, y, initial_map), iterations=4, history=True)
     assert refined.result == result
@@ -413,7 +413,7 @@ def test_failures_are_reported_and_return_no_map(pair, damage, result):
     assert len(RESULTS[result]) > 40
 
 
-def test_an_early_failure_is_reported(pair):
+def test_an_early_failure_is_reported(pair, refine):
     """Successful iterations do not hide an earlier failure."""
 
     class FailsAtFirst(WaveletPreservation):
@@ -425,7 +425,7 @@ def test_an_early_failure_is_reported(pair):
     assert refine(x, y, initial_map, refiner=FailsAtFirst()).result == RESULTS.singular_system
 
 
-def test_too_few_samples_are_reported(pair):
+def test_too_few_samples_are_reported(pair, refine):
     x, y, initial_map, _ = pair
     few = jnp.arange(5)
     refined = refine(x, y, initial_map, samples=(few, few))
@@ -443,7 +443,7 @@ def test_unknown_settings_are_refused():
             maker(**{name: "pullbakc"})
 
 
-def test_the_initial_map_needs_one_match_per_vertex(pair):
+def test_the_initial_map_needs_one_match_per_vertex(pair, refine):
     x, y, initial_map, _ = pair
     with pytest.raises(ValueError, match="X has 300 vertices"):
         refine(x, y, initial_map[:10])
@@ -479,7 +479,7 @@ def test_default_embeddings_follow_the_convention_of_the_refiner(pair):
     np.testing.assert_array_equal(database, y.eigenvectors)
 
 
-def test_an_undetermined_functional_map_is_reported(pair):
+def test_an_undetermined_functional_map_is_reported(pair, refine):
     class Nothing(FilterBank):
         def __call__(self, points, eigenvalues):
             return jnp.zeros((2, len(points)))
@@ -492,13 +492,13 @@ def test_an_undetermined_functional_map_is_reported(pair):
 
 
 @pytest.mark.parametrize("kind", [float, bool])
-def test_initial_maps_of_other_types_than_integers_are_refused(pair, kind):
+def test_initial_maps_of_other_types_than_integers_are_refused(pair, kind, refine):
     x, y, _, initial_map = pair
     with pytest.raises(TypeError, match=r"must be integer vertex indices|pointwise_map"):
         refine(x, y, jnp.asarray(initial_map).astype(kind), refiner=WaveletPreservation(), iterations=1)
 
 
-def test_spectra_of_different_float_types_are_refused(pair):
+def test_spectra_of_different_float_types_are_refused(pair, refine):
     x, y, initial_map, _ = pair
     single = in_precision(x, np.float32)
     with refused("spectrum of X", "float32", "spectrum of Y", "float64", error=ValueError):

@@ -28,8 +28,9 @@ else:
 
 def is_traced(*arrays: object) -> bool:
     """Return whether at least one of the arguments is an array of JAX, so that JAX computes with it."""
-    jax = sys.modules.get("jax")
-    return jax is not None and any(isinstance(array, jax.Array) for array in arrays)
+    # While another thread imports JAX, the module exists, but has no attributes yet.
+    kind = getattr(sys.modules.get("jax"), "Array", ())
+    return any(isinstance(array, kind) for array in arrays)
 
 
 def is_array(value: object) -> bool:

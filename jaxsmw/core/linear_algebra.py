@@ -66,7 +66,7 @@ def solve_positive_definite(matrix: Float[Array, "k k"], right: Float[Array, "k 
 @_or_traced
 def symmetric_eigenvalues(matrix: Float[Array, "k k"]) -> Float[Array, " k"]:
     """Return the eigenvalues of a symmetric matrix in ascending order."""
-    return np.linalg.eigvalsh(matrix)
+    return np.linalg.eigvalsh(matrix) if np.isfinite(matrix).all() else np.full_like(matrix[0], np.nan)
 
 
 @_or_traced

@@ -159,7 +159,9 @@ def refine(
     _check_arguments(spectrum_x, spectrum_y, pointwise_map, refiner, samples)
     check_samples_use(refiner, samples is not None, starts_on_samples, ends_on_samples)
     xp = namespace(spectrum_x.eigenvectors, spectrum_y.eigenvectors, pointwise_map)
-    pointwise_map = pointwise_map.astype(xp.int32)
+    # `diagnose` reports invalid matches. NumPy would raise an error for an index out of range.
+    initial_map, last = pointwise_map.astype(xp.int32), spectrum_y.mask.shape[0] - 1
+    pointwise_map = xp.clip(initial_map, 0, last)
     problem = Problem(spectrum_x, spectrum_y, samples, partial)
     prepared = in_full = refiner.prepare(dataclasses.replace(problem, samples=None))
     used, first_map = spectrum_x.mask, pointwise_map
@@ -198,7 +200,7 @@ def refine(
     if samples is not None and not starts_on_samples:
         # The first map of the samples has no predecessor either.
         records = records._replace(changed=replaced(records.changed, slice(1), xp.nan))
-    result = diagnose(spectrum_x, spectrum_y, pointwise_map, progress.result, used)
+    result = diagnose(spectrum_x, spectrum_y, initial_map, progress.result, used)
     successful = result == RESULTS.successful
     refined = xp.where(successful, refined, -1)
     if records.pointwise_maps is not None:

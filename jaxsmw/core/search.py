@@ -45,7 +45,7 @@ class SearchProblem(NamedTuple):
 
     queries: Float[Array, "m d"]
     database: Float[Array, "n d"]
-    database_mask: Bool[Array, " n"]
+    database_mask: Bool[Array, " n"] | None = None
 
 
 def nearest_in_both(
