@@ -261,8 +261,8 @@ def test_commands_cache_compiled_programs(tmp_path):
     assert compiled("off") == [] and not cache.exists()
     assert compiled(str(cache)) == []
     (programs,) = cache.glob("programs-*")
-    assert len(list(programs.glob("*-cache"))) > 5
-    assert len(compiled(str(cache))) > 5
+    assert list(programs.glob("*-cache"))
+    assert compiled(str(cache))
 
 
 @pytest.fixture

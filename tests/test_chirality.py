@@ -9,6 +9,7 @@ from synthetic import bumpy_mesh
 import jaxsmw
 from jaxsmw import Mesh, Pair, creature_pair, make_mesh, match, paired_spectra
 from jaxsmw.geometry.shot import mirrored_descriptors, shot_descriptors
+from jaxsmw.matching.search import chirality
 from jaxsmw.matching.search.chirality import (
     ASYMMETRIC_FROM,
     ASYMMETRY_DOUBT,
@@ -160,6 +161,15 @@ def test_a_shape_that_is_its_own_mirror_image_has_no_asymmetry(lump):
         assert Hands(mirrored, *paired_spectra(mirrored, 20)).asymmetry() == pytest.approx(
             asymmetry, abs=0.02
         )
+
+
+def test_the_asymmetry_of_a_known_mesh_is_not_computed_again(lump, monkeypatch, tmp_path):
+    monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path))
+    pair = Pair.make(lump, turned(lump))
+    hands = Hands(pair, *paired_spectra(pair, 20))
+    first = hands.asymmetry()
+    monkeypatch.setattr(chirality, "shot_descriptors", lambda *_, **__: pytest.fail("computed again"))
+    assert hands.asymmetry() == first
 
 
 def test_symmetric_shapes_are_not_compared(lump, monkeypatch):

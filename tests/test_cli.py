@@ -88,8 +88,8 @@ def test_the_help_states_the_defaults_of_the_library(run):
     assert f"map:FILE (default: {defaults['init']})" in words["match"]
     assert f"X_Y.map (default: {Settings().init})" in words["benchmark"]
     assert words["match"].count("(default: auto)") == 5
-    automatic = [defaults[name] for name in ("init", "laplacian", "eigensolver", "mirror")]
-    assert [*automatic, WaveletPreservation().search] == ["auto"] * 5
+    automatic = [defaults[name] for name in ("init", "laplacian", "eigensolver", "mirror", "backend")]
+    assert automatic == ["auto"] * 5
     eigenvectors = inspect.signature(compute_spectrum).parameters["number_of_eigenvectors"].default
     assert f"number of eigenvectors (default: {eigenvectors})" in words["spectrum"]
     assert f"eigenvectors per shape (default: {Stage().number_of_eigenvectors})" in words["match"]
@@ -656,7 +656,6 @@ def failing_match(monkeypatch) -> str:
         ["--solution", "least-squares"],
         ["--iterations", "1"],
         ["--samples", "500"],
-        ["--search", "exhaustive"],
         ["--stop-when-unchanged"],
     ],
     ids=" ".join,

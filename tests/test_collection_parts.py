@@ -34,8 +34,8 @@ from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.executor import run, run_batches
 from jaxsmw.matching.outcome import Start
-from jaxsmw.matching.preparation import prepare_shapes
 from jaxsmw.matching.search.chirality import Decision
+from jaxsmw.matching.shape import prepare_shapes
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
 
@@ -376,7 +376,8 @@ def test_batches_are_not_refined_a_second_time(three, monkeypatch):
 def test_the_first_failure_of_a_batch_is_reported(three, monkeypatch):
     """Later stages start from the map of the failure, and must not hide its reason."""
     shape = prepare_shape(three[0], PRESETS["paper"], "exact")
-    eigenvectors = shape.spectrum.eigenvectors.at[0, 0].set(jnp.nan)
+    eigenvectors = shape.spectrum.eigenvectors.copy()
+    eigenvectors[0, 0] = np.nan
     broken = SpectralPair(shape.spectrum, replace(shape.spectrum, eigenvectors=eigenvectors))
     identity = np.arange(len(three[0].vertices))
     (outcome,) = run_batches([Stage(), Stage()], [(broken, Start(identity))], batch_size=1)

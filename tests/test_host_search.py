@@ -10,12 +10,12 @@ from jaxsmw.core.search import SearchProblem
 from jaxsmw.core.search import nearest_neighbor as nearest_neighbor_jax
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 
-METHODS = ["exhaustive", "tree"]
+METHODS = ["exhaustive", "tree", "clusters"]
 
 
 @pytest.fixture(params=METHODS)
 def method(request, monkeypatch):
-    """Force one of the two searches."""
+    """Force one of the searches."""
     force(monkeypatch, request.param)
     return request.param
 
@@ -27,6 +27,14 @@ def force(monkeypatch, method):
         monkeypatch.setattr(host_search, "_LEAF", 1)
     else:
         monkeypatch.setattr(host_search, "_SHARE", -1)
+    if method == "clusters":
+        for name, value in (
+            ("_CLUSTERED_FROM", 1),
+            ("_POINTS_PER_QUERY", 10**6),
+            ("_NEEDED", np.inf),
+            ("_CLUSTER", 10),
+        ):
+            monkeypatch.setattr(host_search, name, value)
 
 
 def brute_force(queries, database):
@@ -105,10 +113,12 @@ def test_indices_are_in_range_for_nan_and_for_masks_without_rows(method):
     generator = np.random.default_rng(0)
     queries, database = generator.normal(size=(300, 4)), generator.normal(size=(50, 4))
     queries[::2] = np.nan
+    huge = nearest_neighbor(1e200 * database, 1e200 * database)
     nearest = nearest_neighbor(queries, database)
     np.testing.assert_array_equal(nearest[1::2], brute_force(queries[1::2], database))
     database[7] = np.nan
     for result in (
+        huge,
         nearest,
         nearest_neighbor(queries, database),
         nearest_neighbor(queries, database, np.zeros(50, bool)),
@@ -145,7 +155,7 @@ def embeddings(spectrum):
 
 @pytest.mark.parametrize("name", ["registration", "wavelets"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_both_methods_and_jax_give_the_same_on_surfaces(spaces, name, dtype, monkeypatch):
+def test_all_methods_and_jax_give_the_same_on_surfaces(spaces, name, dtype, monkeypatch):
     queries, database = (points.astype(dtype) for points in spaces[name])
     exact = brute_force(queries, database)
     for method in METHODS:
@@ -153,6 +163,21 @@ def test_both_methods_and_jax_give_the_same_on_surfaces(spaces, name, dtype, mon
         np.testing.assert_array_equal(nearest_neighbor(queries, database), exact)
     same = np.asarray(nearest_neighbor_jax(jnp.asarray(queries), jnp.asarray(database))) == exact
     assert np.mean(same) > 0.999
+
+
+def test_most_clusters_are_excluded():
+    points = np.asarray(compute_spectrum(bumpy_mesh(5), 30).eigenvectors)
+    clusters = host_search._Clusters.of(points, np.arange(len(points)), points.mean(axis=0))
+    block = host_search._halved(points, 128)[3]
+    assert len(clusters.needed(points[block])) < 0.15 * len(clusters.members)
+    np.testing.assert_array_equal(clusters.search(points[block]), block)
+
+
+def test_groups_contain_all_points():
+    points = np.random.default_rng(0).normal(size=(1001, 3))
+    groups = host_search._halved(points, 40)
+    assert groups.shape == (32, 32)
+    assert set(groups.ravel()) == set(range(1001))
 
 
 @pytest.mark.parametrize(("name", "expected"), [("registration", "_by_tree"), ("wavelets", "_exhaustive")])

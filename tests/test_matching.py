@@ -2,7 +2,6 @@ import inspect
 import logging
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.functional_map import encode, multiscale_kernel
-from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiner import State
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
@@ -28,7 +26,7 @@ from jaxsmw.geometry import eigenbasis
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching import preparation
+from jaxsmw.matching import descriptors, shape
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.match import match, refine_and_judge
 from jaxsmw.matching.pair import Pair
@@ -73,7 +71,7 @@ def test_invalid_arguments_are_refused_before_eigenbases_are_computed(pair, opti
     def refuse(*_, **__):
         raise AssertionError("eigenpairs were computed")
 
-    monkeypatch.setattr("jaxsmw.matching.preparation.eigenpairs", refuse)
+    monkeypatch.setattr("jaxsmw.matching.shape.eigenpairs", refuse)
     mesh_x, mesh_y, _ = pair
     if options == {"partial": True}:
         mesh_y = make_mesh(1000 * mesh_y.vertices, mesh_y.faces)
@@ -103,8 +101,8 @@ def test_initial_maps_of_large_meshes_use_samples(pair, init, monkeypatch):
     if not isinstance(init, str):
         init = np.array([[i, truth[i]] for i, _ in init])
     spectra = paired_spectra(Pair(mesh_x, mesh_y), 30)
-    monkeypatch.setattr(preparation, "_COMPARED", 800)
-    monkeypatch.setattr(preparation, "_COMPARED_FROM", 700)
+    monkeypatch.setattr(shape, "_COMPARED", 800)
+    monkeypatch.setattr(shape, "_COMPARED_FROM", 700)
     start = initial_map(Pair(mesh_x, mesh_y), *spectra, init=init)
     compared = np.unique(start)
     assert 100 < len(compared) < 1000
@@ -136,19 +134,21 @@ def test_the_approximate_eigenbasis_is_nearly_as_accurate(pair):
     assert errors[1] < errors[0] + 0.003
 
 
+def test_both_backends_give_the_same_map(pair):
+    mesh_x, mesh_y, truth = pair
+    by_numpy, by_jax = (
+        match(mesh_x, mesh_y, preset="accurate", mirror="no", backend=name) for name in ("numpy", "jax")
+    )
+    assert [found.backend for found in (by_numpy, by_jax)] == ["numpy", "jax"]
+    assert (by_numpy.pointwise_map == by_jax.pointwise_map).mean() > 0.99
+    errors = [mean_error(mesh_y, found.pointwise_map, truth) for found in (by_numpy, by_jax)]
+    assert errors[0] == pytest.approx(errors[1], abs=1e-4)
+
+
 def test_results_are_reproducible_bit_for_bit(pair):
     first, second = (match(*pair[:2], **OPTIONS) for _ in range(2))
     np.testing.assert_array_equal(first.pointwise_map, second.pointwise_map)
     np.testing.assert_array_equal(first.functional_map, second.functional_map)
-
-
-@pytest.mark.parametrize("samples", [None, 200])
-@pytest.mark.usefixtures("no_programs")
-def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samples):
-    with jax.log_compiles(), caplog.at_level(logging.WARNING):
-        match(*pair[:2], preset=replace(STAGE, number_of_samples=samples), mirror="no")
-    # jax.log_compiles applies to this thread only, so compilation in another thread is not logged.
-    assert "XLA compilation of" in caplog.text and "jit(refine)" not in caplog.text
 
 
 @pytest.mark.slow
@@ -165,8 +165,7 @@ def test_refinement_is_compiled_while_eigenbases_are_computed(pair, caplog, samp
 )
 @pytest.mark.usefixtures("no_programs")
 def test_no_program_of_a_stage_is_compiled_twice(pair, preset, programs, compilations):
-    """Refinement uses the programs that `match` compiles ahead of time."""
-    match(*pair[:2], preset=preset, init="shot", mirror="no")
+    match(*pair[:2], preset=preset, init="shot", mirror="no", backend="jax")
     assert compilations.count("jit(refine)") == programs
 
 
@@ -176,17 +175,16 @@ def test_coarse_passes_share_one_program(pair, compilations):
     """The levels are an argument of the program, so only their number and the largest level matter."""
     accurate = PRESETS["accurate"]
     always = replace(accurate, repair=replace(accurate.repair, non_isometric=0.0, coarse_from=0.0))
-    found = match(*pair[:2], preset=always, init="shot", mirror="no")
+    found = match(*pair[:2], preset=always, init="shot", mirror="no", backend="jax")
     assert len(accurate.repair.coarse_levels) == 2
     assert compilations.count("jit(refine)") == len(found.preset.stages) + 1
 
 
 @pytest.mark.sampled
 def test_the_reverse_map_of_registration_compares_all_columns():
-    """The search in patches, which large meshes use, also compares columns that are not eigenvectors."""
     creature = creature_pair(vertices=3100)
     truth = creature.truth.nearest_corners(creature.target)
-    refiner = Registration((20, 30), search="patches")
+    refiner = Registration((20, 30))
     stage = Stage(refiner, number_of_eigenvectors=30, number_of_samples=400)
     found = match(creature.source, creature.target, preset=stage, init=truth, mirror="no")
     queries, database = (np.asarray(points) for points in found._embeddings())
@@ -204,37 +202,21 @@ def test_the_reverse_map_of_registration_compares_all_columns():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("search", first_always(["exhaustive", "patches"]))
+@pytest.mark.parametrize("backend", first_always(["numpy", "jax"]))
 @pytest.mark.parametrize(
     "refiner", [WaveletPreservation, FeatureRegression, Registration], ids=lambda r: r.__name__
 )
-def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, search):
+def test_forward_and_reverse_maps_search_the_same_space(pair, refiner, backend):
     mesh_x, mesh_y, truth = pair
-    stage = Stage(refiner(search=search), number_of_eigenvectors=30)
-    found = match(mesh_x, mesh_y, preset=stage, init=truth, mirror="no")
+    stage = Stage(refiner(), number_of_eigenvectors=30)
+    found = match(mesh_x, mesh_y, preset=stage, init=truth, mirror="no", backend=backend)
+    assert found.backend == backend
     points = [np.asarray(p) for p in found._embeddings()]
     # Registration also compares columns that are not eigenvectors.
     assert (points[1].shape[1] > found.functional_map.shape[0]) == (refiner is Registration)
     reverse = found._last.reverse_map()
     np.testing.assert_array_equal(found.pointwise_map, KDTree(points[1]).query(points[0])[1])
     np.testing.assert_array_equal(reverse, KDTree(points[0]).query(points[1])[1])
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
-def test_pairs_of_similar_size_share_compiled_programs(caplog):
-    pairs = [creature_pair(vertices=vertices) for vertices in (700, 720)]
-    assert len({len(mesh.vertices) for pair in pairs for mesh in (pair.source, pair.target)}) == 4
-    match(pairs[0].source, pairs[0].target, preset=STAGE)
-    with jax.log_compiles(), caplog.at_level(logging.WARNING):
-        found = match(pairs[1].source, pairs[1].target, preset=STAGE, history=False)
-    assert "jit(pad)" in caplog.text  # JAX compiles the padding anew for each size
-    assert "jit(refine)" not in caplog.text and "jit(nearest_neighbor)" not in caplog.text
-    m = len(pairs[1].source.vertices)
-    assert found.refinement.pointwise_map.shape == found.spectrum_x.mask.shape == (m,)
-    assert found.initial_map.shape == found.pointwise_map.shape == (m,)
-    alone = refine(found.spectrum_x, found.spectrum_y, jnp.asarray(found.initial_map), **STAGE.settings())
-    assert (np.asarray(alone.pointwise_map) == found.pointwise_map).mean() > 0.99
 
 
 def test_scale_and_rotation_do_not_matter(pair, usual):
@@ -431,7 +413,7 @@ def test_fine_meshes_are_described_at_two_scales(pair, monkeypatch):
     mesh_x, mesh_y, truth = pair
     spectra = paired_spectra(Pair(mesh_x, mesh_y), 30)
     coarse = describe(Pair(mesh_x, mesh_y), *spectra, 60)
-    monkeypatch.setattr(preparation, "FINE_FROM", 1000)
+    monkeypatch.setattr(descriptors, "FINE_FROM", 1000)
     described = describe(Pair(mesh_x, mesh_y), *spectra, 60)
     assert described[0].descriptors.shape == coarse[0].descriptors.shape == (len(truth), 60)
     for x, y in (described, coarse):  # the mean square over both shapes is 1
@@ -508,10 +490,8 @@ def test_the_stages_for_large_meshes_are_as_accurate(pair, usual):
 
 
 @pytest.mark.slow
-def test_presets_fit_small_meshes(monkeypatch):
+def test_presets_fit_small_meshes():
     """A mesh of 162 vertices has neither 200 eigenvectors nor 1000 samples."""
-    # Nothing is compiled in a thread here, because Beartype (used only in tests) captures warnings in threads.
-    monkeypatch.setattr("jaxsmw.matching.match._compile_ahead", lambda *_: [])
     mesh = bumpy_mesh(2)
     with pytest.warns(UserWarning, match="continues without descriptors: .* coarse"):
         found = match(mesh, mesh, init=np.arange(162))
@@ -653,7 +633,7 @@ def test_surface_points_and_expected_errors_are_computed_once(pair, monkeypatch)
     points, expected = found.surface_points(), found.expected_error()
     copies = points.weights.copy(), expected.copy()
     points.faces[:], points.weights[:], expected[:] = -1, -1, -1  # a caller may change the results
-    for name in ("estimate_error", "nearest_points"):
+    for name in ("estimate_error", "nearest_point_on_candidates"):
         monkeypatch.delattr(f"jaxsmw.matching.correspondence.{name}")
     again = found.surface_points()
     np.testing.assert_array_equal(again.weights, copies[0])

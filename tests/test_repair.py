@@ -14,7 +14,6 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching import executor, spectral_pair
 from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import Judge, detours, distortion, overlap
 from jaxsmw.matching.match import match
@@ -107,17 +106,6 @@ def outcome(body, initial_map, repair=REPAIR, stages=(STAGE,), init="map"):
 def test_swapped_limbs_are_repaired(body, swapped):
     assert outcome(body, swapped, None)[0] > 0.1
     assert outcome(body, swapped)[0] < 0.02
-
-
-def test_padding_changes_nothing(body, swapped, monkeypatch):
-    _, found = outcome(body, swapped)
-    program_size = executor.program_size
-    for module in (executor, spectral_pair):
-        monkeypatch.setattr(module, "program_size", lambda size: program_size(size) + 20)
-    _, more = outcome(body, swapped)
-    padded, padded_more = (one.outcome.last.refinement.pointwise_map.shape[0] for one in (found, more))
-    assert padded_more == padded + 20
-    np.testing.assert_array_equal(more.pointwise_map, found.pointwise_map)
 
 
 @pytest.mark.slow

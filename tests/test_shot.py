@@ -24,13 +24,13 @@ def descriptors(bumpy):
 def agree(a: np.ndarray, b: np.ndarray) -> bool:
     """Return whether 99 % of the descriptors are equal. Rounding may flip the local axes of a few
     descriptors."""
-    return np.mean(np.abs(a - b).max(axis=1) < 1e-6) > 0.99
+    return np.mean(np.abs(a - b).max(axis=1) < 1e-5) > 0.99
 
 
 def test_descriptors_are_non_negative_unit_rows_of_352(bumpy, descriptors):
     assert descriptors.shape == (len(bumpy.vertices), 352)
     assert (descriptors >= 0).all()
-    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1)
+    np.testing.assert_allclose(np.linalg.norm(descriptors, axis=1), 1, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_distinguishes_vertices_despite_noise(bumpy, descriptors):
 
 def test_the_size_of_blocks_has_no_effect(bumpy, descriptors, monkeypatch):
     monkeypatch.setattr(shot, "_PAIRS_PER_BLOCK", 5000)
-    np.testing.assert_allclose(shot_descriptors(bumpy), descriptors, atol=1e-9)
+    np.testing.assert_allclose(shot_descriptors(bumpy), descriptors, atol=1e-5)
 
 
 def test_a_flat_square_fills_one_bin_of_the_cosine():
@@ -84,7 +84,7 @@ def test_a_flat_square_fills_one_bin_of_the_cosine():
     descriptors = shot_descriptors(make_mesh(*grid_mesh(40, 40)), radius=0.2)
     bins = descriptors.reshape(-1, 32, 11).sum(axis=1)
     extreme = np.maximum(bins[:, 0], bins[:, 10])
-    np.testing.assert_allclose(extreme, bins.sum(axis=1))
+    np.testing.assert_allclose(extreme, bins.sum(axis=1), rtol=1e-5)
 
 
 def test_the_radius_has_an_effect(bumpy, descriptors):
@@ -148,4 +148,4 @@ def test_samples_act_like_the_vertices_of_a_coarser_mesh(bumpy):
 def test_all_vertices_as_samples_change_nothing(bumpy, descriptors):
     everything = np.arange(len(bumpy.vertices))
     same = shot_descriptors(bumpy, samples=SurfaceSamples(everything, everything))
-    np.testing.assert_allclose(same, descriptors, atol=1e-9)
+    np.testing.assert_allclose(same, descriptors, atol=1e-5)

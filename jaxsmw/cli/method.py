@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import AbstractContextManager, nullcontext
+from importlib import import_module
 from typing import TYPE_CHECKING, get_args
 
 from jaxsmw.choices import (
@@ -31,13 +32,13 @@ if TYPE_CHECKING:
     from jaxsmw.matching.correspondence import Correspondence
     from jaxsmw.matching.stages import Stage
 
-# A dictionary from the name of each solution to its class name and its arguments. The first solution is the
-# solution of the MWP paper.
+# A dictionary from the name of each solution to its class, as "module:class" in `jaxsmw.core.solutions`, and
+# its arguments. The first solution is the solution of the MWP paper.
 _SOLUTIONS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "filtering": ("Filtering", ()),
-    "least-squares": ("LeastSquares", ()),
-    "least-squares-frobenius": ("LeastSquares", ("frobenius",)),
-    "regularized": ("RegularizedLeastSquares", ()),
+    "filtering": ("closed_form:Filtering", ()),
+    "least-squares": ("closed_form:LeastSquares", ()),
+    "least-squares-frobenius": ("closed_form:LeastSquares", ("frobenius",)),
+    "regularized": ("regularized:RegularizedLeastSquares", ()),
 }
 _PAPER_SOLUTION = next(iter(_SOLUTIONS))
 
@@ -222,16 +223,17 @@ def _precision(name: str) -> AbstractContextManager[object]:
 
 def _changed_stage(options: argparse.Namespace) -> Stage:
     """Return a stage that runs the MWP paper's method with the changes that the options request."""
-    from jaxsmw import functional_maps
     from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
     from jaxsmw.matching.stages import Stage
 
-    kind, arguments = _SOLUTIONS[options.solution or _PAPER_SOLUTION]
+    place, arguments = _SOLUTIONS[options.solution or _PAPER_SOLUTION]
+    module, kind = place.split(":")
+    make_solution = getattr(import_module(f"jaxsmw.core.solutions.{module}"), kind)
     refiner = WaveletPreservation(
         bank=make_bank(options.bank, options.filters),
-        solution=getattr(functional_maps, kind)(*arguments),
+        solution=make_solution(*arguments),
     )
-    filtering = isinstance(refiner.solution, functional_maps.Filtering)
+    filtering = kind == "Filtering"
     if options.bank and filtering and (bounds := bounds_unless_tight(refiner.bank)):
         lower, upper = bounds
         say(

@@ -13,7 +13,7 @@ from jaxsmw.collection.edges import EdgeMap
 from jaxsmw.collection.result import MatchedEdge
 from jaxsmw.collection.synchronization import Network, synchronize, vertex_map_between
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching.preparation import PreparedShape
+from jaxsmw.matching.shape import PreparedShape
 
 # Lengths are in units of the square root of the area of each shape. Table R26 is in `docs/research_log.md`.
 # The number of samples of each shape at which cycles are compared.

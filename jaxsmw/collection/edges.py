@@ -24,7 +24,8 @@ from jaxsmw.collection.shapes import preset_key, shape_key
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.preparation import DescriptorAxes, PreparedShape
+from jaxsmw.matching.descriptors import DescriptorAxes
+from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from jaxsmw.choices import EDGES_PER_SHAPE
 from jaxsmw.collection.consistency import Edge, check_pairs
 from jaxsmw.errors import InputError, check_number, check_whole_number
-from jaxsmw.matching.preparation import PreparedShape
+from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.runtime.cache import Store
 
 # Low eigenvalues describe the proportions of a body. High eigenvalues depend on the mesh.

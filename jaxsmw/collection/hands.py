@@ -12,8 +12,8 @@ from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.graph import choose_edges, shape_distances
 from jaxsmw.collection.shapes import shape_key
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedShape
 from jaxsmw.matching.search.chirality import Decision, Hands
+from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress

@@ -23,7 +23,7 @@ from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, connected_components
 from jaxsmw.geometry.shortcuts import points_on_uncut
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching.preparation import PreparedShape
+from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.cache import Store

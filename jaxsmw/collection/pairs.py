@@ -19,7 +19,8 @@ from jaxsmw.matching.executor import run_batches
 from jaxsmw.matching.match import match_prepared
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedPair, PreparedShape
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.matching.starts import make_starts
 from jaxsmw.runtime.backends import chosen_backend

@@ -13,7 +13,7 @@ from jaxsmw.collection.shape_models import ShapeModel, shape_model
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching.preparation import DescriptorAxes
+from jaxsmw.matching.descriptors import DescriptorAxes
 from jaxsmw.transfer.registered_mesh import RegisteredMesh, register_mesh
 from jaxsmw.wording import count_of
 

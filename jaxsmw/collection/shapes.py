@@ -18,8 +18,9 @@ from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.shortcuts import cut_shortcuts
 from jaxsmw.geometry.shot import shot_descriptors
+from jaxsmw.matching.descriptors import DescriptorAxes, PrincipalAxes
 from jaxsmw.matching.pair import number_of_usable_vertices
-from jaxsmw.matching.preparation import DescriptorAxes, PreparedShape, PrincipalAxes, prepare_shapes
+from jaxsmw.matching.shape import PreparedShape, prepare_shapes
 from jaxsmw.matching.stages import Preset
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress
@@ -100,7 +101,7 @@ def describe_shapes(
     with warned_already():
         arrays = store.get("descriptor-axes", preset_key(preset), compute)
         axes = DescriptorAxes(tuple(arrays["radii"].tolist()), PrincipalAxes(arrays["mean"], arrays["axes"]))
-        return [axes.describe(shape) for shape in shapes], axes
+        return axes.describe(shapes), axes
 
 
 def prepare_collection(

@@ -39,7 +39,7 @@ def _or_traced(compute: Callable[..., Array]) -> Callable[..., Array]:
 
 
 @_or_traced
-def product(a: Float[Array, ...], b: Float[Array, ...]) -> Float[Array, ...]:
+def product(a: Float[Array, "*a"], b: Float[Array, "*b"]) -> Float[Array, "*product"]:
     """Return the matrix product, in full precision also on accelerators."""
     return np.matmul(a, b)
 

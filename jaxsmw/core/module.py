@@ -107,8 +107,8 @@ def _equal(mine: Any, theirs: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """Return the text of a value, but only the type and the shape of an array of several numbers."""
-    return f"{value.dtype}{list(value.shape)}" if is_array(value) and value.ndim else repr(value)
+    """Return the text of a value; of an array, only the type and the shape."""
+    return f"{value.dtype}{list(value.shape)}" if is_array(value) else repr(value)
 
 
 def import_jax() -> Any:

@@ -18,7 +18,7 @@ class RESULTS(Module):
     == RESULTS.successful`. `RESULTS[result]` is a text that explains the status and suggests remedies.
     """
 
-    code: Int[Array, ...]
+    code: Int[Array, "*batch"]
 
     successful: ClassVar[RESULTS]
     nonfinite_spectrum: ClassVar[RESULTS]
@@ -29,10 +29,10 @@ class RESULTS(Module):
     fixed_point_not_reached: ClassVar[RESULTS]
     solver_not_converged: ClassVar[RESULTS]
 
-    def __eq__(self, other: object) -> Bool[Array, ...]:  # type: ignore[override]
+    def __eq__(self, other: object) -> Bool[Array, "*batch"]:  # type: ignore[override]
         return self.code == other.code if isinstance(other, RESULTS) else np.asarray(False)
 
-    def __ne__(self, other: object) -> Bool[Array, ...]:  # type: ignore[override]
+    def __ne__(self, other: object) -> Bool[Array, "*batch"]:  # type: ignore[override]
         return ~(self == other)
 
     __hash__ = Module.__hash__

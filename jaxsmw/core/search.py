@@ -21,10 +21,10 @@ def nearest_neighbor(
     identical database rows, the first is returned. The queries are processed in blocks, so no array of size m
     x n is stored.
 
-    JAX compares every query with every row. NumPy searches in a tree if the points lie near a space of few
-    dimensions. The score of a database row b for a query q is `q·b - |b|²/2`, which is largest for the
-    nearest row. An exhaustive search compares the distances to two of the rows with the best scores, because
-    scores have large rounding errors if `|b|` is large compared to the distance.
+    JAX compares every query with every row. NumPy leaves rows out if a tree or a few clusters show that they
+    are too far away; see `jaxsmw.core.host_search`. The score of a database row b for a query q is `q·b -
+    |b|²/2`, which is largest for the nearest row. The search compares the distances to two of the rows with
+    the best scores, because scores have large rounding errors if `|b|` is large compared to the distance.
 
     **Arguments:**
 
@@ -55,7 +55,7 @@ def nearest_in_both(
     return _implementation(*first, *second).nearest_in_both(first, second)
 
 
-def _implementation(*arrays: Array) -> Any:
+def _implementation(*arrays: Array | None) -> Any:
     if is_traced(*arrays):
         from jaxsmw.core import traced_search
 

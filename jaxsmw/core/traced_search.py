@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Int, Int32
 
 from jaxsmw.core.arrays import Array, in_blocks
 from jaxsmw.core.linear_algebra import product
-from jaxsmw.core.search import SearchProblem
 
 # BLOCK is the number of queries per block, and _CHUNK is the number of database rows per chunk. Both sizes
 # were chosen by measurements with scripts/benchmark_speed.py on two CPU cores. The scores of a block must fit
@@ -23,6 +22,9 @@ _CHUNK = 64
 _SCORES = 2**26
 # `_maximum` divides each chunk into parts of _RUN rows.
 _RUN = 8
+
+# The queries (m, d), the database (n, d) and its mask (n,) of one search.
+_Problem = tuple[Array, Array, Array]
 
 
 def nearest_neighbor(
@@ -65,11 +67,9 @@ def queries_per_block(m: int, n: int) -> int:
     return BLOCK * max(1, min(-(-m // BLOCK), _SCORES // (n * BLOCK)))
 
 
-def nearest_in_both(
-    first: SearchProblem, second: SearchProblem
-) -> tuple[Int32[Array, " m_1"], Int32[Array, " m_2"]]:
+def nearest_in_both(first: _Problem, second: _Problem) -> tuple[Int32[Array, " m_1"], Int32[Array, " m_2"]]:
     # Both searches are iterations of one loop, so JAX compiles the search only once.
-    d = max(first.queries.shape[1], second.queries.shape[1])
+    d = max(first[0].shape[1], second[0].shape[1])
 
     def stacked(*arrays: Array) -> Array:
         most = max(map(len, arrays))
@@ -79,7 +79,7 @@ def nearest_in_both(
 
     arguments = tuple(stacked(*pair) for pair in zip(first, second, strict=True))
     nearest = lax.map(lambda one: nearest_neighbor(*one), arguments)
-    return nearest[0, : len(first.queries)], nearest[1, : len(second.queries)]
+    return nearest[0, : len(first[0])], nearest[1, : len(second[0])]
 
 
 def _maximum(values: Array, axis: int, parts: int) -> Array:

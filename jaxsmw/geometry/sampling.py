@@ -12,6 +12,7 @@ from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.arrays import first_equal_rows
 from jaxsmw.geometry.mesh import Mesh
 
 # If edges are much shorter than the usual errors of matches, even good maps look discontinuous at these
@@ -95,6 +96,16 @@ class SurfaceSamples(NamedTuple):
             _, nearest[apart] = KDTree(mesh.vertices[vertices]).query(mesh.vertices[apart])
         return cls(vertices, nearest)
 
+    def adjacent(self, mesh: Mesh) -> Int64[np.ndarray, "e 2"]:
+        """Return the pairs of samples, as rows of `vertices`, whose regions are joined by an edge.
+
+        The lower row of each pair is first, and the pairs are in lexicographic order.
+        """
+        low, high = np.sort(self.nearest[mesh.edges], axis=1).T
+        number = len(self.vertices)
+        pairs = np.unique((low * number + high)[low < high])  # faster than unique rows
+        return np.stack(np.divmod(pairs, number), axis=1)
+
 
 def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     """Choose vertices that are evenly spread over the area, regardless of the density of the mesh.
@@ -116,8 +127,7 @@ def poisson_disk_samples(mesh: Mesh, number_of_samples: int) -> SurfaceSamples:
     # In each box of a grid around the centroid, only the lowest-numbered vertex remains a candidate.
     positions = mesh.vertices - mesh.middle
     boxes = np.floor(positions[candidates] / (distance / 3)).astype(np.int64)
-    _, first = np.unique(boxes, axis=0, return_index=True)
-    candidates = np.sort(candidates[first])
+    candidates = candidates[np.unique(first_equal_rows(boxes))]
     tree = KDTree(positions[candidates])
     pairs = tree.sparse_distance_matrix(tree, distance, output_type="coo_matrix")
     near = sp.csr_matrix((np.ones(pairs.nnz, bool), (pairs.row, pairs.col)), pairs.shape)
@@ -137,8 +147,7 @@ def coarse_edges(mesh: Mesh) -> tuple[Int64[np.ndarray, "e 2"], Int64[np.ndarray
     if n <= _DENSE:
         return mesh.edges, np.arange(n)
     samples = poisson_disk_samples(mesh, _SPREAD)
-    pairs = np.unique(np.sort(samples.nearest[mesh.edges], axis=1), axis=0)
-    return samples.vertices[pairs[pairs[:, 0] != pairs[:, 1]]], samples.vertices[samples.nearest]
+    return samples.vertices[samples.adjacent(mesh)], samples.vertices[samples.nearest]
 
 
 def maximal_independent_set(graph: sp.csr_matrix, radius: int) -> Int64[np.ndarray, " s"]:

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Float32, Float64, Int32, Int64, Shaped
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
@@ -19,7 +19,7 @@ SHOT_DIMENSION = _AZIMUTH * _ELEVATION * _RADIAL * _COSINE
 _FEWEST_NEIGHBORS = 3
 SHOT_RADIUS = 0.06
 """The radius of SHOT neighbourhoods in the MWP paper, in units of the square root of the area."""
-# The approximate number of (vertex, neighbour) pairs in a block of vertices. A pair takes about 300 bytes,
+# The approximate number of (vertex, neighbour) pairs in a block of vertices. A pair takes about 200 bytes,
 # so the histograms of a block stay in the processor's cache.
 _PAIRS_PER_BLOCK = 30_000
 
@@ -81,26 +81,33 @@ def shot_descriptors(
         if mesh.is_inside_out:
             normals = -normals
 
+        # Single precision is accurate enough for descriptors, and takes less time.
+        descriptors = np.zeros((len(vertices), SHOT_DIMENSION), np.float32)
+        places, normals = np.ascontiguousarray(positions.T), normals.T.astype(np.float32, order="C")
         tree = KDTree(positions)
-        neighbors = tree.query_ball_point(positions, radius, return_length=True, workers=-1) - 1
-        lonely = np.mean(neighbors < _FEWEST_NEIGHBORS)
+        number_of_pairs = 16 * KDTree(positions[::16]).count_neighbors(tree, radius)
+        number_of_blocks = min(1 + number_of_pairs // _PAIRS_PER_BLOCK, len(positions))
+        number_lonely = 0
+        # A block consists of vertices near each other, so the search compares few vertices in vain.
+        for block in np.array_split(tree.indices, number_of_blocks):
+            pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
+            # NumPy sorts integers of 16 bits several times faster. A block has fewer vertices than pairs.
+            order = np.argsort(pairs["i"].astype(np.uint16), kind="stable")
+            numbers = np.bincount(pairs["i"], minlength=len(block))
+            number_lonely += int(np.sum(numbers - 1 < _FEWEST_NEIGHBORS))
+            neighbor, distance = pairs["j"][order], pairs["v"][order].astype(np.float32)
+            offsets = places.take(neighbor, axis=1) - np.repeat(places[:, block], numbers, axis=1)
+            descriptors[block] = _histograms(
+                offsets.astype(np.float32), normals.take(neighbor, axis=1), distance, numbers, radius
+            )
+        lonely = number_lonely / len(vertices)
         if lonely > 0.5:
             raise InputError(_too_coarse(mesh, lonely, radius, required))
-
-        # Single precision is accurate enough for descriptors.
-        descriptors = np.zeros((len(vertices), SHOT_DIMENSION), np.float32)
-        block_of_vertex = np.cumsum(neighbors + 1) // _PAIRS_PER_BLOCK
-        for block in np.split(np.arange(len(vertices)), np.flatnonzero(np.diff(block_of_vertex)) + 1):
-            pairs = KDTree(positions[block]).sparse_distance_matrix(tree, radius, output_type="ndarray")
-            # Pairs of vertices at the same position are left out, because they define no direction.
-            apart = pairs["v"] > 0
-            center, neighbor, distance = (pairs[column][apart] for column in "ijv")
-            descriptors[block] = _histograms(positions, normals, block, center, neighbor, distance, radius)
         descriptors = mesh.spread(descriptors) if samples is None else descriptors
         return {"descriptors": descriptors, "lonely": np.asarray(lonely)}
 
     chosen = () if samples is None else samples
-    result = cached("shot", (mesh.vertices, mesh.faces, radius, *chosen), compute)
+    result = cached("shot", (mesh.vertices, mesh.faces, radius, "float32", *chosen), compute)
     if (lonely := float(result["lonely"])) > 0.01:
         warnings.warn(_too_coarse(mesh, lonely, radius, required), stacklevel=2)
     return result["descriptors"]
@@ -123,24 +130,24 @@ def _too_coarse(mesh: Mesh, lonely: float, radius: float, required: bool) -> str
 
 
 def _histograms(
-    positions: np.ndarray,
-    normals: np.ndarray,
-    block: Int64[np.ndarray, " b"],
-    center: Int64[np.ndarray, " p"],
-    neighbor: Int64[np.ndarray, " p"],
-    distance: Float64[np.ndarray, " p"],
+    offsets: Float32[np.ndarray, "3 p"],
+    normals: Float32[np.ndarray, "3 p"],
+    distance: Float32[np.ndarray, " p"],
+    numbers: Int64[np.ndarray, " b"],
     radius: float,
-) -> Float64[np.ndarray, "b 352"]:
-    """Return the descriptors of a block from pairs of a `center` in the block and a `neighbor`."""
-    # `center` counts within the block. Lengths are in units of the square root of the area.
-    offsets = positions.take(neighbor, axis=0) - positions[block].take(center, axis=0)
-    frames = _local_frames(offsets, center, radius - distance, len(block)).take(center, axis=0)
-    x, y, z = np.einsum("pad,pd->ap", frames, offsets)
-    cosine = np.einsum("pd,pd->p", frames[:, 2], normals.take(neighbor, axis=0))
+) -> Float32[np.ndarray, "b 352"]:
+    """Return the descriptors of a block of vertices from pairs of a vertex and a neighbour.
+
+    The first `numbers[0]` pairs belong to the first vertex of the block, and so on. Every vertex is its own
+    neighbour. Lengths are in units of the square root of the area.
+    """
+    apart = distance > 0  # vertices at the same position define no direction, and are left out
+    (x, y, z), cosine = _local_coordinates(offsets, normals, radius - distance, numbers)
 
     # Each coordinate is scaled so that the integer b is the centre of bin b.
     azimuth = np.arctan2(y, x) * (_AZIMUTH / (2 * np.pi)) - 0.5
-    elevation = np.arcsin(np.clip(z / distance, -1, 1)) * (_ELEVATION / np.pi) + (_ELEVATION - 1) / 2
+    sine = np.clip(z / np.where(apart, distance, 1), -1, 1)
+    elevation = np.arcsin(sine) * (_ELEVATION / np.pi) + (_ELEVATION - 1) / 2
     shell = distance * (_RADIAL / radius) - 0.5
     bin_of_cosine = (1 + np.clip(cosine, -1, 1)) * ((_COSINE - 1) / 2)
 
@@ -148,56 +155,71 @@ def _histograms(
     # have only two bins, so every pair has weights for all four combinations. Each row of `histogram`
     # is one bin of azimuth and cosine at one vertex. The columns of `histogram` are the four combinations of
     # elevation and distance.
+    size, p = len(numbers), len(distance)
     upper, outer = np.clip(elevation, 0, 1), np.clip(shell, 0, 1)
-    shares = np.empty((len(center), _ELEVATION * _RADIAL))
-    for low, of_elevation in enumerate((1 - upper, upper)):
+    shares = np.empty((p, _ELEVATION * _RADIAL), np.float32)
+    for low, of_elevation in enumerate(((1 - upper) * apart, upper * apart)):
         for near, of_distance in enumerate((1 - outer, outer)):
             np.multiply(of_elevation, of_distance, out=shares[:, low * _RADIAL + near])
-    histogram = np.zeros((len(block) * _AZIMUTH * _COSINE, _ELEVATION * _RADIAL))
-    first, each = center.astype(np.int32) * (_AZIMUTH * _COSINE), np.arange(len(center) + 1, dtype=np.int32)
-    for sector, sector_weight in _two_nearest(azimuth):
-        start = first + sector % _AZIMUTH * _COSINE
-        for level, level_weight in _two_nearest(bin_of_cosine):
-            rows = start + np.clip(level, 0, _COSINE - 1)  # beyond the last bin, the weight is zero
-            weights = sector_weight * level_weight
-            histogram += sp.csc_array((weights, rows, each), (len(histogram), len(center))) @ shares
-    shape = len(block), _AZIMUTH, _COSINE, _ELEVATION * _RADIAL
-    descriptors = histogram.reshape(shape).swapaxes(2, 3).reshape(len(block), SHOT_DIMENSION)
-    descriptors[np.bincount(center, minlength=len(block)) < _FEWEST_NEIGHBORS] = 0
+    first = np.repeat(np.arange(size, dtype=np.int32) * (_AZIMUTH * _COSINE), numbers)
+    rows, weights = np.empty((p, 4), np.int32), np.empty((p, 4), np.float32)
+    for near, (sector, sector_weight) in enumerate(_two_nearest(azimuth)):
+        start = first + (sector & (_AZIMUTH - 1)) * _COSINE  # faster than %, and equal for a power of 2
+        for low, (level, level_weight) in enumerate(_two_nearest(bin_of_cosine)):
+            # Beyond the last bin, the weight is zero.
+            np.add(start, np.minimum(level, _COSINE - 1), out=rows[:, 2 * near + low])
+            np.multiply(sector_weight, level_weight, out=weights[:, 2 * near + low])
+    each = np.arange(0, 4 * p + 1, 4, dtype=np.int32)
+    spread = sp.csc_array((weights.ravel(), rows.ravel(), each), (size * _AZIMUTH * _COSINE, p))
+    histogram = (spread @ shares).reshape(size, _AZIMUTH, _COSINE, _ELEVATION * _RADIAL)
+    descriptors = histogram.swapaxes(2, 3).reshape(size, SHOT_DIMENSION)
+    descriptors[_sums(apart, numbers) < _FEWEST_NEIGHBORS] = 0
     norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
     return descriptors / np.where(norms > 0, norms, 1)
 
 
-def _local_frames(
-    offsets: Float64[np.ndarray, "p 3"],
-    center: Int64[np.ndarray, " p"],
-    weight: Float64[np.ndarray, " p"],
-    size: int,
-) -> Float64[np.ndarray, "b 3 3"]:
-    """Return a right-handed frame per vertex; its rows x to z are axes of decreasing scatter."""
-    scatter = np.zeros((size, 3, 3))
-    for row in range(3):
-        for column in range(row, 3):
-            products = weight * offsets[:, row] * offsets[:, column]
-            scatter[:, row, column] = scatter[:, column, row] = np.bincount(center, products, size)
-    _, axes = np.linalg.eigh(scatter)
+def _local_coordinates(
+    offsets: Float32[np.ndarray, "3 p"],
+    normals: Float32[np.ndarray, "3 p"],
+    weight: Float32[np.ndarray, " p"],
+    numbers: Int64[np.ndarray, " b"],
+) -> tuple[Float32[np.ndarray, "3 p"], Float32[np.ndarray, " p"]]:
+    """Return offsets in the local frames, and the cosines of the angles between normals and the z axes.
 
-    def towards_majority(axis: np.ndarray) -> np.ndarray:
-        height = np.einsum("pd,pd->p", axis.take(center, axis=0), offsets)
-        majority = np.bincount(center, np.sign(height), size)
+    A local frame is right-handed. Its axes x to z are axes of decreasing scatter.
+    """
+    scatter = np.empty((len(numbers), 3, 3))
+    for row in range(3):
+        weighted = weight * offsets[row]
+        for column in range(row, 3):
+            sums = _sums(weighted * offsets[column], numbers)
+            scatter[:, row, column] = scatter[:, column, row] = sums
+    _, axes = np.linalg.eigh(scatter)
+    x, z = axes[:, :, 2], axes[:, :, 0]
+    frames = np.stack([x.T, np.cross(z, x).T, z.T]).astype(np.float32).reshape(9, -1)
+    of_pairs = np.repeat(frames, numbers, axis=1).reshape(3, 3, -1)
+    coordinates = np.einsum("adp,dp->ap", of_pairs, offsets)
+
+    def towards_majority(height: Float32[np.ndarray, " p"]) -> Float32[np.ndarray, " p"]:
         # The axis points to the side with more neighbours. On regular meshes, both sides can have equally
         # many neighbours. Then the axis points to the side with the larger weighted sum of heights.
-        tied = majority == 0
-        majority[tied] = np.bincount(center, weight * height, size)[tied]
-        return np.where(majority >= 0, 1.0, -1.0)[:, None] * axis
+        majority = _sums(np.sign(height), numbers)
+        side = np.where(majority == 0, _sums(weight * height, numbers), majority)
+        return np.repeat(np.where(side >= 0, np.float32(1), np.float32(-1)), numbers)
 
-    x, z = towards_majority(axes[:, :, 2]), towards_majority(axes[:, :, 0])
-    return np.stack([x, np.cross(z, x), z], axis=1)
+    sign_x, sign_z = towards_majority(coordinates[0]), towards_majority(coordinates[2])
+    coordinates *= np.stack([sign_x, sign_x * sign_z, sign_z])
+    return coordinates, sign_z * np.einsum("dp,dp->p", of_pairs[2], normals)
+
+
+def _sums(values: Shaped[np.ndarray, " p"], numbers: Int64[np.ndarray, " b"]) -> Float64[np.ndarray, " b"]:
+    """Return the sum of the first `numbers[0]` values, the sum of the following `numbers[1]` values, ..."""
+    return np.add.reduceat(values, np.cumsum(numbers) - numbers, dtype=np.float64)
 
 
 def _two_nearest(
-    coordinate: Float64[np.ndarray, " p"],
-) -> list[tuple[Int32[np.ndarray, " p"], Float64[np.ndarray, " p"]]]:
+    coordinate: Float32[np.ndarray, " p"],
+) -> list[tuple[Int32[np.ndarray, " p"], Float32[np.ndarray, " p"]]]:
     """Return the two bins nearest to each coordinate, each with its weight in linear interpolation."""
     lower = np.floor(coordinate)
     upper_weight = coordinate - lower

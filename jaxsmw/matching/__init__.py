@@ -3,6 +3,8 @@
 - `pair`: two meshes, and the units in which they are compared.
 - `settings`, `stages`: what refines a map, and presets that say in which order.
 - `spectral_pair`: the spectra of a pair, on which stages run.
+- `shape`: the spectrum and samples of one shape.
+- `descriptors`: descriptors of several shapes in common axes.
 - `preparation`: spectra, samples and descriptors of both shapes.
 - `outcome`: what stages start from, and what they leave.
 - `starts`: initial maps.

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int, Int64
 from numpy.typing import ArrayLike
 
 from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap
-from jaxsmw.core.arrays import Array
+from jaxsmw.core.arrays import Array, namespace
 from jaxsmw.core.module import import_jax
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
@@ -295,10 +295,48 @@ def _check_landmarks(pair: Pair, landmarks: np.ndarray) -> None:
             )
 
 
+# The number of queries that `check_nearest` checks, and the tolerance relative to the squared norms.
+_CHECKED_QUERIES, _TOLERANCE = 32, 1e-4
+
+
+def check_nearest(
+    queries: Float[np.ndarray, "a d"],
+    database: Float[np.ndarray, "b d"],
+    usable: Int64[np.ndarray, " u"],
+    nearest: Int64[np.ndarray, " a"],
+) -> None:
+    """Check a few results of a nearest-neighbour search in float64, because all maps depend on this search.
+
+    A broken installation, a broken processor or a compiler fault would otherwise give a wrong map without a
+    message. Points with NaN are not checked here.
+
+    **Raises:** `ArithmeticError` if a result is not usable, or is farther than the nearest row by more than
+    the rounding errors of float32.
+    """
+    rows = np.linspace(0, len(queries) - 1, _CHECKED_QUERIES).astype(int)
+    few, all_rows = queries[rows].astype(np.float64), database[usable].astype(np.float64)
+    sizes, size = (all_rows**2).sum(axis=1), (few**2).sum(axis=1)
+    if not (np.isfinite(sizes).all() and np.isfinite(size).all()):
+        return
+    squared = size[:, None] - 2 * few @ all_rows.T + sizes
+    reached = ((few - database[nearest[rows]].astype(np.float64)) ** 2).sum(axis=1)
+    tolerance = _TOLERANCE * (size + sizes.max())
+    if not (np.isin(nearest[rows], usable).all() and (reached <= squared.min(axis=1) + tolerance).all()):
+        raise ArithmeticError(
+            "wrong nearest neighbours were found, so numerical results of this installation cannot be "
+            "trusted: install numpy, scipy, jax and jaxlib again, and unset XLA_FLAGS and JAX_PLATFORMS."
+        )
+
+
 def nearest_map(prepared: PreparedPair, features: _Features) -> Int64[np.ndarray, " m"]:
-    """Compute a pointwise map of all vertices of X (m,) by nearest-neighbour search in feature space."""
+    """Compute a pointwise map of all vertices of X (m,) by nearest-neighbour search in feature space.
+
+    **Raises:** `ArithmeticError` if the search is wrong; see `check_nearest`.
+    """
     x, y = prepared.shapes
     dtype, mask = y.spectrum.eigenvectors.dtype, np.asarray(y.compared_spectrum.mask)
     of_x, of_y = (of_shape.astype(dtype) for of_shape in features)
-    nearest = np.asarray(nearest_neighbor(of_x, of_y, database_mask=mask), np.int64)
+    xp = namespace(y.spectrum.eigenvectors)
+    nearest = np.asarray(nearest_neighbor(xp.asarray(of_x), xp.asarray(of_y), database_mask=mask), np.int64)
+    check_nearest(of_x, of_y, np.flatnonzero(mask), nearest)
     return x.everywhere(nearest if y.compared is None else y.compared.vertices[nearest])

@@ -427,9 +427,13 @@ def _nearest_rotations(covariances: Float[Array, "s 3 3"]) -> Float[Array, "s 3 
 
 def _squared(matrices: Float[Array, "16 s"]) -> Float[Array, "16 s"]:
     """Return the squares of symmetric matrices (4, 4), divided by their traces."""
-    rows = [[matrices[4 * i + j] for j in range(4)] for i in range(4)]
-    upper = {(i, j): sum(rows[i][k] * rows[k][j] for k in range(4)) for i in range(4) for j in range(i, 4)}
-    trace = sum(upper[i, i] for i in range(4))
+    row = matrices.reshape(4, 4, -1)
+
+    def product_of(i: int, j: int) -> Float[Array, " s"]:
+        return row[i, 0] * row[0, j] + row[i, 1] * row[1, j] + row[i, 2] * row[2, j] + row[i, 3] * row[3, j]
+
+    upper = {(i, j): product_of(i, j) for i in range(4) for j in range(i, 4)}
+    trace = upper[0, 0] + upper[1, 1] + upper[2, 2] + upper[3, 3]
     entries = [upper[min(i, j), max(i, j)] for i in range(4) for j in range(4)]
     return namespace(matrices).stack(entries) / trace[None]
 

@@ -17,9 +17,10 @@ from jaxsmw.geometry.shot import SHOT_RADIUS
 from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import Judge, Scored
 from jaxsmw.matching.outcome import Start
-from jaxsmw.matching.preparation import PreparedPair, PreparedShape
+from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.proxies import Proxy, deformation, extremities, map_difference, plausible_pairings
 from jaxsmw.matching.settings import RepairSettings
+from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
 from jaxsmw.runtime.threads import side_by_side

@@ -15,13 +15,14 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, shot_descriptors
+from jaxsmw.matching.descriptors import PrincipalAxes
 from jaxsmw.matching.executor import run
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import principal_components
 from jaxsmw.matching.search.proxies import Proxy, distance_error
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
+from jaxsmw.runtime.cache import cached
 from jaxsmw.runtime.threads import side_by_side
 
 # The approximate number of evenly spread samples of each shape. If a shape has fewer than `_FEWEST` samples,
@@ -104,15 +105,7 @@ class Hands:
 
         **Raises:** `InputError` if the samples are too sparse for SHOT.
         """
-        return float(np.mean(side_by_side(self._asymmetry, self.x, self.y)))
-
-    def _asymmetry(self, shape: Proxy) -> float:
-        shot = _shot(shape, _ASYMMETRY_RADII)
-        # All descriptors have the same norm, so the nearest descriptor has the largest inner product.
-        mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
-        matches = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
-        random = np.random.default_rng(0).permutation(len(matches))
-        return distance_error(shape, shape, matches) / distance_error(shape, shape, random)
+        return float(np.mean(side_by_side(_asymmetry, self.x, self.y)))
 
     def evidence(self) -> float:
         """Compare a coarse map of X with a coarse map of the mirror image of X.
@@ -146,13 +139,10 @@ class Hands:
             for own in (shot_x, shot_y)
             for descriptors in (own, [mirrored_descriptors(one) for one in own])
         ]
-        components = principal_components(
-            np.concatenate(shot),
-            np.concatenate([shape.areas for shape in shapes]) / len(shapes),
-            _STAGE.number_of_descriptors,
-        )
-        of_hands = np.split(components, np.cumsum([len(rows) for rows in shot])[:-1])
-        return [_Hand(*hand) for hand in zip(shapes, shot, of_hands, strict=True)]
+        areas = [shape.areas / len(shapes) for shape in shapes]
+        axes = PrincipalAxes.of(zip(shot, areas, strict=True), _STAGE.number_of_descriptors)
+        components = map(axes.components, shot)
+        return [_Hand(*hand) for hand in zip(shapes, shot, components, strict=True)]
 
     @staticmethod
     def _error(
@@ -174,6 +164,22 @@ class Hands:
 def _proxy(argument: tuple[Mesh, Spectrum]) -> Proxy:
     mesh, spectrum = argument
     return Proxy(mesh, spectrum, poisson_disk_samples(mesh, _SAMPLES), mesh.area**0.5)
+
+
+def _asymmetry(shape: Proxy) -> float:
+    """Return the asymmetry of a shape, which is kept in the cache; see `Hands.asymmetry`."""
+
+    def compute() -> dict[str, np.ndarray]:
+        shot = _shot(shape, _ASYMMETRY_RADII)
+        # All descriptors have the same norm, so the nearest descriptor has the largest inner product.
+        mirrored = np.hstack([mirrored_descriptors(one) for one in shot])
+        matches = np.argmax(np.hstack(shot) @ mirrored.T, axis=1)
+        random = np.random.default_rng(0).permutation(len(matches))
+        ratio = distance_error(shape, shape, matches) / distance_error(shape, shape, random)
+        return {"asymmetry": np.asarray(ratio)}
+
+    inputs = shape.mesh.vertices, shape.mesh.faces, _SAMPLES, *_ASYMMETRY_RADII
+    return float(cached("asymmetry", inputs, compute)["asymmetry"])
 
 
 def _shot(shape: Proxy, radii: tuple[int, ...]) -> list[Float[np.ndarray, "s 352"]]:

@@ -17,7 +17,8 @@ from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import Judge, Scored, detours
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedPair, prepare_shapes
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.shape import prepare_shapes
 from jaxsmw.matching.stages import Preset, Sizes, Stage
 
 logger = logging.getLogger("jaxsmw")
