@@ -10,7 +10,9 @@ from messages import assert_names, refused
 from pygsp import filters as pygsp_filters
 from pygsp import graphs as pygsp_graphs
 from sampled_cases import first_always
+from synthetic import to_namespace
 
+from jaxsmw.core.arrays import is_traced
 from jaxsmw.core.banks import (
     CubicSpline,
     ExponentialWindow,
@@ -73,16 +75,22 @@ BANKS = PARSEVAL | {
 }
 
 
-def spectrum(seed=0, k=30, lambda_max=50.0):
+def spectrum(seed=0, k=30, lambda_max=50.0, namespace="jax"):
     """Returns k distinct, unevenly spaced eigenvalues from 0 to lambda_max."""
     steps = np.random.default_rng(seed).uniform(0.1, 2, k - 1)
-    return jnp.asarray(np.concatenate([[0], np.cumsum(steps)]) * (lambda_max / steps.sum()))
+    return to_namespace(np.concatenate([[0], np.cumsum(steps)]) * (lambda_max / steps.sum()), namespace)
 
 
-@jax.jit
-def sample(bank, points, eigenvalues):
-    """Samples a bank with a program that JAX compiles only once per bank."""
+def respond(bank, points, eigenvalues):
     return bank(points, eigenvalues)
+
+
+compiled_sample = jax.jit(respond)
+
+
+def sample(bank, points, eigenvalues):
+    """Samples a bank, for arrays of JAX with a program that is compiled only once per bank."""
+    return (compiled_sample if is_traced(points) else respond)(bank, points, eigenvalues)
 
 
 each_bank = pytest.mark.parametrize("bank", BANKS.values(), ids=BANKS.keys())
@@ -102,8 +110,8 @@ def test_squares_sum_to_one(make, filters, lambda_max, seed):
 
 
 @pytest.mark.parametrize("make", PARSEVAL_OF_ANY_SIZE.values(), ids=PARSEVAL_OF_ANY_SIZE.keys())
-def test_banks_with_more_filters_than_float32_has_octaves_are_parseval(make):
-    eigenvalues = spectrum().astype(jnp.float32)
+def test_banks_with_more_filters_than_float32_has_octaves_are_parseval(make, namespace):
+    eigenvalues = spectrum(namespace=namespace).astype(np.float32)
     np.testing.assert_allclose(frame_function(sample(make(200), eigenvalues, eigenvalues)), 1, atol=1e-5)
 
 
@@ -119,23 +127,24 @@ def test_squares_of_two_filters_sum_to_one_for_any_edge(bank_class, edge, lambda
 
 
 @pytest.mark.parametrize("bank", PARSEVAL.values(), ids=PARSEVAL.keys())
-def test_squares_sum_to_one_in_single_precision(bank):
-    eigenvalues = spectrum(2, 30, 7.0).astype(jnp.float32)
+def test_squares_sum_to_one_in_single_precision(bank, namespace):
+    eigenvalues = spectrum(2, 30, 7.0, namespace).astype(np.float32)
     np.testing.assert_allclose(frame_function(sample(bank, eigenvalues, eigenvalues)), 1, atol=1e-6)
 
 
 @each_bank
-def test_precision_of_the_points_is_kept(bank):
-    eigenvalues = spectrum()
+def test_precision_of_the_points_is_kept(bank, namespace):
+    eigenvalues = spectrum(namespace=namespace)
     double = sample(bank, eigenvalues, eigenvalues)
-    single = sample(bank, *[eigenvalues.astype(jnp.float32)] * 2)
-    assert double.dtype == jnp.float64 and single.dtype == jnp.float32
+    single = sample(bank, *[eigenvalues.astype(np.float32)] * 2)
+    assert double.dtype == np.float64 and single.dtype == np.float32
+    assert type(double) is type(single) is type(eigenvalues)
     np.testing.assert_allclose(single, double, atol=3e-5)
 
 
 @each_bank
-def test_responses_do_not_depend_on_scale_or_order(bank):
-    eigenvalues = spectrum()
+def test_responses_do_not_depend_on_scale_or_order(bank, namespace):
+    eigenvalues = spectrum(namespace=namespace)
     order = np.random.default_rng(0).permutation(30)
     responses = sample(bank, eigenvalues, eigenvalues)
     assert (np.asarray(responses) >= 0).all()
@@ -150,6 +159,17 @@ def test_compiled_and_batched_banks_give_the_same_responses(bank):
     batched = jax.jit(jax.vmap(lambda b, e: b(e, e)))(banks, stack)
     np.testing.assert_allclose(batched[0], bank(stack[0], stack[0]), atol=1e-13)
     np.testing.assert_allclose(batched[2], sample(bank, stack[2], stack[2]), atol=1e-13)
+
+
+@each_bank
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_both_namespaces_give_the_same_responses(bank, dtype):
+    eigenvalues = spectrum(namespace="numpy")
+    eigenvalues[1:4], eigenvalues[10:15] = 0, eigenvalues[10]
+    points = np.random.default_rng(0).uniform(0, eigenvalues[-1], 50)
+    arrays = points.astype(dtype), eigenvalues.astype(dtype)
+    responses, expected = (sample(bank, *to_namespace(arrays, name)) for name in ("numpy", "jax"))
+    np.testing.assert_allclose(responses, expected, atol=3e-5 if dtype == np.float32 else 1e-13)
 
 
 @each_bank
@@ -205,8 +225,8 @@ def test_every_static_parameter_changes_the_result(bank, other):
 
 
 @each_bank
-def test_every_continuous_parameter_changes_the_result(bank):
-    eigenvalues = spectrum()
+def test_every_continuous_parameter_changes_the_result(bank, namespace):
+    eigenvalues = spectrum(namespace=namespace)
     leaves, structure = jax.tree.flatten(bank)
     for index, leaf in enumerate(leaves):
         moved = jax.tree.unflatten(structure, [*leaves[:index], 1.1 * leaf**0.99, *leaves[index + 1 :]])
