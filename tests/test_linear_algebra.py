@@ -13,7 +13,7 @@ import jax.scipy as jsp
 import numpy as np
 import pytest
 from sampled_cases import first_always
-from synthetic import random_spectrum
+from synthetic import random_spectrum, to_namespace
 
 from jaxsmw.core import linear_algebra
 from jaxsmw.core.refinement import refine
@@ -184,6 +184,63 @@ def test_factorisations_and_their_derivatives_equal_those_of_jax(name):
         found, reference = (jax.jit(transform(f))(*arguments) for f in (function, expected))
         np.testing.assert_allclose(found, reference, rtol=1e-9, atol=1e-11)
         assert set(lapack_calls(transform(function), *arguments)) == {"0"}
+
+
+def inputs(name, dtype):
+    """A matrix that a factorisation accepts, and a right side if it needs one."""
+    _, _, shape, right_shape = FACTORISATIONS[name]
+    generator = np.random.default_rng(0)
+    matrix = generator.normal(size=shape)
+    if name not in ("tall", "wide", "square"):
+        matrix = matrix @ matrix.T + np.eye(shape[0])
+    if name == "triangular":
+        matrix = np.tril(matrix)
+    right = () if right_shape is None else (generator.normal(size=right_shape),)
+    return [array.astype(dtype) for array in (matrix, *right)]
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", FACTORISATIONS)
+def test_factorisations_of_numpy_equal_those_of_jax(name, dtype):
+    function, arrays = FACTORISATIONS[name][0], inputs(name, dtype)
+    before = [array.copy() for array in arrays]
+    found, expected = (function(*to_namespace(arrays, namespace)) for namespace in ("numpy", "jax"))
+    assert isinstance(found, np.ndarray) and found.dtype == expected.dtype == dtype
+    np.testing.assert_allclose(found, expected, atol=2e-5 if dtype == np.float32 else 1e-12)
+    np.testing.assert_array_equal(np.concatenate(arrays, axis=1), np.concatenate(before, axis=1))
+
+
+@pytest.mark.parametrize("name", FACTORISATIONS)
+def test_factorisations_of_nan_are_nan(name, namespace):
+    matrix, *right = inputs(name, np.float64)
+    found = FACTORISATIONS[name][0](*to_namespace((np.full_like(matrix, np.nan), *right), namespace))
+    assert found.shape == FACTORISATIONS[name][1](matrix, *right).shape
+    entries = np.tril(np.ones_like(found, bool)) if name == "cholesky" else np.ones_like(found, bool)
+    assert np.isnan(np.asarray(found)[entries]).all()
+
+
+@pytest.mark.parametrize("diagonal", [[1.0, -1.0, 2.0], [0.0, 0.0, 0.0]], ids=str)
+def test_matrices_that_are_not_positive_definite_are_no_exception(diagonal, namespace):
+    matrix, right = to_namespace((np.diag(diagonal), np.ones((3, 2))), namespace)
+    assert not np.isfinite(linear_algebra.cholesky(matrix)).all()
+    assert not np.isfinite(linear_algebra.solve_positive_definite(matrix, right)).all()
+    assert not linear_algebra.is_regular(matrix)
+    assert np.isfinite(linear_algebra.solve_lower(matrix, right)).all() == (diagonal[0] != 0)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_singular_matrices_are_regularized_alike(dtype, namespace):
+    vectors = np.random.default_rng(0).normal(size=(5, 4))
+    vectors[:, 3] = vectors[:, 0]
+    singular = to_namespace((vectors.T @ vectors).astype(dtype), namespace)
+    assert not linear_algebra.is_regular(singular)
+    regular = linear_algebra.regularized(singular)
+    assert regular.dtype == dtype
+    error = 4 * np.finfo(dtype).eps * np.asarray(singular).diagonal().max()
+    np.testing.assert_allclose(regular - singular, error * np.eye(4), rtol=0.1, atol=0.1 * error)
+    fine = singular + np.eye(4, dtype=dtype)
+    assert linear_algebra.is_regular(fine)
+    np.testing.assert_array_equal(linear_algebra.regularized(fine), fine)
 
 
 if __name__ == "__main__":

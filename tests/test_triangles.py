@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import nnls
-from synthetic import bumpy_mesh
+from synthetic import bumpy_mesh, to_namespace
 
 from jaxsmw.core.triangles import nearest_point_on_candidates, nearest_point_on_triangles
 
@@ -19,11 +19,17 @@ def generator():
     return np.random.default_rng(0)
 
 
-def found(queries, points, faces, **options):
-    """Returns faces, weights, and the distance from each query to its nearest point."""
-    face, weights = compiled_search(jnp.asarray(queries), jnp.asarray(points), jnp.asarray(faces), **options)
-    there = np.einsum("qc,qcd->qd", weights, points[faces[np.asarray(face)]])
-    return np.asarray(face), np.asarray(weights), np.linalg.norm(queries - there, axis=1)
+@pytest.fixture
+def found(namespace):
+    """A function that returns faces, weights, and the distance from each query to its nearest point."""
+    search = compiled_search if namespace == "jax" else nearest_point_on_triangles
+
+    def find(queries, points, faces, **options):
+        face, weights = search(*to_namespace((queries, points, faces), namespace), **options)
+        there = np.einsum("qc,qcd->qd", weights, points[faces[np.asarray(face)]])
+        return np.asarray(face), np.asarray(weights), np.linalg.norm(queries - there, axis=1)
+
+    return find
 
 
 def by_brute_force(queries, points, faces):
@@ -41,7 +47,7 @@ def by_brute_force(queries, points, faces):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_agrees_with_libigl_in_space(generator, dtype):
+def test_agrees_with_libigl_in_space(generator, dtype, found):
     mesh = bumpy_mesh(3)
     queries = generator.normal(size=(300, 3))
     queries[:100] = mesh.vertices[:100]  # on corners
@@ -55,14 +61,14 @@ def test_agrees_with_libigl_in_space(generator, dtype):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dimensions", [2, 5, 12])
-def test_agrees_with_brute_force_in_any_dimension(generator, dimensions):
+def test_agrees_with_brute_force_in_any_dimension(generator, dimensions, found):
     points, queries = generator.normal(size=(20, dimensions)), generator.normal(size=(40, dimensions))
     faces = np.array([generator.choice(20, 3, replace=False) for _ in range(30)])
     _, _, distance = found(queries, points, faces)
     np.testing.assert_allclose(distance, by_brute_force(queries, points, faces), atol=1e-6)
 
 
-def test_points_of_the_surface_are_their_own_nearest_points(generator):
+def test_points_of_the_surface_are_their_own_nearest_points(generator, found):
     mesh = bumpy_mesh(3)
     points = np.hstack([mesh.vertices, generator.normal(size=(len(mesh.vertices), 4))])
     faces = generator.integers(len(mesh.faces), size=200)
@@ -75,7 +81,7 @@ def test_points_of_the_surface_are_their_own_nearest_points(generator):
 
 
 @pytest.mark.parametrize("corners", [[0, 0, 0], [0, 0, 1], [0, 1, 0], [0, 1, 1], [0, 1, 3]])
-def test_distances_to_triangles_without_area_are_exact(corners):
+def test_distances_to_triangles_without_area_are_exact(corners, found):
     """The degenerate triangles are a point, a segment, and three collinear points."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 5, 0], [2, 0, 0]])
     queries = np.array([[0.4, 1, 0], [-1, 0, 0], [3, 0, 0]])
@@ -86,11 +92,11 @@ def test_distances_to_triangles_without_area_are_exact(corners):
     assert np.isfinite(weights).all()
 
 
-def test_masked_triangles_are_ignored(generator):
+def test_masked_triangles_are_ignored(generator, found, namespace):
     mesh = bumpy_mesh(2)
     queries = generator.normal(size=(50, 3))
     mask = generator.random(len(mesh.faces)) < 0.5
-    face, _, distance = found(queries, mesh.vertices, mesh.faces, face_mask=jnp.asarray(mask))
+    face, _, distance = found(queries, mesh.vertices, mesh.faces, face_mask=to_namespace(mask, namespace))
     assert mask[face].all()
     _, _, expected = found(queries, mesh.vertices, mesh.faces[mask])
     np.testing.assert_allclose(distance, expected)
@@ -109,7 +115,7 @@ def test_vmap_equals_a_loop(generator):
 
 
 @pytest.mark.parametrize("search", ["all", "candidates"])
-def test_weights_are_never_negative(search, generator):
+def test_weights_are_never_negative(search, generator, namespace):
     """Without clipping, the weight of the first corner is negative for many points on the opposite edge."""
     points = generator.normal(size=(300, 3)).astype(np.float32)
     faces = np.arange(300).reshape(-1, 3)
@@ -117,11 +123,12 @@ def test_weights_are_never_negative(search, generator):
     corners = points[faces]
     queries = shares * corners[:, 1] + (1 - shares) * corners[:, 2]
     queries += (queries - corners[:, 0]) * np.float32(0.01)
+    arguments = to_namespace((queries, points, faces), namespace)
     if search == "all":
-        _, weights = compiled_search(queries, points, faces)
+        _, weights = nearest_point_on_triangles(*arguments)
     else:
-        rows = np.arange(100)
-        _, weights = nearest_point_on_candidates(*map(jnp.asarray, (queries, points, faces, rows, rows)))
+        rows = to_namespace(np.arange(100), namespace)
+        _, weights = nearest_point_on_candidates(*arguments, rows, rows)
     assert (np.asarray(weights) >= 0).all()
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=3e-7)
 
@@ -137,12 +144,13 @@ def test_no_array_of_all_queries_and_triangles_is_stored():
     assert memory.temp_size_in_bytes < m * f * 4 / 4
 
 
-def test_candidates_give_the_nearest_point_of_their_triangles(generator):
+def test_candidates_give_the_nearest_point_of_their_triangles(generator, found, namespace):
     points, queries = generator.normal(size=(20, 5)), generator.normal(size=(8, 5))
     faces = np.array([generator.choice(20, 3, replace=False) for _ in range(30)])
     rows = np.repeat(np.arange(8), 7)
     candidates = generator.integers(30, size=len(rows))
-    face, weights = nearest_point_on_candidates(*map(jnp.asarray, (queries, points, faces, rows, candidates)))
+    arguments = to_namespace((queries, points, faces, rows, candidates), namespace)
+    face, weights = nearest_point_on_candidates(*arguments)
     face, weights = np.asarray(face), np.asarray(weights)
     for query in range(8):
         own = candidates[rows == query]
