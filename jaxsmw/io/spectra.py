@@ -12,9 +12,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Float, Float64
 from numpy.typing import ArrayLike
 
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.module import import_jax
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_suffix, naming

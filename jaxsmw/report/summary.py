@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxsmw.choices import Axis
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.banks import FilterBank
 from jaxsmw.core.banks.base import sample_bank
 from jaxsmw.core.functional_map import Convention, encode
