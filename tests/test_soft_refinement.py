@@ -10,11 +10,11 @@ from scipy.spatial.distance import cdist
 from synthetic import in_precision, random_spectrum, stacked
 
 from jaxsmw.core.banks import Logarithm, Meyer, Warped
-from jaxsmw.core.functional_map import WaveletProblem, encode
+from jaxsmw.core.functional_map import WaveletProblem, encode, pull_back
 from jaxsmw.core.refinement import refine
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
-from jaxsmw.core.soft_maps import NearestFew, Recovery, Sinkhorn, Softmax, pull_back
+from jaxsmw.core.soft_maps import NearestFew, Recovery, Sinkhorn, Softmax
 from jaxsmw.core.soft_refinement import WaveletPreservationLayer, refine_softly
 from jaxsmw.core.solutions.closed_form import Filtering, LeastSquares
 from jaxsmw.core.solutions.descriptors import DescriptorPair
