@@ -146,7 +146,7 @@ def _register() -> None:
     """Make pytrees of all classes, if JAX is imported."""
     jax = sys.modules.get("jax")
     # While JAX is imported, it has no attributes yet.
-    if not _unregistered or not hasattr(jax, "tree_util"):
+    if not _unregistered or jax is None or not hasattr(jax, "tree_util"):
         return
     with _lock:
         while _unregistered:
