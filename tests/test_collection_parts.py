@@ -5,7 +5,6 @@ from dataclasses import replace
 from itertools import combinations, permutations
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.sparse import coo_array
@@ -164,8 +163,8 @@ def test_wrong_edges_are_found_by_cycles(share):
 
 
 def test_an_edge_in_no_cycle_keeps_its_prior():
-    prior = jnp.array([0.1, 0.2, 0.3, 0.7])
-    found = edge_errors(jnp.array([[0, 1, 2]]), jnp.array([0.05]), prior)
+    prior = np.array([0.1, 0.2, 0.3, 0.7])
+    found = edge_errors(np.array([[0, 1, 2]]), np.array([0.05]), prior)
     np.testing.assert_allclose(found, [0.05, 0.05, 0.05, 0.7], rtol=1e-6)
 
 
@@ -311,16 +310,12 @@ def test_points_inside_torn_triangles_follow_the_nearest_corner(body):
     np.testing.assert_allclose(torn, images[body.faces[0, [0, 2]]])
 
 
-def test_robust_mean_ignores_outliers_and_padding():
-    rng = np.random.default_rng(0)
-    candidates = jnp.asarray(rng.normal(size=(9, 5, 3)) * 0.01)
-    outlying = candidates.at[0].add(1.0)
-    start, scale = jnp.zeros((5, 3)), jnp.asarray(0.02)
-    weights = jnp.ones(9)
-    found = robust_mean(outlying, weights, start, scale)
-    assert jnp.abs(found - candidates[1:].mean(axis=0)).max() < 0.01
-    padded = robust_mean(jnp.pad(outlying, ((0, 2), (0, 0), (0, 0))), jnp.pad(weights, (0, 2)), start, scale)
-    np.testing.assert_allclose(padded, found, atol=1e-12)
+def test_robust_mean_ignores_outliers():
+    candidates = np.random.default_rng(0).normal(size=(9, 5, 3)) * 0.01
+    outlying = candidates.copy()
+    outlying[0] += 1.0
+    found = robust_mean(outlying, np.ones(9), np.zeros((5, 3)), 0.02)
+    assert np.abs(found - candidates[1:].mean(axis=0)).max() < 0.01
 
 
 # --------------------------------------------------------------------------------------------------- batches

@@ -59,15 +59,18 @@ _ARGUMENT = re.compile(
     r"(?:True|([01])(?!\.?\w)|([\"'])(\w+)\3)"
 )
 
+# An argument for a number that an option without the first words sets.
+_SIZE = re.compile(r"\bnumber_of_(eigenvectors|samples)\b")
+
 
 def with_options(message: str) -> str:
-    """Return a message of the library with options such as `--weld` in place of `weld=True`."""
+    """Return a message of the library with options such as `--weld` in place of arguments."""
 
     def option(argument: re.Match[str]) -> str:
         value = argument[2] or argument[4]
         return f"--{argument[1].replace('_', '-')}" + (f" {value}" if value else "")
 
-    return _ARGUMENT.sub(option, message)
+    return _SIZE.sub(r"--\1", _ARGUMENT.sub(option, message))
 
 
 def report_progress(message: str) -> None:

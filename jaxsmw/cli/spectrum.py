@@ -67,12 +67,11 @@ def run(options: argparse.Namespace) -> None:
         row = eigenvalues[first : first + _EIGENVALUES_PER_LINE]
         show(f"{first:5}  {' '.join(f'{value:9.2f}' for value in row)}")
     if options.output:
-        import jax
+        import numpy as np
 
         from jaxsmw.io.spectra import write_spectrum
 
-        with jax.enable_x64(True):
-            write_spectrum(options.output, as_spectrum(mesh, *pairs), mesh)
+        write_spectrum(options.output, as_spectrum(mesh, *pairs, dtype=np.float64), mesh)
         report_written(options.output)
     if options.figure:
         from jaxsmw.report.summary import draw_bank

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float, Float64, Int, Int64
+from jaxtyping import Float64, Int64
 
 from jaxsmw.errors import InputError, check_whole_number
 
@@ -67,17 +65,16 @@ def cycle_error(
 
 
 def edge_errors(
-    cycles: Int[Array, "c 3"],
-    errors: Float[Array, " c"],
-    prior: Float[Array, " e"],
-) -> Float[Array, " e"]:
+    cycles: Int64[np.ndarray, "c 3"],
+    errors: Float64[np.ndarray, " c"],
+    prior: Float64[np.ndarray, " e"],
+) -> Float64[np.ndarray, " e"]:
     """Estimate the error of each edge's map from the errors of cycles.
 
     If two maps of a cycle are right, the error of the cycle is the error of the third map. Each iteration
     averages the errors of all cycles through an edge. The weight of a cycle decreases exponentially with the
     estimated errors of its two other edges (cycle-edge message passing; Lerman, Shi, "Robust group
-    synchronization via cycle-edge message passing", Foundations of Computational Mathematics 2022). The
-    function is traced JAX code.
+    synchronization via cycle-edge message passing", Foundations of Computational Mathematics 2022).
 
     **Arguments:**
 
@@ -91,16 +88,15 @@ def edge_errors(
     number = prior.shape[0]
     # Each edge receives the errors of its cycles, whose weights depend on their two other edges.
     receiver = cycles.T.reshape(-1)
-    others = jnp.concatenate([cycles[:, [1, 2]], cycles[:, [0, 2]], cycles[:, [0, 1]]])
-    message = jnp.tile(errors, 3)
-
-    def iterate(estimate: Float[Array, " e"], sharpness: Float[Array, ""]) -> tuple[Array, None]:
-        weights = jnp.exp(-sharpness * estimate[others].sum(axis=1))
-        total = jnp.zeros(number).at[receiver].add(weights)
-        mean = jnp.zeros(number).at[receiver].add(weights * message) / jnp.maximum(total, 1e-30)
-        return jnp.where(total > 0, mean, prior), None
-
-    return lax.scan(iterate, prior, jnp.asarray(_SHARPNESS))[0]
+    others = np.concatenate([cycles[:, [1, 2]], cycles[:, [0, 2]], cycles[:, [0, 1]]])
+    message = np.tile(errors, 3)
+    estimate = prior
+    for sharpness in _SHARPNESS:
+        weights = np.exp(-sharpness * estimate[others].sum(axis=1))
+        total = np.bincount(receiver, weights, number)
+        mean = np.bincount(receiver, weights * message, number) / np.maximum(total, 1e-30)
+        estimate = np.where(total > 0, mean, prior)
+    return estimate
 
 
 def estimate_edge_errors(
@@ -133,8 +129,7 @@ def estimate_edge_errors(
     )
     if not len(shapes):
         return prior, errors, cycles
-    estimated = edge_errors(jnp.asarray(cycles), jnp.asarray(errors), jnp.asarray(prior))
-    return np.asarray(estimated, np.float64), errors, cycles
+    return edge_errors(cycles, errors, prior), errors, cycles
 
 
 def find_outliers(errors: Mapping[Edge, float], limit: float) -> tuple[int, ...]:

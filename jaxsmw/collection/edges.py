@@ -11,9 +11,8 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Int64
 
@@ -30,6 +29,11 @@ from jaxsmw.matching.stages import Preset
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress
 from jaxsmw.runtime.workers import run_tasks
+
+if TYPE_CHECKING:
+    from jax import Device
+else:
+    Device = Any
 
 logger = logging.getLogger("jaxsmw")
 
@@ -95,7 +99,7 @@ class EdgeTask(NamedTuple):
 
 
 def match_edges(
-    tasks: Iterable[EdgeTask], preset: Preset, devices: Sequence[jax.Device] | None = None
+    tasks: Iterable[EdgeTask], preset: Preset, devices: Sequence[Device] | None = None
 ) -> Iterator[EdgeMap | ArithmeticError]:
     """Match edges as `match_many` does, and yield their maps, or the error of a failed refinement.
 
@@ -132,7 +136,7 @@ class EdgeMatcher:
     aligned: bool
     store: Store
     executor: Executor | None = None
-    devices: Sequence[jax.Device] | None = None
+    devices: Sequence[Device] | None = None
     progress: Progress = no_progress
 
     def match(self, inits: Mapping[Edge, InitialMap], step: str) -> dict[Edge, EdgeMap]:
@@ -226,7 +230,7 @@ def _stored_shape(directory: Path, key: str, name: str) -> PreparedShape:
 
 def _match_stored(task: _StoredTask) -> EdgeMap:
     x, y = (_stored_shape(task.directory, key, name) for key, name in zip(task.keys, task.names, strict=True))
-    (result,) = match_edges([EdgeTask(x, y, task.init, task.aligned)], task.preset, jax.devices()[:1])
+    (result,) = match_edges([EdgeTask(x, y, task.init, task.aligned)], task.preset)
     if isinstance(result, ArithmeticError):
         raise result
     return result

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from jaxsmw.choices import DEFAULT_MIRROR, DEFAULT_PRESET, EDGES_PER_SHAPE, MirrorCollection
@@ -25,10 +25,14 @@ from jaxsmw.geometry.shortcuts import points_on_uncut
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
-from jaxsmw.runtime.batches import check_devices
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress, timed
 from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, register_mesh
+
+if TYPE_CHECKING:
+    from jax import Device
+else:
+    Device = Any
 
 # The largest number of times that contradicted edges are matched again.
 _ROUNDS = 2
@@ -46,7 +50,7 @@ def match_collection(
     seed: int = 0,
     directory: Path | str | None = None,
     executor: Executor | None = None,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Device] | None = None,
     progress: Progress | None = None,
 ) -> Collection:
     """Match all shapes of a collection, such that the maps of all pairs agree.
@@ -107,7 +111,10 @@ def match_collection(
     check_number("stiffness", stiffness, positive=True)
     check_number("edges_per_shape", edges_per_shape, positive=True)
     seed = check_whole_number("seed", seed, 0)
-    check_devices(devices)
+    if devices is not None:
+        from jaxsmw.runtime.batches import check_devices
+
+        check_devices(devices)
     if directory is not None and not Path(directory).is_dir():
         raise InputError(f"{directory}: is not a directory: create it first.")
     named = _named_meshes(meshes, names)

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 
 from jaxsmw.choices import Eigensolver
+from jaxsmw.core.arrays import is_array
+from jaxsmw.core.module import leaves
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.eigenbasis import choose_eigensolver
 from jaxsmw.geometry.mesh import Mesh
@@ -77,8 +77,8 @@ def shape_key(shape: PreparedShape, preset: Preset, eigensolver: Eigensolver) ->
 
 def preset_key(preset: Preset) -> tuple[Any, ...]:
     """Return the part of a `Store` key that identifies a preset: its text and its arrays."""
-    refiners = [stage.refiner for stage in preset.stages]
-    return repr(preset), *(np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(refiners, eqx.is_array)))
+    refiners = tuple(stage.refiner for stage in preset.stages)
+    return repr(preset), *(np.asarray(leaf) for leaf in leaves(refiners) if is_array(leaf))
 
 
 def describe_shapes(

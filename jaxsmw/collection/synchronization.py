@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float, Float64, Int64
+from jaxtyping import Float64, Int64
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
@@ -16,8 +14,6 @@ from jaxsmw.collection.consistency import Edge
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.runtime.batches import pad_rows, padded_size
-from jaxsmw.runtime.compilation import compiled
 
 # Lengths are in units of the square root of the area of each shape. Table R26 is in `docs/research_log.md`.
 # Each iteration averages the points on every shape. (Table R26)
@@ -49,20 +45,19 @@ def carry(
 
 
 def robust_mean(
-    candidates: Float[Array, "d n 3"],
-    weights: Float[Array, " d"],
-    start: Float[Array, "n 3"],
-    scale: Float[Array, ""],
-) -> Float[Array, "n 3"]:
+    candidates: Float64[np.ndarray, "d n 3"],
+    weights: Float64[np.ndarray, " d"],
+    start: Float64[np.ndarray, "n 3"],
+    scale: float,
+) -> Float64[np.ndarray, "n 3"]:
     """Average d candidates for each point, with Cauchy's weights: half the weight at `scale`."""
-
-    def iterate(mean: Float[Array, "n 3"], _: None) -> tuple[Float[Array, "n 3"], None]:
-        squared = jnp.sum((candidates - mean[None]) ** 2, axis=2)
+    mean = start
+    for _ in range(5):
+        squared = np.sum((candidates - mean) ** 2, axis=2)
         share = weights[:, None] / (1 + squared / scale**2)
-        total = jnp.maximum(share.sum(axis=0), jnp.finfo(share.dtype).tiny)
-        return jnp.sum(share[:, :, None] * candidates, axis=0) / total[:, None], None
-
-    return lax.scan(iterate, start, length=5)[0]
+        total = np.maximum(share.sum(axis=0), np.finfo(float).tiny)
+        mean = np.sum(share[:, :, None] * candidates, axis=0) / total[:, None]
+    return mean
 
 
 class Network:
@@ -92,7 +87,6 @@ class Network:
         self.units = [mesh.area**0.5 for mesh in meshes]
         self._images = {(i, j): points.positions(meshes[j]) for (i, j), points in maps.items()}
         self._neighbors = [sorted(i for i, k in maps if k == j) for j in range(len(meshes))]
-        self._most = max(map(len, self._neighbors), default=0)
 
     def error(self, i: int, j: int) -> float:
         """Return the estimated error of the maps between shapes i and j."""
@@ -141,21 +135,11 @@ class Network:
             if shape == template:
                 return points[shape]
             unit, neighbors = self.units[shape], self._neighbors[shape]
-            # Single precision cannot resolve a mesh that lies far from the origin.
-            center = self.meshes[shape].vertices.mean(axis=0)
             weights = np.array([1 / max(self.error(i, shape), 1e-3) ** 2 for i in neighbors])
-            candidates = np.stack([self.carried(points[i], i, shape) - center for i in neighbors]) / unit
-            start = (points[shape].positions(self.meshes[shape]) - center) / unit
-            n, size = len(start), padded_size(len(start))
-            # Maps and vertices are padded, so that all shapes share one compiled program.
-            padding = ((0, self._most - len(neighbors)), (0, size - n), (0, 0))
-            mean = compiled(robust_mean)(
-                jnp.asarray(np.pad(candidates, padding), jnp.float32),
-                jnp.asarray(pad_rows(weights / weights.max(), self._most), jnp.float32),
-                jnp.asarray(pad_rows(start, size), jnp.float32),
-                jnp.asarray(_ROBUST_SCALE, jnp.float32),
-            )
-            return self._project(np.asarray(mean, np.float64)[:n] * unit + center, shape)
+            candidates = np.stack([self.carried(points[i], i, shape) for i in neighbors])
+            start = points[shape].positions(self.meshes[shape])
+            mean = robust_mean(candidates, weights / weights.max(), start, _ROBUST_SCALE * unit)
+            return self._project(mean, shape)
 
         return [moved(shape) for shape in range(len(self.meshes))]
 

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import sys
 from collections.abc import Callable, Iterator
+from threading import Lock
 from typing import Any, ParamSpec, TypeVar, dataclass_transform
 
 import numpy as np
@@ -136,17 +137,21 @@ def jitted(function: Callable[Parameters, Returned]) -> Callable[Parameters, Ret
     return call
 
 
-# The classes that JAX does not know yet.
+# The classes that JAX does not know yet. A class is removed after it is registered, under the lock.
 _unregistered: list[type] = []
+_lock = Lock()
 
 
 def _register() -> None:
     """Make pytrees of all classes, if JAX is imported."""
     jax = sys.modules.get("jax")
-    if jax is None or not hasattr(jax, "tree_util"):  # while JAX is imported, it has no attributes yet
+    # While JAX is imported, it has no attributes yet.
+    if not _unregistered or jax is None or not hasattr(jax, "tree_util"):
         return
-    while _unregistered:
-        _register_class(jax.tree_util, _unregistered.pop())
+    with _lock:
+        while _unregistered:
+            _register_class(jax.tree_util, _unregistered[-1])
+            _unregistered.pop()
 
 
 def _register_class(tree_util: Any, kind: type) -> None:

@@ -14,7 +14,7 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, splu
 
 from jaxsmw.choices import APPROXIMATE_FROM, NUMBER_OF_EIGENVECTORS, Eigensolver, Laplacian
-from jaxsmw.core.arrays import on_host
+from jaxsmw.core.arrays import float_type
 from jaxsmw.core.checks import check_kind
 from jaxsmw.core.module import import_jax
 from jaxsmw.core.spectrum import Spectrum
@@ -100,16 +100,20 @@ def as_spectrum(
     eigenvalues: Float64[np.ndarray, " k"],
     eigenvectors: Float64[np.ndarray, "n k"],
     vertex_areas: Float64[np.ndarray, " n"],
+    *,
+    dtype: type[np.floating] | None = None,
 ) -> Spectrum:
-    """Return the `eigenpairs` of a mesh as a `Spectrum` of NumPy arrays, of JAX's default float type."""
+    """Return the `eigenpairs` of a mesh as a `Spectrum` of NumPy arrays, by default of JAX's float type."""
     referenced = mesh.referenced_vertices
     # Positions are relative to the centroid. In single precision, absolute positions of a mesh far from the
     # origin would be inaccurate.
     centered = mesh.vertices - mesh.average(mesh.vertices)
     positions = np.where(referenced[:, None], centered / np.sqrt(mesh.area), 0)
     normals = -mesh.vertex_normals if mesh.is_inside_out else mesh.vertex_normals
-    arrays = map(on_host, (eigenvalues, eigenvectors, vertex_areas, referenced))
-    return Spectrum(*arrays).with_positions(on_host(positions), on_host(normals))
+    dtype = dtype or float_type()
+    numbers = eigenvalues, eigenvectors, vertex_areas, positions, normals
+    values, vectors, areas, *directions = (array.astype(dtype) for array in numbers)
+    return Spectrum(values, vectors, areas, referenced).with_positions(*directions)
 
 
 def eigenpairs(

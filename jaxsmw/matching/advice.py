@@ -63,12 +63,12 @@ def _suspicion(correspondence: Correspondence) -> str:
             if correspondence.mirrored
             else '; if one mesh is a mirror image of the other, set mirror="yes"'
         )
-    if pair.partial:
+    if pair.partial and pair.scale == 1:
         cure += (
             ", and check that both meshes have the same unit of length, or estimate the scale with "
             'scale="unknown"'
         )
-    else:
+    if not pair.partial:
         cure += "; if one mesh is a partial shape, set partial=True"
     return (
         f"{pair.name}: limbs may be swapped or mirrored, or the body may be upside down. The map has "

@@ -15,9 +15,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int
+from jaxtyping import Float, Float64, Int
 
 from jaxsmw.choices import Axis
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.errors import InputError, check_number, check_suffix
 from jaxsmw.geometry.mesh import Mesh

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Array, Float, Float64
+from jaxtyping import Float, Float64
 
+from jaxsmw.core.arrays import Array
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 

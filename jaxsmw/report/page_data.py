@@ -6,8 +6,9 @@ import base64
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float, Float64, Shaped
+from jaxtyping import Float, Float64, Shaped
 
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError

@@ -12,13 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from jaxsmw.choices import Axis
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.banks import FilterBank
+from jaxsmw.core.banks.base import sample_bank
 from jaxsmw.core.functional_map import Convention, encode
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
@@ -39,7 +39,7 @@ from jaxsmw.report.figures import (
 )
 from jaxsmw.report.page import EXPECTED_ERROR, ShownMap, write_page
 from jaxsmw.report.page_data import eigenvectors_on_page
-from jaxsmw.runtime.compilation import compiled
+from jaxsmw.runtime.backends import device
 from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.progress import timed
 from jaxsmw.runtime.provenance import machine, versions
@@ -310,11 +310,7 @@ def _encoded(
     convention: Convention = "pullback",
 ) -> Float[np.ndarray, "k_out k_in"]:
     """Compute the functional map of a pointwise map, with the float type of the spectra."""
-    with jax.enable_x64(spectrum_x.eigenvectors.dtype == np.float64):
-        encoded = compiled(encode)(
-            jax.device_put(pointwise_map), spectrum_x, spectrum_y, convention=convention
-        )
-        return np.asarray(encoded)
+    return np.asarray(encode(pointwise_map, spectrum_x, spectrum_y, convention=convention))
 
 
 def _title(mesh_x: Mesh, mesh_y: Mesh) -> str:
@@ -326,9 +322,8 @@ def draw_bank(bank: FilterBank, eigenvalues: Float[np.ndarray, " k"]) -> Figure:
 
     The figure marks the ascending eigenvalues of a shape (k,), and ends at the last eigenvalue.
     """
-    spectrum = jnp.asarray(eigenvalues)
-    grid = jnp.linspace(0, spectrum[-1], 1000)
-    return draw_filters(np.asarray(grid), np.asarray(bank(grid, spectrum)), eigenvalues)
+    grid = np.linspace(0, eigenvalues[-1], 1000, dtype=eigenvalues.dtype)
+    return draw_filters(grid, sample_bank(bank, grid, eigenvalues), eigenvalues)
 
 
 def draw_errors(errors: Mapping[str, GeodesicError]) -> Figure:
@@ -380,5 +375,8 @@ def summarize(
 
 
 def provenance() -> dict[str, str]:
-    """Return a dictionary of the facts on which results depend: package versions, machine and device."""
-    return {**versions(), "machine": machine(), "device": jax.devices()[0].device_kind}
+    """Return a dictionary of the facts on which results depend: package versions, machine and device.
+
+    The device is the processor, unless JAX has an accelerator.
+    """
+    return {**versions(), "machine": machine(), "device": device()}

@@ -26,3 +26,12 @@ def chosen_backend(backend: Backend) -> Literal["numpy", "jax"]:
     import jax
 
     return "numpy" if jax.default_backend() == "cpu" else "jax"
+
+
+def device() -> str:
+    """Return the kind of device on which one pair is refined: `"cpu"`, or the name of an accelerator."""
+    if chosen_backend("auto") == "numpy":
+        return "cpu"
+    import jax
+
+    return jax.devices()[0].device_kind
