@@ -109,14 +109,14 @@ def test_masked_rows_are_never_chosen(n, method):
     np.testing.assert_array_equal(nearest, np.flatnonzero(mask)[brute_force(queries, database[mask])])
 
 
-def test_indices_are_in_range_for_nan_and_for_masks_without_rows(method):
+def test_indices_are_in_range_for_nan_and_infinity_and_for_masks_without_rows(method):
     generator = np.random.default_rng(0)
     queries, database = generator.normal(size=(300, 4)), generator.normal(size=(50, 4))
     queries[::2] = np.nan
     huge = nearest_neighbor(1e200 * database, 1e200 * database)
     nearest = nearest_neighbor(queries, database)
     np.testing.assert_array_equal(nearest[1::2], brute_force(queries[1::2], database))
-    database[7] = np.nan
+    queries[0], database[7], database[8], database[9] = np.inf, np.nan, np.inf, -np.inf
     for result in (
         huge,
         nearest,

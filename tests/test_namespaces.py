@@ -13,8 +13,10 @@ from synthetic import bumpy_mesh, in_precision, refine_in, to_namespace
 from threadpoolctl import threadpool_limits
 
 from jaxsmw.core import host_search
-from jaxsmw.core.arrays import cond, fori_loop, in_blocks, namespace, on_host, replaced, scan, segment_min
+from jaxsmw.core.arrays import cond, fori_loop, in_blocks, on_host, replaced, scan, segment_min
+from jaxsmw.core.arrays import namespace as namespace_of
 from jaxsmw.core.banks import CubicSpline, FilterBank, Gabor, Heat, Identity, Meyer, SoftmaxFrame, tighten
+from jaxsmw.core.module import leaves
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -94,8 +96,7 @@ def check_that_both_agree(pair, dtype, *, on_samples=False, **settings):
         np.testing.assert_allclose(series, expected, rtol=100 * tolerance, atol=0.01)
     if host.history.pointwise_maps is not None:
         assert np.mean(host.history.pointwise_maps == np.asarray(traced.history.pointwise_maps)) > 0.99
-    leaves = [jax.tree.leaves(refinement) for refinement in (host, traced)]
-    for one, other in zip(*leaves, strict=True):
+    for one, other in zip(leaves(host), leaves(traced), strict=True):
         assert (one.dtype, one.shape) == (other.dtype, other.shape) and not isinstance(one, jax.Array)
 
 
@@ -145,7 +146,7 @@ class Vanishing(FilterBank):
     share: float
 
     def __call__(self, points, eigenvalues):
-        xp = namespace(points)
+        xp = namespace_of(points)
         return xp.where(points <= self.share * eigenvalues[-1], xp.ones_like(points), 0)[None]
 
 
@@ -153,7 +154,7 @@ class Flat(FilterBank):
     """A bank with one constant filter."""
 
     def __call__(self, points, eigenvalues):
-        return namespace(points).ones_like(points)[None]
+        return namespace_of(points).ones_like(points)[None]
 
 
 def with_entry(array, index, value):
@@ -242,6 +243,23 @@ class Record(NamedTuple):
     nothing: None
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_changes_of_a_spectrum_keep_its_types(pair, dtype, namespace):
+    spectrum = in_precision(to_namespace(pair[0], namespace), dtype)
+    vertices = to_namespace(np.arange(0, 600, 7), namespace)
+    for changed in (
+        spectrum.scale(np.float64(0.3)),
+        spectrum.reflect(),
+        spectrum.truncate(5),
+        spectrum.pad(700),
+        spectrum.sample(vertices),
+        spectrum.excluding(spectrum.eigenvectors[:, 1] > 0),
+    ):
+        assert [leaf.dtype for leaf in leaves(changed)] == [leaf.dtype for leaf in leaves(spectrum)]
+        assert {type(leaf) for leaf in leaves(changed)} == {type(spectrum.mask)}
+    np.testing.assert_allclose(spectrum.excluding(~spectrum.mask).vertex_areas.sum(), 1, rtol=1e-5)
+
+
 def both(compute, *arrays):
     """Return the results of a function for arrays of JAX, compiled, and for arrays of NumPy, as lists."""
     traced = jax.jit(compute)(*to_namespace(arrays, "jax"))
@@ -274,7 +292,7 @@ def test_inputs_are_not_changed_and_their_namespace_is_kept():
     numbers = NUMBERS.copy()
     assert isinstance(replaced(numbers, 0, 5.0), np.ndarray)
     np.testing.assert_array_equal(numbers, NUMBERS)
-    assert namespace(numbers) is np and namespace(numbers, jnp.zeros(1)) is jnp
+    assert namespace_of(numbers) is np and namespace_of(numbers, jnp.zeros(1)) is jnp
     assert isinstance(on_host(jnp.zeros(2, jnp.float32)), np.ndarray)
     assert (
         on_host(np.zeros(2, np.int64)).dtype == np.int32 and on_host(np.zeros(2, np.float32)).dtype == float

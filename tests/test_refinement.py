@@ -454,8 +454,8 @@ def test_at_least_one_iteration_is_needed(pair):
         refine(*pair[:3], iterations=0)
 
 
-def test_the_loop_accepts_new_refiners(pair):
-    """This refiner computes the orthogonal functional map of spectral ICP, without wavelets."""
+def test_the_loop_accepts_new_refiners(pair, refine):
+    """This refiner computes the orthogonal functional map of spectral ICP, without wavelets, by JAX alone."""
 
     class Orthogonal(WaveletPreservation):
         def update(self, prepared, pointwise_map, previous):

@@ -129,9 +129,9 @@ def _prepare(problem: _Problem) -> tuple[Sequence[_Block], _Search]:
     mask = None if problem[2] is None else np.asarray(problem[2])
     rows = _distinct_rows(database, mask)
     points = database if len(rows) == len(database) else database[rows]
-    center = points.mean(axis=0, dtype=np.float64)
     blocks = [slice(start, start + _BLOCK) for start in range(0, len(queries), _BLOCK)]
     with np.errstate(over="ignore", invalid="ignore"):
+        center = points.mean(axis=0, dtype=np.float64)
         # Squared distances between very large numbers are infinite and exclude nothing.
         if np.isfinite(np.vdot(points, points) + np.vdot(queries, queries)):
             if len(points) > _LEAF and len(queries) > _QUERIES_PER_AXIS * queries.shape[1]:

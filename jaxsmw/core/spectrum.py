@@ -59,6 +59,7 @@ class Spectrum(Module):
 
     def scale(self, factor: float) -> Spectrum:
         """Return the spectrum of the shape whose areas are multiplied by a positive `factor`."""
+        factor = float(factor)  # a number of NumPy would change the float type of the arrays
         return dataclasses.replace(
             self,
             eigenvalues=self.eigenvalues / factor,
