@@ -166,6 +166,7 @@ def with_entry(array, index, value):
 FAULTS = {
     "NaN in X": (lambda x, y, t: (replace(x, eigenvectors=with_entry(x.eigenvectors, (0, 3), np.nan)), y, t), {}, RESULTS.nonfinite_spectrum),
     "X is NaN": (lambda x, y, t: (replace(x, eigenvectors=x.eigenvectors * np.nan), y, t), {}, RESULTS.nonfinite_spectrum),
+    "infinite descriptors": (lambda x, y, t: (x, y.with_descriptors(np.copysign(np.inf, y.descriptors)), t), {"number_of_descriptors": 4}, RESULTS.nonfinite_spectrum),
     "infinite eigenvalue": (lambda x, y, t: (x, replace(y, eigenvalues=with_entry(y.eigenvalues, 2, np.inf)), t), {}, RESULTS.nonfinite_spectrum),
     "too large": (lambda x, y, t: (x, y, with_entry(t, 3, 600)), {}, RESULTS.invalid_initial_map),
     "negative": (lambda x, y, t: (x, y, with_entry(t, 3, -1)), {}, RESULTS.invalid_initial_map),
@@ -193,15 +194,19 @@ def test_both_namespaces_report_the_same_failure_without_warnings(pair, fault):
         assert (refinement.pointwise_map == -1).all() and (refinement.history.pointwise_maps == -1).all()
 
 
+@pytest.mark.parametrize("sampled", [False, True])
 @pytest.mark.parametrize("name", COARSE_TO_FINE)
-@pytest.mark.parametrize("fault", ["X is NaN", "too large", "negative", "masked"])
-def test_coarse_to_fine_refiners_report_the_same_failure(pair, name, fault):
+@pytest.mark.parametrize(
+    "fault", ["X is NaN", "too large", "far below zero", "masked", "infinite descriptors"]
+)
+def test_coarse_to_fine_refiners_report_failures_without_warnings(pair, name, fault, sampled):
     x, y, initial_map, samples = pair
     damage, _, expected = FAULTS[fault]
-    settings = {"refiner": REFINERS[name], "iterations": 2}
-    for vertices in (None, samples):
-        refined = refine_in("numpy", *damage(x, y, initial_map), samples=vertices, **settings)
-        assert refined.result == expected
+    x, y, start = damage(x, y, initial_map)
+    settings = {"number_of_descriptors": 4, "number_of_samples": SAMPLES if sampled else None}
+    stages = [Stage(REFINERS[name], **settings)]
+    outcome = run(stages, SpectralPair(x, y, samples if sampled else None), Start(start))
+    assert outcome.runs[-1].refinement.result == expected and not outcome.successful
 
 
 def test_too_few_samples_are_reported(pair):
