@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from sampled_cases import first_always
 from scipy.spatial.distance import cdist
+from synthetic import to_namespace
 
 from jaxsmw.core.search import SearchProblem, nearest_in_both, nearest_neighbor
 from jaxsmw.core.traced_search import queries_per_block
@@ -46,17 +47,14 @@ def test_equals_brute_force(m, n, d):
 @pytest.mark.parametrize(
     "sizes", [((30, 200, 4), (150, 90, 7)), ((64, 64, 3), (64, 64, 3)), ((1, 5, 2), (300, 2, 1))]
 )
-def test_two_searches_in_one_loop_equal_two_searches(sizes):
+def test_two_searches_at_once_equal_two_searches(sizes, namespace):
     """The numbers of queries, of rows and of dimensions can differ."""
     generator = np.random.default_rng(0)
     problems = [
-        SearchProblem(
-            jnp.asarray(generator.normal(size=(m, d))),
-            jnp.asarray(generator.normal(size=(n, d))),
-            jnp.arange(n) % 3 != 1,
-        )
+        SearchProblem(generator.normal(size=(m, d)), generator.normal(size=(n, d)), np.arange(n) % 3 != 1)
         for m, n, d in sizes
     ]
+    problems = to_namespace(problems, namespace)
     for one, found in zip(problems, nearest_in_both(*problems), strict=True):
         distances = cdist(one.queries, one.database) + np.where(one.database_mask, 0, np.inf)
         np.testing.assert_array_equal(found, np.argmin(distances, axis=1))
@@ -78,36 +76,31 @@ def test_the_size_of_blocks_changes_no_match(size, monkeypatch):
     check_against_brute_force(nearest_neighbor, 300, 450, 7, draws=3)
 
 
-def test_ties_go_to_the_lowest_index():
-    corners = jnp.asarray([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0], [2.0, 2.0]])
+def test_ties_go_to_the_lowest_index(namespace):
+    corners = np.asarray([[0.0, 0.0], [2.0, 0.0], [0.0, 2.0], [2.0, 2.0]])
+    queries = np.asarray([[1.0, 1.0], [2.0, 1.0], [3.0, 3.0]])
     for repeats in (1, 40, 100):
-        database = jnp.tile(corners, (repeats, 1))
-        assert nearest_neighbor(jnp.asarray([[1.0, 1.0], [2.0, 1.0], [3.0, 3.0]]), database).tolist() == [
-            0,
-            1,
-            3,
-        ]
+        arguments = to_namespace((queries, np.tile(corners, (repeats, 1))), namespace)
+        assert nearest_neighbor(*arguments).tolist() == [0, 1, 3]
 
 
 @pytest.mark.parametrize("n", [5, 100, 300])
-def test_masked_rows_are_never_chosen(n):
+def test_masked_rows_are_never_chosen(n, namespace):
     generator = np.random.default_rng(0)
     queries, database = generator.normal(size=(80, 4)), generator.normal(size=(n, 4))
     mask = generator.random(n) < 0.3
     mask[-1] = True
-    nearest = nearest_neighbor(jnp.asarray(queries), jnp.asarray(database), database_mask=jnp.asarray(mask))
+    arguments = to_namespace((queries, database, mask), namespace)
+    nearest = nearest_neighbor(*arguments[:2], database_mask=arguments[2])
     allowed = np.flatnonzero(mask)
     np.testing.assert_array_equal(nearest, allowed[cdist(queries, database[mask]).argmin(axis=1)])
 
 
-def test_padding_changes_nothing():
+def test_padding_changes_nothing(namespace):
     generator = np.random.default_rng(0)
-    queries, database = (
-        jnp.asarray(generator.normal(size=(90, 5))),
-        jnp.asarray(generator.normal(size=(70, 5))),
-    )
-    padded = jnp.concatenate([database, jnp.zeros((200, 5))])
-    mask = jnp.arange(270) < 70
+    queries, database = generator.normal(size=(90, 5)), generator.normal(size=(70, 5))
+    padded, mask = np.concatenate([database, np.zeros((200, 5))]), np.arange(270) < 70
+    queries, database, padded, mask = to_namespace((queries, database, padded, mask), namespace)
     np.testing.assert_array_equal(
         nearest_neighbor(queries, padded, database_mask=mask), nearest_neighbor(queries, database)
     )
