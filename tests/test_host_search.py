@@ -87,6 +87,13 @@ def test_exhaustive_search_gives_equal_distances_to_the_lowest_index():
         assert nearest_neighbor(queries, np.tile(corners, (repeats, 1))).tolist() == [0, 1, 3]
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_repeated_rows_of_round_numbers_are_removed(dtype):
+    rows = np.stack(np.meshgrid(np.arange(-4, 4), np.arange(8)), axis=-1).reshape(-1, 2).astype(dtype)
+    distinct = host_search._distinct_rows(np.tile(rows, (50, 1)), None)
+    np.testing.assert_array_equal(distinct, np.arange(64))
+
+
 def test_rows_with_equal_hashes_stay_apart(monkeypatch):
     class NoFactors:
         def integers(self, high, size, dtype):

@@ -157,7 +157,8 @@ def _distinct_rows(
         return np.zeros(1, int)
     # The sum turns -0.0 into 0.0, which is equal but has other bits.
     points = np.ascontiguousarray(database[allowed] + 0)
-    words = points.view(np.dtype(f"u{points.itemsize}"))
+    # Words of 64 bits would have poor hashes, because only the first bits of round numbers are not zero.
+    words = points.view(np.uint32)
     factors = np.random.default_rng(0).integers(2**63, size=words.shape[1], dtype=np.uint64)
     hashes = (words * factors).sum(axis=1, dtype=np.uint64)
     _, first, same = np.unique(hashes, return_index=True, return_inverse=True)
