@@ -24,6 +24,7 @@ from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.matching.starts import make_starts
 from jaxsmw.runtime.backends import chosen_backend
+from jaxsmw.runtime.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from jax import Device
@@ -109,7 +110,7 @@ def prepare_task(
     """
     pair = Pair(x.mesh, y.mesh)
     prepared = PreparedPair.of(pair, x, y, given=given)
-    with warned_already():
+    with warned_already(), one_blas_thread():
         starts = make_starts(
             prepared, DEFAULT_INITIAL_MAP if init is None else init, rigid=aligned and init is None
         )
@@ -160,6 +161,7 @@ def _matched(
     outcomes: Sequence[Outcome] = (),
 ) -> Correspondence | ArithmeticError:
     try:
-        return match_prepared(prepared, starts, preset, outcomes=outcomes)
+        with one_blas_thread():
+            return match_prepared(prepared, starts, preset, outcomes=outcomes)
     except ArithmeticError as error:
         return error

@@ -141,31 +141,33 @@ def match(
 
     seconds: dict[str, float] = {}
     step = functools.partial(timed, seconds=seconds)
-    prepared = prepare(
-        surfaces,
-        method.sizes,
-        given=pair,
-        laplacian=laplacian,
-        eigensolver=eigensolver,
-        backend=backend,
-        step=step,
-    )
-    aligns = automatic and method.repair is not None  # "aligned" is used only for asymmetric shapes
-    decision = Decision(mirror == "yes")
-    if (mirror == "auto" or aligns) and not partial:
-        with step("mirror test"):
-            decision = Hands(surfaces, *prepared.spectra.both).decide(mirror)
-    # SHOT changes in a mirror image, so initial maps and descriptors are computed after this decision.
-    if decision.mirrored:
-        if mirror == "auto":
-            logger.info("%s: the mirror image of the source is matched", pair.name)
-        prepared = prepared.mirror()
-    with step("initial map"):
-        starts = make_starts(prepared, first_init, rigid=aligns and decision.asymmetric)
-    if method.number_of_descriptors:
-        with step("descriptors"):
-            prepared = prepared.describe(method.number_of_descriptors, required=not adapts)
-    correspondence = match_prepared(prepared, starts, method, step=step)
+    # Searches and preparation use all cores, for which threads of the linear algebra would only wait.
+    with one_blas_thread():
+        prepared = prepare(
+            surfaces,
+            method.sizes,
+            given=pair,
+            laplacian=laplacian,
+            eigensolver=eigensolver,
+            backend=backend,
+            step=step,
+        )
+        aligns = automatic and method.repair is not None  # "aligned" is used only for asymmetric shapes
+        decision = Decision(mirror == "yes")
+        if (mirror == "auto" or aligns) and not partial:
+            with step("mirror test"):
+                decision = Hands(surfaces, *prepared.spectra.both).decide(mirror)
+        # SHOT changes in a mirror image, so initial maps and descriptors are computed after this decision.
+        if decision.mirrored:
+            if mirror == "auto":
+                logger.info("%s: the mirror image of the source is matched", pair.name)
+            prepared = prepared.mirror()
+        with step("initial map"):
+            starts = make_starts(prepared, first_init, rigid=aligns and decision.asymmetric)
+        if method.number_of_descriptors:
+            with step("descriptors"):
+                prepared = prepared.describe(method.number_of_descriptors, required=not adapts)
+        correspondence = match_prepared(prepared, starts, method, step=step)
     # The advice distinguishes a map that looks wrong from a doubtful hand. The result does not.
     for text in advice(correspondence, decision):
         warnings.warn(text, stacklevel=2)
@@ -202,7 +204,7 @@ def match_prepared(
     preset = prepared.usable(preset)
     known: Sequence[Outcome | None] = outcomes or [None] * len(starts)
     candidates = []
-    with step("refinement"), one_blas_thread():
+    with step("refinement"):
         for start, outcome in zip(starts, known, strict=True):
             scored = refine_and_judge(prepared, start, preset, outcome)
             candidates.append((start, repair_map(prepared, start, preset, scored)))
@@ -212,7 +214,7 @@ def match_prepared(
         with step("choice of start"):
             start, scored = _choose(prepared, preset, successful)
     last = step("final stages") if preset.final or preset.repair else nullcontext()
-    with last, one_blas_thread():
+    with last:
         if trimmed := match_trimmed(prepared, preset, scored):
             prepared, scored = trimmed
         else:

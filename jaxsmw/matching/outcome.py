@@ -16,6 +16,7 @@ from jaxsmw.core.refiner import Problem, Refiner, State
 from jaxsmw.core.results import RESULTS
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
+from jaxsmw.runtime.threads import one_blas_thread
 
 Computed = TypeVar("Computed")
 
@@ -77,7 +78,7 @@ class StageRun:
 
             # Stages with other levels share the program.
             return compiled(function)(self.stage.refiner.with_traced_levels(), problem, self.refinement.state)
-        with np.errstate(all="ignore"):  # status codes report failures
+        with np.errstate(all="ignore"), one_blas_thread():
             return function(self.stage.refiner, problem, self.refinement.state)
 
 
