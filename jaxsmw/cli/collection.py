@@ -157,7 +157,7 @@ def run(options: argparse.Namespace) -> None:
             _write(options, collection, meshes, model, measures, make_directory(new))
             replace_results(new, directory)
     _show(collection, model, scale=options.scale)
-    show(f"time: {stopwatch.summary()} (compilation included)")
+    show(f"time: {stopwatch.summary()}")
     report_progress(f"the results are in {options.output}")
 
 

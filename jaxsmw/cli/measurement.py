@@ -118,4 +118,4 @@ def show_match(
     show_quality(correspondence)
     for name, error in errors.items():
         show(f"{name + ' map:':12} {error}")
-    show(f"time:        {stopwatch.summary()} (compilation included)")
+    show(f"time:        {stopwatch.summary()}")

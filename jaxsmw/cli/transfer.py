@@ -138,7 +138,7 @@ def run(options: argparse.Namespace) -> None:
             registered=registered,
             landmarks=(landmarks, transferred) if landmarks and transferred else None,
         )
-    show(f"time: {stopwatch.summary()} (compilation included)")
+    show(f"time: {stopwatch.summary()}")
 
 
 def _check(options: argparse.Namespace) -> None:

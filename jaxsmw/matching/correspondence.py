@@ -81,8 +81,8 @@ class Correspondence:
       have values above 0.3. See `jaxsmw.matching.search.chirality.Hands`.
     - `left_out`: the share of X's area in small components that have no counterpart on Y and only move with
       their surroundings; see `jaxsmw.transfer.match_small_components`.
-    - `seconds`: a dictionary from the name of each step to its wall time in seconds. If meshes of a certain
-      size are refined for the first time, the time includes compilation.
+    - `seconds`: a dictionary from the name of each step to its wall time in seconds. If JAX refines meshes of
+      a certain size for the first time, the time includes compilation.
     """
 
     pair: Pair

@@ -146,6 +146,7 @@ def write_report(
     summary = {
         "settings": dict(settings or {}),
         "result": summarize(correspondence, errors, steps),
+        "backend": correspondence.backend,
         "distortion": correspondence.distortion,
         "suspicious": correspondence.suspicious,
         "wrong_probability": correspondence.wrong_probability(),
@@ -351,6 +352,7 @@ def summarize(
         "vertices": f"{len(correspondence.mesh_x.vertices)} to {len(correspondence.mesh_y.vertices)}",
         "functional map": "{} x {}".format(*correspondence.functional_map.shape),
         "iterations": str(correspondence.iterations),
+        "refined by": {"numpy": "NumPy", "jax": "JAX"}[correspondence.backend],
     }
     if correspondence.mirrored or correspondence.mirror_evidence is not None:
         evidence = correspondence.mirror_evidence
