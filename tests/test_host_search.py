@@ -166,7 +166,9 @@ def test_all_methods_and_jax_give_the_same_on_surfaces(spaces, name, dtype, monk
 
 def test_most_clusters_are_excluded():
     points = np.asarray(compute_spectrum(bumpy_mesh(5), 30).eigenvectors)
-    clusters = host_search._Clusters.of(points, np.arange(len(points)), points.mean(axis=0))
+    clusters = host_search._Clusters.of(
+        points, np.arange(len(points)), points.mean(axis=0), host_search._halved(points, 40)
+    )
     block = host_search._halved(points, 128)[3]
     assert len(clusters.needed(points[block])) < 0.15 * len(clusters.members)
     np.testing.assert_array_equal(clusters.search(points[block]), block)
