@@ -137,10 +137,6 @@ def _prepare(problem: SearchProblem) -> tuple[Sequence[_Block], _Search]:
     with np.errstate(over="ignore", invalid="ignore"):
         # Squared distances between very large numbers are infinite and exclude nothing.
         if np.isfinite(np.vdot(points, points) + np.vdot(queries, queries)):
-            if len(points) > _LEAF and len(queries) > _QUERIES_PER_AXIS * queries.shape[1]:
-                axes = _principal_axes(points, center)
-                if _share_of_near_points(queries, points, center, axes) < _SHARE:
-                    return blocks, _by_tree(points, rows, center, axes)
             if len(points) >= _CLUSTERED_FROM and len(queries) * _POINTS_PER_QUERY >= len(points):
                 with _threads() as run:
                     sizes = _CLUSTER, _CLUSTERED_BLOCK
@@ -150,6 +146,10 @@ def _prepare(problem: SearchProblem) -> tuple[Sequence[_Block], _Search]:
                 needed = np.mean([len(clusters.needed(queries[block])) for block in tried])
                 if needed < _NEEDED * len(members):
                     return list(near_queries), clusters.search
+            if len(points) > _LEAF and len(queries) > _QUERIES_PER_AXIS * queries.shape[1]:
+                axes = _principal_axes(points, center)
+                if _share_of_near_points(queries, points, center, axes) < _SHARE:
+                    return blocks, _by_tree(points, rows, center, axes)
         return blocks, _exhaustive(points, rows, center.astype(points.dtype))
 
 
