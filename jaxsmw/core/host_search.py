@@ -5,7 +5,8 @@
 - The exhaustive search compares all queries with all database points by matrix products.
 - The search by tree rotates the points to the principal axes of the database and builds a k-d tree. It is
   faster if the first axes exclude most points, as in the joint space of `Registration`.
-- The search in clusters skips most groups of points of large databases.
+- The search in clusters divides large databases into groups of nearby points, these into smaller groups, and
+  so on. It skips groups that are too far away from a block of nearby queries.
 
 A few queries decide which search is the fastest. CPU times in seconds in float32 on one core of an AMD EPYC,
 on data of a FAUST pair of which the large meshes were subdivided:
@@ -16,10 +17,13 @@ on data of a FAUST pair of which the large meshes were subdivided:
 |  5 000 | `Registration`, 142        |      0.085 | 0.036 |          |
 |  5 000 | `FeatureRegression`, 120   |      0.075 |  0.19 |          |
 |  5 000 | `WaveletPreservation`, 100 |      0.064 |   0.9 |          |
-| 20 000 | eigenvectors, 60           |       0.95 |       |     0.41 |
-| 20 000 | eigenvectors, 120          |        1.6 |       |     0.97 |
-| 80 000 | eigenvectors, 60           |         15 |   460 |      2.3 |
-| 80 000 | eigenvectors, 120          |         25 |  1000 |      6.5 |
+| 30 000 | `WaveletPreservation`, 100 |            |       |      1.1 |
+| 30 000 | `Registration`, 142        |            |   0.5 |      0.6 |
+| 80 000 | eigenvectors, 60           |         15 |   460 |          |
+| 80 000 | eigenvectors, 120          |         25 |  1000 |          |
+|   10⁵  | `WaveletPreservation`, 100 |            |       |      3.6 |
+|   10⁵  | `Registration`, 142        |            |   3.1 |      2.3 |
+|   10⁶  | `WaveletPreservation`, 100 |            |       |       45 |
 """
 
 from __future__ import annotations
@@ -54,11 +58,12 @@ _QUERIES_PER_AXIS = 16
 # of its preparation. It is chosen if a few blocks need less than _NEEDED of all clusters.
 _CLUSTERED_FROM, _POINTS_PER_QUERY, _NEEDED = 15_000, 4, 0.4
 # The number of points in a cluster, the number of axes of its box, and the number of queries in a block.
-# These values gave the fastest search of 20 000 and of 80 000 points in 60 and in 120 dimensions.
+# These values gave fast searches of 20 000 to 300 000 points in 60 to 120 dimensions. With clusters of 20
+# points or with 4 axes, the time changes by less than 15 %.
 _CLUSTER, _AXES, _CLUSTERED_BLOCK = 40, 6, 128
 # The number of blocks that decide whether clusters are used.
 _TRIED_BLOCKS = 8
-# The number of parts of a group of clusters, a power of two.
+# The number of parts of a group of clusters, a power of two. With 4 and 16, the time is nearly the same.
 _PARTS = 8
 # The number of random directions along which groups are halved. With all coordinates, halving a million
 # points of 100 dimensions takes 2.5 times as long, and the search then takes 0.9 times as long.
