@@ -33,6 +33,7 @@ def force(monkeypatch, method):
             ("_POINTS_PER_QUERY", 10**6),
             ("_NEEDED", np.inf),
             ("_CLUSTER", 10),
+            ("_PARTS", 2),
         ):
             monkeypatch.setattr(host_search, name, value)
 
@@ -174,7 +175,9 @@ def test_all_methods_and_jax_give_the_same_on_surfaces(spaces, name, dtype, monk
 
 def test_most_clusters_are_excluded():
     points = np.asarray(compute_spectrum(bumpy_mesh(5), 30).eigenvectors)
-    clusters = host_search._Clusters.of(points, np.arange(len(points)), points.mean(axis=0))
+    members = host_search._halved(points, 10)
+    clusters = host_search._Clusters.of(points, np.arange(len(points)), points.mean(axis=0), members)
+    assert [len(level.centers) for level in clusters.levels] == [128, 1024]
     block = host_search._halved(points, 128)[3]
     assert len(clusters.needed(points[block])) < 0.15 * len(clusters.members)
     np.testing.assert_array_equal(clusters.search(points[block]), block)

@@ -5,7 +5,8 @@
 - The exhaustive search compares all queries with all database points by matrix products.
 - The search by tree rotates the points to the principal axes of the database and builds a k-d tree. It is
   faster if the first axes exclude most points, as in the joint space of `Registration`.
-- The search in clusters skips most groups of points of large databases.
+- The search in clusters divides large databases into groups of nearby points, these into smaller groups, and
+  so on. It skips groups that are too far away from a block of nearby queries.
 
 A few queries decide which search is the fastest. CPU times in seconds in float32 on one core of an AMD EPYC,
 on data of a FAUST pair of which the large meshes were subdivided:
@@ -16,10 +17,13 @@ on data of a FAUST pair of which the large meshes were subdivided:
 |  5 000 | `Registration`, 142        |      0.085 | 0.036 |          |
 |  5 000 | `FeatureRegression`, 120   |      0.075 |  0.19 |          |
 |  5 000 | `WaveletPreservation`, 100 |      0.064 |   0.9 |          |
-| 20 000 | eigenvectors, 60           |       0.95 |       |     0.41 |
-| 20 000 | eigenvectors, 120          |        1.6 |       |     0.97 |
-| 80 000 | eigenvectors, 60           |         15 |   460 |      2.3 |
-| 80 000 | eigenvectors, 120          |         25 |  1000 |      6.5 |
+| 30 000 | `WaveletPreservation`, 100 |            |       |      1.1 |
+| 30 000 | `Registration`, 142        |            |   0.5 |      0.6 |
+| 80 000 | eigenvectors, 60           |         15 |   460 |          |
+| 80 000 | eigenvectors, 120          |         25 |  1000 |          |
+|   10⁵  | `WaveletPreservation`, 100 |            |       |      3.6 |
+|   10⁵  | `Registration`, 142        |            |   3.1 |      2.3 |
+|   10⁶  | `WaveletPreservation`, 100 |            |       |       45 |
 """
 
 from __future__ import annotations
@@ -54,10 +58,16 @@ _QUERIES_PER_AXIS = 16
 # of its preparation. It is chosen if a few blocks need less than _NEEDED of all clusters.
 _CLUSTERED_FROM, _POINTS_PER_QUERY, _NEEDED = 15_000, 4, 0.4
 # The number of points in a cluster, the number of axes of its box, and the number of queries in a block.
-# These values gave the fastest search of 20 000 and of 80 000 points in 60 and in 120 dimensions.
+# These values gave fast searches of 20 000 to 300 000 points in 60 to 120 dimensions. With clusters of 20
+# points or with 4 axes, the time changes by less than 15 %.
 _CLUSTER, _AXES, _CLUSTERED_BLOCK = 40, 6, 128
 # The number of blocks that decide whether clusters are used.
 _TRIED_BLOCKS = 8
+# The number of parts of a group of clusters, a power of two. With 4 and 16, the time is nearly the same.
+_PARTS = 8
+# The number of random directions along which groups are halved. With all coordinates, halving a million
+# points of 100 dimensions takes 2.5 times as long, and the search then takes 0.9 times as long.
+_DIRECTIONS = 48
 # Iterations of the power method for the axes of clusters and for the axes along which clusters are halved.
 _ITERATIONS = 3
 
@@ -134,17 +144,19 @@ def _prepare(problem: _Problem) -> tuple[Sequence[_Block], _Search]:
         center = points.mean(axis=0, dtype=np.float64)
         # Squared distances between very large numbers are infinite and exclude nothing.
         if np.isfinite(np.vdot(points, points) + np.vdot(queries, queries)):
+            if len(points) >= _CLUSTERED_FROM and len(queries) * _POINTS_PER_QUERY >= len(points):
+                with _threads() as run:
+                    sizes = _CLUSTER, _CLUSTERED_BLOCK
+                    members, near_queries = run(_halved, (points, queries), sizes)
+                clusters = _Clusters.of(points, rows, center.astype(points.dtype), members)
+                tried = near_queries[:: -(-len(near_queries) // _TRIED_BLOCKS)]
+                needed = np.mean([len(clusters.needed(queries[block])) for block in tried])
+                if needed < _NEEDED * len(members):
+                    return list(near_queries), clusters.search
             if len(points) > _LEAF and len(queries) > _QUERIES_PER_AXIS * queries.shape[1]:
                 axes = _principal_axes(points, center)
                 if _share_of_near_points(queries, points, center, axes) < _SHARE:
                     return blocks, _by_tree(points, rows, center, axes)
-            if len(points) >= _CLUSTERED_FROM and len(queries) * _POINTS_PER_QUERY >= len(points):
-                clusters = _Clusters.of(points, rows, center.astype(points.dtype))
-                near_queries = _halved(queries, _CLUSTERED_BLOCK)
-                tried = near_queries[:: -(-len(near_queries) // _TRIED_BLOCKS)]
-                needed = np.mean([len(clusters.needed(queries[block])) for block in tried])
-                if needed < _NEEDED * len(clusters.rows):
-                    return list(near_queries), clusters.search
         return blocks, _exhaustive(points, rows, center.astype(points.dtype))
 
 
@@ -155,17 +167,20 @@ def _distinct_rows(
     allowed = np.arange(len(database)) if mask is None else np.flatnonzero(mask)
     if not len(allowed):
         return np.zeros(1, int)
-    # The sum turns -0.0 into 0.0, which is equal but has other bits.
-    points = np.ascontiguousarray(database[allowed] + 0)
-    # Words of 64 bits would have poor hashes, because only the first bits of round numbers are not zero.
-    words = points.view(np.uint32)
-    factors = np.random.default_rng(0).integers(2**63, size=words.shape[1], dtype=np.uint64)
-    hashes = (words * factors).sum(axis=1, dtype=np.uint64)
+    words = database.shape[1] * database.itemsize // 4
+    factors = np.random.default_rng(0).integers(2**63, size=words, dtype=np.uint64)
+    hashes = np.empty(len(allowed), np.uint64)
+    for start in range(0, len(allowed), _CHUNK):
+        chunk = slice(start, start + _CHUNK)
+        # The sum turns -0.0 into 0.0, which is equal but has other bits.
+        points = np.ascontiguousarray(database[allowed[chunk]] + 0)
+        # Words of 64 bits would have poor hashes, because only the first bits of round numbers are not zero.
+        hashes[chunk] = points.view(np.uint32) @ factors
     _, first, same = np.unique(hashes, return_index=True, return_inverse=True)
-    if len(first) == len(allowed):
-        return allowed
-    repeated = np.all(words == words[first[same]], axis=1) & (first[same] < np.arange(len(allowed)))
-    return allowed[~repeated]
+    earlier = first[same]
+    repeated = np.flatnonzero(earlier < np.arange(len(allowed)))
+    equal = database[allowed[repeated]] == database[allowed[earlier[repeated]]]
+    return np.delete(allowed, repeated[equal.all(axis=1)])
 
 
 def _exhaustive(
@@ -176,13 +191,13 @@ def _exhaustive(
     The score of a point b for a query q is `q·b - |b|²/2`. Exact distances decide between the two points with
     the best scores, because scores have larger rounding errors.
     """
-    points = points - center
-    columns = np.vstack([points.T, -0.5 * np.einsum("nd,nd->n", points, points)])
+    columns = np.empty((points.shape[1] + 1, len(points)), points.dtype)
+    np.subtract(points.T, center[:, None], out=columns[:-1])
+    columns[-1] = -0.5 * np.einsum("dn,dn->n", columns[:-1], columns[:-1])
     chunks = range(0, len(points), _CHUNK)
 
     def search(block: Float[np.ndarray, "block d"]) -> Int[np.ndarray, " block"]:
-        block = block - center
-        extended = np.column_stack([block, np.ones(len(block), block.dtype)])
+        extended = np.column_stack([block - center, np.ones(len(block), block.dtype)])
         found = [_two_best(extended @ columns[:, start : start + _CHUNK]) for start in chunks]
         candidates = np.vstack([start + best for start, (best, _) in zip(chunks, found, strict=True)])
         order = np.argsort(-np.vstack([scores for _, scores in found]), axis=0, kind="stable")[:2]
@@ -226,130 +241,218 @@ def _by_tree(
     return lambda block: rows[tree.query((block - center) @ axes)[1]]
 
 
-class _Clusters(NamedTuple):
-    """Groups of s nearby points, each with a bounding box of r axes, in coordinates relative to `center`.
+class _Boxes(NamedTuple):
+    """Bounding boxes of c groups of points, each along r axes of the group.
 
-    The box gives a lower bound on the distances from a query to the points. The points of a cluster on a
-    surface differ mainly along a few directions, so the axes span nearly all of the differences.
+    Nearby points of a surface differ mainly along a few directions, so the axes span nearly all of the
+    differences between the points of a group.
 
-    - `members`: the positions of the points of each cluster in `points`, and `rows` those in the database.
-    - `extended`: the points of each cluster, with `-|b|²/2` as last coordinate.
-    - `axes`, `offsets`, `low`, `high`: the axes; the coordinate of the cluster's centre along each axis; and
-      the smallest and the largest coordinate of its points.
+    - `centers`: the centres of the boxes, with `-|c|²/2` as last coordinate.
+    - `axes`: the axes, with minus the coordinate of the centre along the axis as last coordinate.
+    - `lengths`: half the lengths of the boxes along their axes.
     - `radii`, `thickness`: the largest distance of a point from the centre, and from the space through the
       centre that the axes span.
+    """
+
+    centers: Float[np.ndarray, "c d+1"]
+    axes: Float[np.ndarray, "r c d+1"]
+    lengths: Float[np.ndarray, "r 1 c"]
+    radii: Float[np.ndarray, " c"]
+    thickness: Float[np.ndarray, " c"]
+
+    @staticmethod
+    def of(groups: Float[np.ndarray, "c s d"], precision: float) -> _Boxes:
+        """Compute the boxes of groups of s points."""
+        few = -(-_CHUNK // groups.shape[1])
+        starts = range(0, len(groups), few)
+        with _threads() as run:
+            parts = list(run(lambda start: _Boxes._of_few(groups[start : start + few], precision), starts))
+        centers, axes, *others = zip(*parts, strict=True)
+        return _Boxes(
+            np.concatenate(centers),
+            np.concatenate(axes, axis=1),
+            *(np.concatenate(columns, axis=-1) for columns in others),
+        )
+
+    @staticmethod
+    def _of_few(groups: Float[np.ndarray, "c s d"], precision: float) -> _Boxes:
+        centers = groups.mean(axis=1)
+        deviations = groups - centers[:, None]
+        d = groups.shape[2]
+        start = np.random.default_rng(0).normal(size=(d, min(_AXES, d))).astype(groups.dtype)
+        along = deviations @ start
+        for _ in range(_ITERATIONS):
+            axes = np.linalg.qr(_transposed(deviations) @ along)[0]
+            along = deviations @ axes
+        low, high = along.min(axis=1, keepdims=True), along.max(axis=1, keepdims=True)
+        to_middle = ((low + high) / 2 @ _transposed(axes))[:, 0]
+        centers += to_middle
+        deviations -= to_middle[:, None]
+        radii = np.einsum("csd,csd->cs", deviations, deviations).max(axis=1)
+        deviations -= (deviations @ axes) @ _transposed(axes)
+        thickness = np.einsum("csd,csd->cs", deviations, deviations).max(axis=1)
+        radii, thickness = (np.sqrt(squares) * (1 + precision) for squares in (radii, thickness))
+        offsets = np.einsum("cd,cdr->rc", centers, axes)[:, :, None]
+        return _Boxes(
+            np.column_stack([centers, -0.5 * np.einsum("cd,cd->c", centers, centers)]),
+            np.concatenate([axes.transpose(2, 0, 1), -offsets], axis=2),
+            (high - low).transpose(2, 1, 0) / 2,
+            radii,
+            thickness,
+        )
+
+    def nearest(
+        self, block: Float[np.ndarray, "block e"], groups: Int[np.ndarray, " g"]
+    ) -> Int[np.ndarray, " h"]:
+        """Return the groups with the nearest centres to some query."""
+        return groups[np.unique(np.argmax(block @ self.centers[groups].T, axis=1))]
+
+    def within(
+        self, reach: _Reach, block: Float[np.ndarray, "block e"], groups: Int[np.ndarray, " g"]
+    ) -> Int[np.ndarray, " h"]:
+        """Return the groups that can contain a point within the reach of its query."""
+        to_centers = reach.squares - 2 * (block @ self.centers[groups].T) - reach.tolerance
+        # The balls around the centres exclude many groups before the boxes are used. The negations keep
+        # groups with bounds that are not a number.
+        excluded = to_centers > (np.sqrt(reach.reach) + self.radii[groups]) ** 2
+        kept = np.flatnonzero(~excluded.all(axis=0))
+        near = groups[kept]
+        along = block @ _transposed(self.axes[:, near])
+        beside = to_centers[:, kept] - np.einsum("rbg,rbg->bg", along, along)
+        beside = np.sqrt(np.maximum(beside, 0)) - self.thickness[near]
+        np.abs(along, out=along)
+        along -= self.lengths[:, :, near]
+        np.maximum(along, 0, out=along)
+        bounds = np.einsum("rbg,rbg->bg", along, along) + np.maximum(beside, 0) ** 2
+        return near[~(bounds > reach.reach + reach.tolerance).all(axis=0)]
+
+
+class _Reach(NamedTuple):
+    """An upper bound on the squared distance from each query to its nearest point.
+
+    `squares` are the squared lengths of queries, and `tolerance` bounds rounding errors of squared distances.
+    """
+
+    reach: Float[np.ndarray, "block 1"]
+    squares: Float[np.ndarray, "block 1"]
+    tolerance: Float[np.ndarray, "block 1"]
+
+
+class _Clusters(NamedTuple):
+    """Groups of s nearby points (clusters), groups of nearby clusters, groups of these, and so on.
+
+    - `points`, `rows`: the points, and their rows in the database.
+    - `center`: the mean of the points. The following coordinates are relative to it.
+    - `members`, `extended`: the indices of the points of each cluster, and their coordinates with `-|b|²/2`
+      as last coordinate.
+    - `levels`: the boxes of the groups, from large groups to clusters. Each group but the clusters consists
+      of consecutive groups of the next level.
     - `precision`, `largest`: the relative rounding error of a squared distance, and the largest `|b|²`.
     """
 
-    center: Float[np.ndarray, " d"]
     points: Float[np.ndarray, "n d"]
     rows: Int[np.ndarray, " n"]
+    center: Float[np.ndarray, " d"]
     members: Int[np.ndarray, "c s"]
     extended: Float[np.ndarray, "c s d+1"]
-    centers: Float[np.ndarray, "c d"]
-    axes: Float[np.ndarray, "r c d"]
-    offsets: Float[np.ndarray, "r c"]
-    low: Float[np.ndarray, "r c"]
-    high: Float[np.ndarray, "r c"]
-    radii: Float[np.ndarray, " c"]
-    thickness: Float[np.ndarray, " c"]
+    levels: list[_Boxes]
     precision: float
     largest: float
 
     @staticmethod
     def of(
-        points: Float[np.ndarray, "n d"], rows: Int[np.ndarray, " n"], center: Float[np.ndarray, " d"]
+        points: Float[np.ndarray, "n d"],
+        rows: Int[np.ndarray, " n"],
+        center: Float[np.ndarray, " d"],
+        members: Int[np.ndarray, "c s"],
     ) -> _Clusters:
-        """Divide points into clusters and compute their boxes."""
-        points = points - center
+        """Compute the boxes of the clusters that `_halved` gives, and of groups of them."""
         d = points.shape[1]
-        members = np.sort(_halved(points, _CLUSTER), axis=1)
-        squares = np.einsum("nd,nd->n", points, points)
-        extended = np.column_stack([points, -0.5 * squares])[members]
-        centers = extended[:, :, :d].mean(axis=1)
-        deviations = extended[:, :, :d] - centers[:, None]
-        start = np.random.default_rng(0).normal(size=(d, min(_AXES, d))).astype(points.dtype)
-        along = deviations @ start
-        for _ in range(_ITERATIONS):
-            axes = np.linalg.qr(_transposed(deviations) @ along)[0]
-            along = deviations @ axes
-        offsets = np.einsum("cd,cdr->rc", centers, axes)
+        extended = np.empty((*members.shape, d + 1), points.dtype)
+        for few in range(0, len(members), _CHUNK // _CLUSTER):
+            part = extended[few : few + _CHUNK // _CLUSTER]
+            part[:, :, :d] = points[members[few : few + len(part)]] - center
+            part[:, :, d] = -0.5 * np.einsum("csd,csd->cs", part[:, :, :d], part[:, :, :d])
         precision = 2 * (d + 12) * float(np.finfo(points.dtype).eps)
-        radii = np.sqrt(np.einsum("csd,csd->cs", deviations, deviations).max(axis=1)) * (1 + precision)
-        deviations -= along @ _transposed(axes)
-        thickness = np.sqrt(np.einsum("csd,csd->cs", deviations, deviations).max(axis=1)) * (1 + precision)
+        levels = [_Boxes.of(extended[:, :, :d], precision)]
+        while (groups := len(levels[0].centers) // _PARTS) >= _PARTS**2:
+            levels.insert(0, _Boxes.of(extended.reshape(groups, -1, d + 1)[:, :, :d], precision))
         return _Clusters(
-            center,
             points,
             rows,
+            center,
             members,
             extended,
-            centers,
-            np.ascontiguousarray(axes.transpose(2, 0, 1)),
-            offsets,
-            offsets + along.min(axis=1).T,
-            offsets + along.max(axis=1).T,
-            radii,
-            thickness,
+            levels,
             precision,
-            float(squares.max()),
+            -2 * float(extended[:, :, d].min()),
         )
 
     def search(self, block: Float[np.ndarray, "block d"]) -> Int[np.ndarray, " block"]:
         """Return the database rows that are nearest to nearby queries."""
         needed = self.needed(block)
-        best, _ = _two_best(self._scores(block - self.center, needed))
-        return self.rows[_nearer(block - self.center, self.points, self.members[needed].reshape(-1)[best])]
+        best, _ = _two_best(self._scores(self._extended(block), needed))
+        return self.rows[_nearer(block, self.points, self.members[needed].reshape(-1)[best])]
 
     def needed(self, block: Float[np.ndarray, "block d"]) -> Int[np.ndarray, " needed"]:
         """Return all clusters that can contain the nearest point of a query."""
-        block = block - self.center
-        squares = np.einsum("bd,bd->b", block, block)[:, None]
+        block = self._extended(block)
+        groups = np.arange(len(self.levels[0].centers))
+        for number, level in enumerate(self.levels):
+            groups = level.within(self._reach(block, self.levels[number:], groups), block, groups)
+            if level is not self.levels[-1]:
+                groups = _parts(groups)
+        return groups
+
+    def _extended(self, block: Float[np.ndarray, "block d"]) -> Float[np.ndarray, "block d+1"]:
+        return np.column_stack([block - self.center, np.ones(len(block), block.dtype)])
+
+    def _reach(
+        self, block: Float[np.ndarray, "block e"], levels: list[_Boxes], groups: Int[np.ndarray, " g"]
+    ) -> _Reach:
+        """Return the reach to the points of those clusters in groups of the first level that seem nearest."""
+        for level in levels[:-1]:
+            groups = _parts(level.nearest(block, groups))
+        scores = self._scores(block, levels[-1].nearest(block, groups)).max(axis=1, keepdims=True)
+        squares = np.einsum("bd,bd->b", block, block)[:, None] - 1
         tolerance = self.precision * (squares + self.largest)
-        to_centers = squares + np.einsum("cd,cd->c", self.centers, self.centers) - 2 * block @ self.centers.T
-        candidates = np.unique(np.argmin(to_centers, axis=1))
-        scores = self._scores(block, candidates).max(axis=1, keepdims=True)
-        reach = np.maximum(squares - 2 * scores, 0) + tolerance
-        # The balls around the centres exclude many clusters before the boxes are used. The negations keep
-        # clusters with bounds that are not a number.
-        excluded = to_centers - tolerance > (np.sqrt(reach) + self.radii) ** 2
-        near = np.flatnonzero(~excluded.all(axis=0))
-        beside = to_centers[:, near] - tolerance
-        bounds = np.zeros_like(beside)
-        for axes, offsets, low, high in zip(self.axes, self.offsets, self.low, self.high, strict=True):
-            along = block @ axes[near].T
-            bounds += (along - np.clip(along, low[near], high[near])) ** 2
-            beside -= (along - offsets[near]) ** 2
-        beside = np.sqrt(np.maximum(beside, 0)) - self.thickness[near]
-        bounds += np.maximum(beside, 0) ** 2
-        return near[~(bounds > reach + tolerance).all(axis=0)]
+        return _Reach(np.maximum(squares - 2 * scores, 0) + tolerance, squares, tolerance)
 
     def _scores(
-        self, block: Float[np.ndarray, "block d"], clusters: Int[np.ndarray, " c"]
+        self, block: Float[np.ndarray, "block e"], clusters: Int[np.ndarray, " c"]
     ) -> Float[np.ndarray, "block candidates"]:
         """Return the scores of all points of some clusters, as in `_exhaustive`."""
-        extended = self.extended[clusters].reshape(-1, self.extended.shape[2])
-        return np.column_stack([block, np.ones(len(block), block.dtype)]) @ extended.T
+        return block @ self.extended[clusters].reshape(-1, self.extended.shape[2]).T
+
+
+def _parts(groups: Int[np.ndarray, " g"]) -> Int[np.ndarray, " h"]:
+    return (groups[:, None] * _PARTS + np.arange(_PARTS)).reshape(-1)
 
 
 def _halved(points: Float[np.ndarray, "n d"], size: int) -> Int[np.ndarray, "c s"]:
-    """Divide points into equal groups by repeated halving along the axis of largest variance of each group.
+    """Divide points into equal groups by repeated halving, nearly along the axis of largest variance.
 
-    The groups have 0.7 to 1.4 times `size` points. The last point is repeated to fill the groups.
+    The groups have 0.7 to 1.4 times `size` points. The last point is repeated to fill the groups. The halves
+    of a group stand next to each other. Coordinates along random directions replace the points, because they
+    nearly preserve distances.
     """
     levels = max(0, round(np.log2(len(points) / size)))
     total = -(-len(points) // 2**levels) * 2**levels
+    if points.shape[1] > _DIRECTIONS:
+        shape = points.shape[1], _DIRECTIONS
+        points = points @ np.random.default_rng(0).normal(size=shape).astype(points.dtype)
     groups = np.minimum(np.arange(total), len(points) - 1)[None]
     for _ in range(levels):
         deviations = points[groups]
         deviations -= deviations.mean(axis=1, keepdims=True)
-        widest = np.einsum("gsd,gsd->gd", deviations, deviations).argmax(axis=1)
-        along = np.take_along_axis(deviations, widest[:, None, None], axis=2)
+        covariances = _transposed(deviations) @ deviations
+        axes = covariances @ np.ones(points.shape[1], points.dtype)
         for _ in range(_ITERATIONS):
-            axis = _transposed(deviations) @ along
-            length = np.linalg.norm(axis, axis=1, keepdims=True)
-            along = deviations @ (axis / np.where(length > 0, length, 1))
-        order = np.argsort(along[:, :, 0], axis=1, kind="stable")
+            axes = (covariances @ axes[:, :, None])[:, :, 0]
+            length = np.linalg.norm(axes, axis=1, keepdims=True)
+            axes = axes / np.where(length > 0, length, 1)
+        along = np.einsum("gsd,gd->gs", deviations, axes)
+        order = np.argpartition(along, along.shape[1] // 2, axis=1)
         groups = np.take_along_axis(groups, order, axis=1).reshape(2 * len(groups), -1)
     return groups
 

@@ -120,7 +120,7 @@ class Registration(CoarseToFine["PreparedSurfaces", "Registered"]):
             forward, backward = _deformations(
                 _Matched(x, all_y, pointwise_map, active_x), _Matched(y, all_x, reverse_map, active_y)
             )
-        functional_map = product(x.dual.T, all_y.eigenvectors[pointwise_map])
+        functional_map = x.coefficients(all_y.eigenvectors[pointwise_map])
         state = Registered(functional_map, iteration, forward, backward, weight)
         return state, RESULTS.successful
 
@@ -173,11 +173,13 @@ class _Surface(NamedTuple):
     """The data of all vertices of a shape, or only of the samples.
 
     Positions are in units of the square root of the area. `points` contains the positions, normals and
-    eigenfunctions, multiplied by their weights.
+    eigenfunctions, multiplied by their weights. `dual` is the transposed pseudo-inverse of the
+    eigenvectors. It is None for all vertices, whose eigenvectors are orthonormal with the weights `areas`.
     """
 
     eigenvectors: Float[Array, "n k"]
-    dual: Float[Array, "n k"]
+    dual: Float[Array, "n k"] | None
+    areas: Float[Array, " n"]
     weights: Float[Array, " n"]
     heat: Float[Array, " k"]
     time: Float[Array, ""]
@@ -207,7 +209,8 @@ class _Surface(NamedTuple):
         time = xp.maximum(_HEAT_TIME, xp.where(last > 0, _DECAY / last, 0))
         return cls(
             spectrum.eigenvectors,
-            dual_eigenvectors(spectrum, "area"),
+            None,
+            spectrum.vertex_areas,
             weights,
             xp.exp(-time * eigenvalues),
             time,
@@ -224,8 +227,20 @@ class _Surface(NamedTuple):
         weights = namespace(vertices).full(vertices.shape, 1 / vertices.shape[0], self.weights.dtype)
         fields = (self.positions, self.normals, self.points, self.descriptors, self.mask)
         return _Surface(
-            spectrum.eigenvectors, dual, weights, self.heat, self.time, *(field[vertices] for field in fields)
+            spectrum.eigenvectors,
+            dual,
+            weights,
+            weights,
+            self.heat,
+            self.time,
+            *(field[vertices] for field in fields),
         )
+
+    def coefficients(self, functions: Float[Array, "n c"]) -> Float[Array, "k c"]:
+        """Return the coefficients of functions in the eigenvectors."""
+        if self.dual is None:  # An array `dual` of all vertices would take as much memory as `eigenvectors`.
+            return product(self.eigenvectors.T, functions * self.areas[:, None])
+        return product(self.dual.T, functions)
 
     def reweighted(self, weights: Float[Array, " s"]) -> _Surface:
         """Return the same vertices with new weights for the least-squares fit of coefficients."""
@@ -292,7 +307,7 @@ def _deformations(*given: _Matched) -> list[Deformation]:
     )
     found = []
     for one, rows, of_matches in zip(given, _split(averaged, surfaces), points, strict=True):
-        coefficients = product(one.surface.dual.T, xp.concatenate([rows, of_matches], axis=1))
+        coefficients = one.surface.coefficients(xp.concatenate([rows, of_matches], axis=1))
         active = xp.where(one.active[:, None], coefficients, 0)
         moments = one.surface.heat[:, None] * coefficients[:, :24]
         found.append(Deformation(active[:, :3], active[:, 24:], moments))
