@@ -137,7 +137,7 @@ def recomputing() -> Iterator[None]:
 
 
 def cache_compiled_programs() -> None:
-    """Make JAX store compiled programs on disk for later processes, and remove damaged programs.
+    """Make JAX store compiled programs on disk for later processes.
 
     The programs take at most 0.25 GiB. The function sets environment variables of JAX, so it must run before
     JAX is imported. It changes nothing if the user has set one of these variables.
