@@ -50,7 +50,7 @@ nitpicky = True
 # Type variables have no entry in the reference.
 nitpick_ignore_regex = [
     ("py:.*", r"(?!jaxsmw\b).*"),
-    ("py:class", r"jaxsmw\.[\w.]*(StateT|PreparedT|\.Side)"),
+    ("py:class", r"jaxsmw\.[\w.]*(StateT|PreparedT|\.(Side|Carry|Value))"),
 ]
 default_role = "code"
 autodoc_class_signature = "mixed"

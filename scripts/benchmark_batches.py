@@ -34,12 +34,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from benchmark_speed import ITERATIONS, truth_of
+from benchmark_speed import ITERATIONS, KnownPair
 from common import Part, make_parser, measure_parts, medians
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from jaxtyping import Array, Int
 
+from jaxsmw.benchmark.datasets import open_data_set
 from jaxsmw.collection.pairs import match_pairs, prepare_task
 from jaxsmw.collection.shapes import prepare_collection
 from jaxsmw.core.refinement import Refinement, refine
@@ -47,7 +48,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.meshes import read_mesh
-from jaxsmw.matching.executor import padded_map, run_batches
+from jaxsmw.matching.executor import run_batches
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, PresetName
@@ -237,10 +238,9 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
     products: Counter[MatrixProduct] = Counter()
     for stage in preset.stages:
         spectra, first = tasks[0]
-        seen = spectra.padded.seen_by(stage)
-        start = padded_map(first.pointwise_map)
+        seen = spectra.seen_by(stage)
         traced = partial(refine, samples=seen.samples, **stage.settings())
-        products += matrix_products(traced, *seen.both, start)
+        products += matrix_products(traced, *seen.both, jnp.asarray(first.pointwise_map))
     floor = time_of_products(products, count, options.repeats)
     yield (
         "Preset accurate",
@@ -286,8 +286,9 @@ def agreement(options: argparse.Namespace) -> Iterator[Part]:
 
 def errors_of(data: Path, shapes: Shapes, maps: Sequence[np.ndarray]) -> list[float]:
     """Return the mean geodesic error of each map, in thousandths of the square root of the area."""
-    truths = (truth_of(data, shapes.names[i], shapes.names[j]) for i, j in shapes.pairs)
-    return [truth.error(T, truth.meshes[1]) for truth, T in zip(truths, maps, strict=True)]
+    known = open_data_set(data).known_pairs
+    pairs = (KnownPair.read(known[shapes.names[i], shapes.names[j]]) for i, j in shapes.pairs)
+    return [pair.error(pointwise_map) for pair, pointwise_map in zip(pairs, maps, strict=True)]
 
 
 def prepared_tasks(shapes: Shapes, preset: PresetName) -> list[tuple[SpectralPair, Start]]:

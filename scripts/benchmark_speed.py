@@ -1,34 +1,27 @@
-"""Measures how long parts of the library take, and compares these times with lower bounds or other libraries.
+"""Measures the times and the memory of jaxsmw, with NumPy and with JAX, and those of other libraries.
 
-    python scripts/benchmark_speed.py [--quick] [--only PART ...] [--data FAUST_R] [--output DIR]
+    python scripts/benchmark_speed.py [--quick] [--rounds N] [--only PART ...] [--data FAUST_R] [--output DIR]
 
-- `refinement`: the time of three iterations in float32 with 100 eigenvectors (as in the MWP paper), for
-  shapes of several sizes. The candidates are exhaustive search, search in patches, refinement on samples, and
-  a plain argmin over stored distances. The lower bound is the time of three products of an (m x k) and a (k x
-  n) matrix, in the fastest of several implementations.
-- `eigenbasis`: the CPU time of 100 exact or approximate eigenpairs, compared with SciPy's shift-invert
-  `eigsh` with default settings. The note above the table states the errors of the approximate eigenvalues.
-- `side_by_side_eigenbases`: the time to compute two eigenbases concurrently, in threads and in processes,
-  compared with the time to compute one eigenbasis.
-- `stages`: the times of other computations on the host for one shape, such as SHOT and sampling.
-- `command`: wall time and CPU time of whole commands, from the start of Python until the outputs are written,
-  with and without the results of earlier commands. Some commands also run beside busy processes.
-- `later_pairs`: the time of `match` for each of several pairs in one process, after a first pair.
-- `throughput`: the pairs per minute of one process of jaxsmw, and of ten processes of each other library.
-- `peers`: the time from two mesh files to the refined map, and the time of refinement alone. pyFM and geomfum
-  are included if they are installed (`jaxsmw[peers]`).
-- `scale`: the time from two mesh files of up to a million vertices to the refined map. The script measures
-  each size twice, each time in a new process: cold, with an empty cache, and warm, with the cache of the
-  first process. The table states times, peak memory and errors. Power laws in the number of vertices are
-  fitted to the times and the memory. The table states the exponents.
+- `commands`: whole commands in new processes, from the start of Python until all files are written. A first
+  command has an empty cache. Later commands have the cache of a command with other or with the same meshes.
+  Two commands also run beside one busy process for each core.
+- `one_process`: pairs in one process, whose shapes are already in the cache. Each pair is matched twice. JAX
+  compiles its programs only for the first of these matches, because all pairs have different sizes.
+- `memory`: the peak memory of one process that matches 98 pairs of many sizes and measures their errors.
+- `peers`: jaxsmw, pyFM and geomfum, from the same mesh files and the same initial map, in one process each.
+  Libraries that are not installed (`jaxsmw[peers]`) are left out.
+- `scale`: pairs of up to a million vertices. Each size is measured twice, each time in a new process: cold,
+  with an empty cache, and warm, with the cache of the first process.
+- `refinement`: three iterations with 100 eigenvectors, as in the MWP paper, by NumPy and by JAX. The lower
+  bound is the time of three products of an (m x k) and a (k x n) matrix.
+- `eigenbasis`: the CPU time of 100 eigenpairs, compared with SciPy's `eigsh` with default settings.
+- `stages`: the other computations for one shape, such as SHOT and sampling.
 
-The candidates of a comparison take turns in one process, so that other load on the machine affects all
-candidates equally. Each ratio is computed from median times. The shapes are procedural creatures. To obtain
-the large shapes, the script splits edges of a creature and moves its vertices at random. With `--data`, the
-parts `peers` and `scale` use two people of the remeshed FAUST set instead of creatures. The script writes
-three files to DIR: the tables to `speed.md`, all measurements to `speed.json`, and a plot of the times
-against the sizes to `speed.png`. With `--quick`, the script measures only the smallest sizes, which takes
-three minutes.
+All candidates of a comparison take turns, so that other load on the machine affects them equally. Times are
+medians. Without `--data`, all shapes are procedural creatures. With `--data`, `commands`, `one_process`,
+`peers` and `scale` use people of the remeshed FAUST set, and `memory` uses pairs of all data sets beside this
+set. Large shapes are subdivided and made noisy. The script writes the tables to `speed.md` and all
+measurements to `speed.json`. With `--quick`, it measures the smallest sizes once, which takes five minutes.
 """
 
 from __future__ import annotations
@@ -38,39 +31,38 @@ import multiprocessing
 import os
 import re
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from contextlib import AbstractContextManager, nullcontext, suppress
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import chain, permutations
+from itertools import chain, islice, zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
-import jax
-import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 import scipy.sparse as sp
 from common import Part, make_parser, measure_parts, medians
-from jaxtyping import Array, Float32, Int64
+from jaxtyping import Int64
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
-from jaxsmw.choices import Eigensolver, Search
-from jaxsmw.core.refinement import refine
-from jaxsmw.core.refiner import Refiner
-from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
-from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.creature import creature_pair
+from jaxsmw.benchmark.datasets import DataPair, open_data_set
+from jaxsmw.choices import Backend, Eigensolver, PresetName
+from jaxsmw.core.refinement import refine, refine_at_once
+from jaxsmw.creature import CREATURES, creature_pair
+from jaxsmw.errors import InputError
+from jaxsmw.evaluation.ground_truth import GroundTruth
+from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
-from jaxsmw.geometry.geodesics import geodesic_distances, geodesic_distances_between
+from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.laplacian import assemble_laplacian
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.sampling import farthest_point_samples, poisson_disk_samples
@@ -79,28 +71,20 @@ from jaxsmw.io.meshes import read_mesh, write_mesh
 from jaxsmw.matching.match import match
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import paired_spectra
-from jaxsmw.matching.stages import PresetName, Stage
 from jaxsmw.matching.starts import initial_map
-from jaxsmw.report.figures import save_figure
-from jaxsmw.runtime.cache import cache_compiled_programs
-from jaxsmw.runtime.compilation import compiled
-from jaxsmw.runtime.threads import one_blas_thread, side_by_side
+from jaxsmw.runtime.threads import one_blas_thread
+
+# Modules with JAX and Matplotlib are imported where they are used, because new processes import this module
+# before their memory is measured.
 
 ITERATIONS, EIGENVECTORS, SAMPLES = 3, 100, 500
 SIZES = (7000, 20_000, 50_000)
-LARGE = (100_000, 300_000, 1_000_000)
-XLA_DEFAULTS = ", XLA's defaults"
-# For shapes with more than this number of vertices, a matrix of all distances would take gigabytes.
-STORED = 10_000
+LARGE = (30_000, 100_000, 300_000, 1_000_000)
+# The number of pairs in `memory`, and the numbers of pairs after which the memory is stated.
+ASSORTED, STATED = 98, (10, 50, 98)
+PRESETS: tuple[PresetName, ...] = ("accurate", "paper")
 
-
-class PlainSearch(WaveletPreservation):
-    """Wavelet preservation with the simplest search: an argmin over a stored matrix of all distances."""
-
-    def recover(self, prepared, state):
-        queries, database = self.embeddings(prepared, state)
-        products = queries @ database.T
-        return jnp.argmin(0.5 * jnp.sum(database**2, axis=1)[None, :] - products, axis=1).astype(jnp.int32)
+Result = TypeVar("Result")
 
 
 def wall_and_cpu() -> np.ndarray:
@@ -109,204 +93,102 @@ def wall_and_cpu() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time() + children.ru_utime + children.ru_stime])
 
 
+def memory(entry: str) -> float:
+    """Return an entry of `/proc/self/status` in GiB: "VmRSS", or its peak so far, "VmHWM"."""
+    (kilobytes,) = re.findall(rf"{entry}:\s*(\d+) kB", Path("/proc/self/status").read_text("utf-8"))
+    return int(kilobytes) / 2**20
+
+
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
     """Return a table with the time of each candidate in seconds, and relative to the candidate `of`."""
     rows = [[name, f"{value:.3f}", f"{value / seconds[of]:.2f}"] for name, value in seconds.items()]
     return [["", "seconds", f"of {of}"], *rows]
 
 
-def products(x: Spectrum, y: Spectrum) -> dict[str, Callable[[], object]]:
-    """Return functions that multiply the eigenvector matrices of X and Y `ITERATIONS` times, by name.
-
-    The time of the fastest function is a lower bound for the time of an exhaustive search.
-    """
-    # Each block of products fits into the processor's cache. Only the maximum of each row is kept.
-    rows = x.eigenvectors
-    blocks = jnp.pad(rows, ((0, -rows.shape[0] % 256), (0, 0))).reshape(-1, 256, rows.shape[1])
-
-    def blocked(a: Float32[Array, "b 256 k"], b: Float32[Array, "n k"]) -> Float32[Array, "b 256"]:
-        return jax.lax.map(lambda block: jnp.max(block @ b.T, axis=1), a)
-
-    usual, ours = jax.jit(blocked), compiled(blocked)
-    ways: dict[str, Callable[[], object]] = {
-        "products, JAX in blocks": lambda: [ours(blocks, y.eigenvectors) for _ in range(ITERATIONS)],
-        f"products, JAX in blocks{XLA_DEFAULTS}": lambda: [
-            usual(blocks, y.eigenvectors) for _ in range(ITERATIONS)
-        ],
-    }
-    if rows.shape[0] <= STORED:
-        product = jax.jit(lambda a, b: a @ b.T)
-        a, b = np.asarray(rows), np.asarray(y.eigenvectors)
-        out = np.empty((a.shape[0], b.shape[0]), a.dtype)
-        ways["products, JAX"] = lambda: [product(rows, y.eigenvectors) for _ in range(ITERATIONS)]
-        ways["products, NumPy"] = lambda: [np.matmul(a, b.T, out=out) for _ in range(ITERATIONS)]
-    return ways
-
-
-def refinement(options: argparse.Namespace) -> Iterator[Part]:
-    """For each size, yield the times of several ways to refine one pair."""
-    for size in options.sizes:
-        pair = creature_pair(vertices=size)
-        meshes = pair.source, pair.target
-        x, y = (compute_spectrum(mesh, EIGENVECTORS, eigensolver="exact") for mesh in meshes)
-        start = jnp.asarray(initial_map(Pair(*meshes), x, y, init="shot" if size <= STORED else "wks"))
-        samples = [jnp.asarray(farthest_point_samples(mesh, SAMPLES)) for mesh in meshes]
-
-        def refined(refiner: Refiner, *sampled: Any, run=refine, x=x, y=y, start=start) -> Callable[[], Any]:
-
-            def once() -> Any:
-                with one_blas_thread():  # `match` also limits BLAS to one thread
-                    return jax.block_until_ready(
-                        run(x, y, start, refiner=refiner, iterations=ITERATIONS, samples=sampled or None)
-                    )
-
-            return once
-
-        ours = compiled(refine)
-        exhaustive, patches = (WaveletPreservation(search=search) for search in ("exhaustive", "patches"))
-        candidates = {
-            "all with all": refined(exhaustive, run=ours),
-            "in patches": refined(patches, run=ours),
-            f"all with all{XLA_DEFAULTS}": refined(exhaustive),
-            f"in patches{XLA_DEFAULTS}": refined(patches),
-            "on samples": refined(exhaustive, *samples, run=ours),
-            "on samples, in patches": refined(patches, *samples, run=ours),
-        }
-        if size <= STORED:
-            candidates["plain argmin"] = refined(PlainSearch(), run=ours)
-        alone = products(x, y)
-        seconds = medians(alone | candidates, options.repeats if size <= STORED else 3)
-        floor = min(alone, key=lambda name: seconds[name])
-        same = [
-            float(np.mean(np.asarray(candidates[a]().pointwise_map == candidates[b]().pointwise_map)))
-            for a, b in (("all with all", "in patches"), ("on samples", "on samples, in patches"))
-        ]
-        m, n = (mesh.vertices.shape[0] for mesh in meshes)
-        yield (
-            f"Refinement, {m} x {n} vertices",
-            f"k = {EIGENVECTORS}, {ITERATIONS} iterations, float32. Search in patches finds {same[0]:.3%} of "
-            f"the matches of the exhaustive search, and {same[1]:.3%} on samples.",
-            compared(seconds, floor),
-            {"vertices": [m, n], "seconds": seconds, "same": same},
-        )
-
-
-def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
-    """For each size, yield the CPU times of several eigensolvers on one shape."""
-    for size in [*options.sizes, *LARGE[: 0 if options.quick else 1]]:
-        mesh = finer(creature_pair(vertices=min(size, SIZES[-1])).source, size)
-        stiffness, areas = assemble_laplacian(mesh)
-        masses = sp.diags(areas / areas.sum()).tocsc()
-
-        def usual(stiffness=stiffness, masses=masses) -> object:
-            with threadpool_limits(1, "blas"):
-                return eigsh(stiffness, EIGENVECTORS, masses, sigma=-1e-2)
-
-        def ours(solver: Eigensolver, mesh=mesh) -> np.ndarray:
-            return eigenpairs(mesh, EIGENVECTORS, eigensolver=solver)[0]
-
-        seconds = medians(
-            {
-                "SciPy's eigsh": usual,
-                "exact": lambda: ours("exact"),
-                "approximate": lambda: ours("approximate"),
-            },
-            3,
-            time.process_time,
-            warm=False,
-        )
-        excess = ours("approximate")[1:] / ours("exact")[1:] - 1
-        yield (
-            f"Eigenbasis, {len(mesh.vertices)} vertices",
-            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Our times include the assembly of the "
-            f"Laplacian and a check of the result. Approximate eigenvalues are {excess.mean():.2%} too large "
-            f"on average, and at most {excess.max():.2%} too large.",
-            compared(seconds, "SciPy's eigsh"),
-            {"vertices": len(mesh.vertices), "seconds": seconds, "excess": excess.tolist()},
-        )
-
-
-def side_by_side_eigenbases(options: argparse.Namespace) -> Iterator[Part]:
-    """For each size, yield the times to compute the eigenbases of two shapes concurrently.
-
-    The times exclude the start of the processes.
-    """
-    for size in options.sizes:
-        pair = creature_pair(vertices=size)
-        meshes = [pair.source, pair.target]
+def in_new_process(cache: Path | str, function: Callable[..., Result], *arguments: Any) -> Result:
+    """Call a function in a new process, which uses the given directory as its cache."""
+    before = os.environ["JAXSMW_CACHE"]
+    os.environ["JAXSMW_CACHE"] = str(cache)
+    try:
         spawned = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(2, spawned, initializer=keep, initargs=(meshes,)) as pool:
-            keep(meshes)
-
-            def by_processes(pool=pool) -> object:
-                return list(pool.map(eigenbasis_in_one_thread, range(2)))
-
-            seconds = medians(
-                {
-                    "one": partial(eigenbasis_in_one_thread, 0),
-                    "both, in threads": lambda: side_by_side(eigenbasis_of, 0, 1),
-                    "both, by two processes": by_processes,
-                },
-                options.repeats,
-            )
-        m, n = (len(mesh.vertices) for mesh in meshes)
-        yield (
-            f"Eigenbases side by side, {m} and {n} vertices",
-            f"Wall-clock time of {EIGENVECTORS} eigenpairs for each shape, with one BLAS thread for each "
-            "shape.",
-            compared(seconds, "one"),
-            {"vertices": [m, n], "seconds": seconds},
-        )
+        with ProcessPoolExecutor(1, spawned, warnings.simplefilter, ("ignore",)) as executor:
+            return executor.submit(function, *arguments).result()
+    finally:
+        os.environ["JAXSMW_CACHE"] = before
 
 
-kept_meshes: list[Mesh] = []
-"""The meshes whose eigenbases this process computes."""
+class KnownPair(NamedTuple):
+    """Two meshes with ground truth."""
+
+    meshes: tuple[Mesh, Mesh]
+    truth: GroundTruth
+    partial: bool = False
+
+    @classmethod
+    def of_creatures(cls, kind: str, vertices: int, seed: int) -> KnownPair:
+        pair = creature_pair(kind, vertices=vertices, seed=seed)
+        return cls((pair.source, pair.target), GroundTruth.of_all_vertices(pair.truth))
+
+    @classmethod
+    def read(cls, pair: DataPair) -> KnownPair:
+        x, y = (read_mesh(file) for file in pair.meshes)
+        return cls((x, y), pair.ground_truth(x, y), pair.partial)
+
+    def error(
+        self, pointwise_map: np.ndarray, *, target: Mesh | None = None, number: int | None = None
+    ) -> float:
+        """Return the mean geodesic error in thousandths of the square root of the target's area.
+
+        If the map is between subdivided meshes (see `finer`), `target` is the subdivided target, and each
+        match is replaced by the nearest vertex of the target in `meshes`. The error is measured at `number`
+        random vertices; None for all.
+        """
+        coarse = self.meshes[1]
+        if target is not None:
+            pointwise_map = KDTree(coarse.vertices).query(target.vertices[pointwise_map])[1]
+        return 1000 * geodesic_error(coarse, pointwise_map, self.truth, number_of_samples=number).mean
 
 
-def keep(meshes: Sequence[Mesh]) -> None:
-    kept_meshes[:] = meshes
+def known_pairs(options: argparse.Namespace, number: int) -> list[KnownPair]:
+    """Return at most nine pairs of about 5000 vertices: people of FAUST if `--data` is given, else creatures.
+
+    Half of the pairs of FAUST are poses of one person.
+    """
+    if options.data is None:
+        return [KnownPair.of_creatures("quadruped", 5000, seed) for seed in range(number)]
+    pairs = open_data_set(options.data).known_pairs
+    first = range(2, 2 + 7 * number, 7)
+    return [KnownPair.read(pairs[f"tr_reg_{i:03}", f"tr_reg_{i + 5:03}"]) for i in first]
 
 
-def eigenbasis_of(number: int) -> None:
-    eigenpairs(kept_meshes[number], EIGENVECTORS)
+def assorted_pairs(options: argparse.Namespace) -> Iterator[KnownPair]:
+    """Yield pairs of all data sets in turn, in the directory that contains FAUST_R, or else of creatures."""
+    random = np.random.default_rng(0)
+    if options.data is None:
+        sizes = random.permutation(np.geomspace(1000, 20_000, ASSORTED)).astype(int)
+        for seed, size in enumerate(sizes):
+            yield KnownPair.of_creatures([*CREATURES][seed % len(CREATURES)], int(size), seed)
+        return
+    data_sets = []
+    for directory in sorted(options.data.resolve().parent.iterdir()):
+        with suppress(InputError):  # another directory
+            pairs = open_data_set(directory).pairs
+            data_sets.append([pairs[number] for number in random.permutation(len(pairs))])
+    for pair in chain.from_iterable(zip_longest(*data_sets)):
+        if pair is not None:
+            yield KnownPair.read(pair)
 
 
-def eigenbasis_in_one_thread(number: int) -> None:
-    with one_blas_thread():
-        eigenbasis_of(number)
+def written(meshes: Sequence[Mesh], directory: Path, suffix: str = ".off") -> list[str]:
+    """Write the meshes of a pair into a new directory, and return their files."""
+    directory.mkdir()
+    files = [str(directory / f"{side}{suffix}") for side in ("source", "target")]
+    for file, mesh in zip(files, meshes, strict=True):
+        write_mesh(file, mesh)
+    return files
 
 
-def stages(options: argparse.Namespace) -> Iterator[Part]:
-    """For each size, yield the times of computations on the host for one shape."""
-    for size in options.sizes:
-        mesh = creature_pair(vertices=size).source
-        sources = np.arange(0, len(mesh.vertices), len(mesh.vertices) // 100)
-        spread = poisson_disk_samples(mesh, 10_000)
-        with tempfile.TemporaryDirectory() as directory:
-            file = Path(directory) / "mesh.off"
-            write_mesh(file, mesh)
-            seconds = medians(
-                {
-                    "eigenbasis": lambda mesh=mesh: eigenpairs(mesh, EIGENVECTORS, eigensolver="exact"),
-                    "10 000 samples": lambda mesh=mesh: poisson_disk_samples(mesh, 10_000),
-                    "SHOT of all": lambda mesh=mesh: shot_descriptors(mesh),
-                    "SHOT of samples": lambda mesh=mesh, at=spread: shot_descriptors(mesh, samples=at),
-                    "farthest points": lambda mesh=mesh: farthest_point_samples(mesh, SAMPLES),
-                    "geodesics from 100": lambda mesh=mesh, at=sources: geodesic_distances(mesh, at),
-                    "reading OFF": lambda file=file: read_mesh(file),
-                },
-                3,
-                warm=False,
-            )
-        yield (
-            f"Stages, {len(mesh.vertices)} vertices",
-            f"k = {EIGENVECTORS}, {SAMPLES} samples.",
-            compared(seconds, "eigenbasis"),
-            {"vertices": len(mesh.vertices), "seconds": seconds},
-        )
-
-
-class Busy:
+class Busy(AbstractContextManager):
     """Processes that keep all cores busy while the context is entered."""
 
     def __enter__(self) -> None:
@@ -319,147 +201,287 @@ class Busy:
             process.wait()
 
 
-def command(options: argparse.Namespace) -> Iterator[Part]:
+def run_python(arguments: Sequence[str], cache: Path, kept: Path | None = None) -> np.ndarray:
+    """Run Python in a new process, and return its wall and CPU seconds.
+
+    `cache` is the cache directory, which is emptied first. With `kept`, it contains a copy of that directory.
+    """
+    shutil.rmtree(cache, ignore_errors=True)
+    if kept is not None:
+        shutil.copytree(kept, cache)
+    start = wall_and_cpu()
+    environment = {**os.environ, "JAXSMW_CACHE": str(cache)}
+    subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=environment)
+    return wall_and_cpu() - start
+
+
+def commands(options: argparse.Namespace) -> Iterator[Part]:
     """Yield the times of whole commands in new processes, for meshes of 5000 vertices."""
-    before, timed = people(options, 2)
+    timed, other = known_pairs(options, 2)
     with tempfile.TemporaryDirectory() as directory:
         root = Path(directory)
-        files = [[str(root / f"{side}_{number}.off") for side in range(2)] for number in range(2)]
-        for file, mesh in zip(chain(*files), (*before, *timed), strict=True):
-            write_mesh(Path(file), mesh)
-        of_before, of_timed = (["match", *of_pair, "--output", str(root / "map.txt")] for of_pair in files)
-        paper = ["--preset", "paper"]
-
-        def started(*arguments: str, cache: Path | None = None, own: bool = True) -> Callable[[], object]:
-            """Return a function that runs Python, by default with an empty cache.
-
-            With `own` False, only programs are kept from earlier commands.
-            """
-
-            def run() -> None:
-                for entry in cache.glob("*.npz") if cache and not own else ():
-                    if not entry.name.startswith("traced-program-"):
-                        entry.unlink()
-                with tempfile.TemporaryDirectory() as empty:
-                    environment = {**os.environ, "JAXSMW_CACHE": str(cache or empty)}
-                    command = [sys.executable, *arguments]
-                    subprocess.run(command, check=True, capture_output=True, env=environment)
-
-            return run
-
-        def beside(run: Callable[[], object]) -> Callable[[], object]:
-            def busy() -> None:
-                with Busy():
-                    run()
-
-            return busy
-
-        program = "-m", "jaxsmw"
-        kept, of_others = root / "kept", root / "others"
-        for extra in ([], paper):
-            started(*program, *of_before, *extra, cache=of_others)()
-            started(*program, *of_timed, *extra, cache=kept)()
-        matches = {
-            "first `match`": started(*program, *of_timed),
-            "second `match`, other meshes": started(*program, *of_timed, cache=of_others, own=False),
-            "second `match`, same meshes": started(*program, *of_timed, cache=kept),
-            "first `match --preset paper`": started(*program, *of_timed, *paper),
-            "second `match --preset paper`, same meshes": started(*program, *of_timed, *paper, cache=kept),
+        files, of_others = (written(pair.meshes, root / str(i)) for i, pair in enumerate((timed, other)))
+        # All commands have the same cache directory, because JAX finds a program only in the directory where
+        # it was stored.
+        cache, program, output = root / "cache", ["-m", "jaxsmw"], ["--output", str(root / "output")]
+        # Each candidate has a command, the cache that an earlier command left, and busy processes beside it.
+        candidates: dict[str, tuple[list[str], Path | None, AbstractContextManager]] = {}
+        for name, extra in {
+            "`match`": [],
+            "`match --backend jax`": ["--backend", "jax"],
+            "`match --preset paper`": ["--preset", "paper"],
+        }.items():
+            match_timed, match_others = (
+                [*program, "match", *of_pair, *extra, *output] for of_pair in (files, of_others)
+            )
+            same, others = (root / f"{name}, {kind} meshes" for kind in ("same", "other"))
+            for command, kept in ((match_timed, same), (match_others, others)):
+                run_python(command, cache)
+                shutil.copytree(cache, kept)
+            candidates |= {
+                f"{name}, first": (match_timed, None, nullcontext()),
+                f"{name}, other meshes": (match_timed, others, nullcontext()),
+                f"{name}, same meshes": (match_timed, same, nullcontext()),
+            }
+            if not extra:
+                candidates |= {
+                    f"{name}, first, beside busy processes": (match_timed, None, Busy()),
+                    f"{name}, same meshes, beside busy processes": (match_timed, same, Busy()),
+                }
+        other_commands = {
+            "`demo`": [*program, "demo", "--output", str(root / "demo")],
+            "`--help`": [*program, "--help"],
+            "`import jaxsmw`": ["-c", "import jaxsmw"],
+            "`import jax`": ["-c", "import jax"],
         }
-        others = {
-            "`import jax`": started("-c", "import jax"),
-            "`import jaxsmw`": started("-c", "import jaxsmw"),
-            "`jaxsmw --help`": started(*program, "--help"),
-            "`jaxsmw --version`": started(*program, "--version"),
-            "first `demo`": started(*program, "demo", "--output", str(root / "demo")),
-        }
-        busy = {f"{name}, busy": beside(run) for name, run in matches.items()}
-        times = medians(matches | others | busy, options.repeats, wall_and_cpu, warm=False)
-    rows = [["", "wall seconds", "CPU seconds", "wall seconds beside busy processes", "relative to quiet"]]
-    for name in (*matches, *others):
-        wall, cpu = times[name]
-        row = [name, f"{wall:.2f}", f"{cpu:.2f}", "", ""]
-        if beside_busy := times.get(f"{name}, busy"):
-            row[3:] = f"{beside_busy[0]:.2f}", f"{beside_busy[0] / wall:.2f}"
-        rows.append(row)
-    m, n = (len(mesh.vertices) for mesh in timed)
+        candidates |= {name: (command, None, nullcontext()) for name, command in other_commands.items()}
+        times: dict[str, list[np.ndarray]] = {name: [] for name in candidates}
+        for _ in range(options.rounds):
+            for name, (command, kept, beside) in candidates.items():
+                with beside:
+                    times[name].append(run_python(command, cache, kept))
+    seconds = {name: np.median(of_rounds, axis=0).tolist() for name, of_rounds in times.items()}
+    rows = [["", "wall seconds", "CPU seconds", "wall seconds, relative to quiet"]]
+    for name, (wall, cpu) in seconds.items():
+        quiet = name.removesuffix(", beside busy processes")
+        relative = "" if quiet == name else f"{wall / seconds[quiet][0]:.2f}"
+        rows.append([name, f"{wall:.2f}", f"{cpu:.2f}", relative])
+    m, n = (len(mesh.vertices) for mesh in timed.meshes)
     yield (
         f"Commands, {m} and {n} vertices",
-        "Each command ran in a new process. First commands start with an empty cache. Second commands use "
-        "the results of an earlier command with other or with the same meshes. One busy process ran for each "
-        f"core. Times are medians of {options.repeats} runs.",
+        "Each command ran in a new process. A first command has an empty cache, and so do the last four. "
+        "Other commands have the cache of a command with other meshes or with the same meshes. One busy "
+        f"process ran for each core. Times are medians of {options.rounds} rounds.",
         rows,
-        {"seconds": times},
+        {"seconds": seconds},
     )
 
 
-def people(options: argparse.Namespace, number: int) -> list[tuple[Mesh, Mesh]]:
-    """Return pairs of people of the remeshed FAUST set, or without `--data` of creatures of like size."""
-    if options.data is None:
-        pairs = (creature_pair(vertices=5000, seed=seed) for seed in range(number))
-        return [(pair.source, pair.target) for pair in pairs]
-    names = [(f"tr_reg_{i:03}", f"tr_reg_{10 + i:03}") for i in range(number)]
-    return [tuple(read_mesh(options.data / "off" / f"{name}.off") for name in pair) for pair in names]
-
-
-def later_pairs(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the times to match pairs in one process, from arrays to map, after a first pair."""
-    first, *others = people(options, 1 + options.repeats)
-    rows, measured = [["preset", "wall seconds", "CPU seconds", "shortest", "longest"]], {}
-    for preset in ("accurate", "paper"):
-        match(*first, preset=preset)
-        times = []
-        for pair in others:
-            arrays = [(mesh.vertices, mesh.faces) for mesh in pair]
-            start = wall_and_cpu()
-            match(*(make_mesh(*mesh) for mesh in arrays), preset=preset)
-            times.append(wall_and_cpu() - start)
-        wall, cpu = np.median(times, axis=0)
-        walls = [float(time_[0]) for time_ in times]
-        rows.append([preset, *(f"{value:.2f}" for value in (wall, cpu, min(walls), max(walls)))])
-        measured[preset] = np.array(times).tolist()
+def one_process(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the times of pairs in one process, whose shapes are already in the cache."""
+    pairs = known_pairs(options, max(2, options.rounds))
+    rows, measured = [["preset", "backend", "", "wall s", "CPU s", "shortest", "longest"]], {}
+    with tempfile.TemporaryDirectory() as directory:
+        root = Path(directory)
+        files = [written(pair.meshes, root / str(number)) for number, pair in enumerate(pairs)]
+        for preset in PRESETS:
+            for backend in ("numpy", "jax"):
+                times = in_new_process(root / "cache", matched_twice, files, preset, backend)
+                for name, of_pairs in zip(("sizes are new", "same pair again"), times, strict=True):
+                    wall, cpu = np.median(of_pairs, axis=0)
+                    walls = [of_pair[0] for of_pair in of_pairs]
+                    numbers = (f"{value:.2f}" for value in (wall, cpu, min(walls), max(walls)))
+                    rows.append([preset, backend, name, *numbers])
+                measured[f"{preset}, {backend}"] = times
     yield (
-        "Later pairs",
-        f"Times from arrays to map of {len(others)} pairs of about 5000 vertices, in one process and without "
-        "a cache, after a first pair. The shortest and the longest time are wall times.",
+        "One process, shapes kept",
+        f"Times from arrays to map of {len(pairs)} pairs of about 5000 vertices in one process. The cache "
+        "contains all shapes. Times are medians; the last two columns are wall times.",
         rows,
         {"seconds": measured},
     )
 
 
-class Truth(NamedTuple):
-    """Source and target, the vertices of the source with ground truth (r,), and their true matches (r,)."""
-
-    meshes: tuple[Mesh, Mesh]
-    rows: Int64[np.ndarray, " r"]
-    targets: Int64[np.ndarray, " r"]
-
-    def error(self, pointwise_map: np.ndarray, target: Mesh, number: int | None = None) -> float:
-        """Return the mean geodesic error in thousandths of the square root of the target's area.
-
-        The `target` may be subdivided (see `finer`). Each match is replaced by the nearest vertex of the
-        target in `meshes`. The error is measured at `number` random vertices; None for all.
-        """
-        drawn = np.random.default_rng(0).permutation(len(self.rows))[:number]
-        coarse, matches = self.meshes[1], pointwise_map[self.rows[drawn]]
-        _, nearest = KDTree(coarse.vertices).query(target.vertices[matches])
-        distances = geodesic_distances_between(coarse, self.targets[drawn], nearest)
-        return 1000 * float(distances.mean()) / coarse.area**0.5
+def matched_twice(
+    files: list[list[str]], preset: PresetName, backend: Backend
+) -> tuple[list[list[float]], list[list[float]]]:
+    """Match pairs of known shapes twice. Return wall and CPU seconds of the first and second matches."""
+    pairs = [[read_mesh(file) for file in of_pair] for of_pair in files]
+    for pair in pairs:
+        match(*pair, preset=preset, backend="numpy")  # fills the cache
+    first, again = [], []
+    # The pairs are new, because each source is matched to the target of the next pair.
+    for (source, _), (_, target) in zip(pairs, [*pairs[1:], pairs[0]], strict=True):
+        for times in (first, again):
+            arrays = [(mesh.vertices, mesh.faces) for mesh in (source, target)]
+            start = wall_and_cpu()
+            match(*(make_mesh(*mesh) for mesh in arrays), preset=preset, backend=backend)
+            times.append((wall_and_cpu() - start).tolist())
+    return first, again
 
 
-def pair_with_truth(options: argparse.Namespace) -> Truth:
-    """Return two people of the remeshed FAUST set if `--data` is given, else two poses of a creature."""
-    if options.data is None:
-        pair = creature_pair(vertices=SIZES[0])
-        return Truth((pair.source, pair.target), np.arange(len(pair.true_map)), pair.true_map)
-    return truth_of(options.data, "tr_reg_002", "tr_reg_007")
+def memory_of_many(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the memory of one process that matches many pairs of many sizes."""
+    number = 4 if options.quick else ASSORTED
+    with tempfile.TemporaryDirectory() as cache:
+        history = in_new_process(cache, matched_assorted, options, number)
+    rows = [["pairs", "peak memory, GiB", "memory, GiB", "mean error x10^-3", "median", "seconds per pair"]]
+    for stated in sorted({min(number, stated) for stated in STATED}):
+        seen = np.array(history[:stated])
+        error, median, seconds = seen[:, 2].mean(), np.median(seen[:, 2]), np.median(seen[:, 3])
+        peak, resident = seen[-1, :2]
+        rows.append(
+            [str(stated), f"{peak:.2f}", f"{resident:.2f}", f"{error:.1f}", f"{median:.1f}", f"{seconds:.2f}"]
+        )
+    sizes = [size for *_, size in history]
+    yield (
+        "Memory of many pairs",
+        f"{number} pairs whose larger mesh has {min(sizes)} to {max(sizes)} vertices, matched by the preset "
+        "accurate in one process. Errors are measured in the same process, at 400 points per pair.",
+        rows,
+        {"history": history},
+    )
 
 
-def truth_of(data: Path, *names: str) -> Truth:
-    """Return two people of the remeshed FAUST set."""
-    x, y = (read_mesh(data / "off" / f"{name}.off") for name in names)
-    rows, targets = (np.loadtxt(data / "corres" / f"{name}.vts", dtype=np.int64) - 1 for name in names)
-    return Truth((x, y), rows, targets)
+def matched_assorted(options: argparse.Namespace, number: int) -> list[list[float]]:
+    """Match assorted pairs. Return peak and memory in GiB, error, seconds and vertices of each pair."""
+    history = []
+    for pair in islice(assorted_pairs(options), number):
+        start = time.perf_counter()
+        pointwise_map = match(*pair.meshes, partial=pair.partial).pointwise_map
+        seconds = time.perf_counter() - start
+        error = pair.error(pointwise_map, number=400)
+        size = max(len(mesh.vertices) for mesh in pair.meshes)
+        history.append([memory("VmHWM"), memory("VmRSS"), error, seconds, size])
+    return history
+
+
+def peers(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the times and errors of several libraries, from the same mesh files and initial maps."""
+    pairs = known_pairs(options, 2 if options.quick else 4)
+    columns = ["first pair, wall s", "later pairs, wall s", "CPU s", "refinement, s", "of ours"]
+    rows, measured = [["", *columns, "error x10^-3"]], {}
+    with tempfile.TemporaryDirectory() as directory:
+        root = Path(directory)
+        files = [written(pair.meshes, root / str(number)) for number, pair in enumerate(pairs)]
+        starts = []
+        for of_pair in files:
+            pair = Pair(*map(read_mesh, of_pair))
+            starts.append(initial_map(pair, *paired_spectra(pair, EIGENVECTORS)))
+        for name, (library, refined_from_files, *settings) in LIBRARIES.items():
+            if not find_spec(library):
+                print(f"\npeers: {library} is not installed: install it with pip install 'jaxsmw[peers]'.")
+                continue
+            arguments = library, refined_from_files, settings, files, starts
+            times, maps = in_new_process("off", timed_library, *arguments)
+            errors = [pair.error(of_pair) for pair, of_pair in zip(pairs, maps, strict=True)]
+            wall, cpu, refining = np.median(times[1:], axis=0)
+            measured[name] = {"seconds": times, "errors": errors}
+            ours = np.median(measured[next(iter(LIBRARIES))]["seconds"][1:], axis=0)[0]
+            numbers = (f"{value:.2f}" for value in (times[0][0], wall, cpu, refining))
+            rows.append([name, *numbers, f"{wall / ours:.1f}", f"{np.mean(errors):.1f}"])
+    yield (
+        "Peers",
+        f"Times from two mesh files of about 5000 vertices to the map, for {len(pairs)} pairs, each library "
+        "in one process, without a cache. Initial maps are given, except to pyFM with its defaults. Later "
+        "pairs are medians.",
+        rows,
+        {"measured": measured},
+    )
+
+
+# A method returns its map and the seconds of its refinement.
+Refined = tuple[np.ndarray, float]
+
+
+def timed_library(
+    library: str,
+    refined_from_files: Callable[..., Refined],
+    settings: list[Any],
+    files: list[list[str]],
+    starts: list[np.ndarray],
+) -> tuple[list[list[float]], list[np.ndarray]]:
+    """Match pairs. Return the wall, CPU and refinement seconds of each pair, and the maps."""
+    for module in {"pyFM": ("mesh", "functional", "refine", "spectral"), "geomfum": ("refine", "shape")}.get(
+        library, ()
+    ):
+        import_module(f"{library}.{module}")
+    times, maps = [], []
+    for of_pair, start in zip(files, starts, strict=True):
+        begin = wall_and_cpu()
+        pointwise_map, refining = refined_from_files(of_pair, start, *settings)
+        times.append([*(wall_and_cpu() - begin).tolist(), refining])
+        maps.append(np.asarray(pointwise_map))
+    return times, maps
+
+
+def ours_from_files(files: list[str], start: np.ndarray, preset: PresetName, backend: Backend) -> Refined:
+    result = match(*map(read_mesh, files), preset=preset, init=start, backend=backend)
+    return result.pointwise_map, result.seconds["refinement"]
+
+
+def pyfm_defaults_from_files(files: list[str], _: np.ndarray) -> Refined:
+    """Match with pyFM's default descriptors, and ten steps of ZoomOut from 50 eigenvectors."""
+    from pyFM.functional import FunctionalMapping
+    from pyFM.mesh import TriMesh
+
+    x, y = (TriMesh.load(file) for file in files)
+    model = FunctionalMapping(y, x)
+    model.preprocess()
+    model.fit(verbose=False)
+    begin = time.perf_counter()
+    return model.get_p2p(model.zoomout_refine(step=1)), time.perf_counter() - begin
+
+
+# With 16 steps of 5 eigenvectors, ZoomOut goes from 20 to 100 eigenvectors.
+STEPS, STEP = 16, 5
+
+
+def pyfm_from_files(files: list[str], start: np.ndarray) -> Refined:
+    from pyFM.mesh import TriMesh
+    from pyFM.refine import zoomout_refine
+    from pyFM.spectral import p2p_to_FM
+
+    x, y = (TriMesh.load(file).process(k=EIGENVECTORS) for file in files)
+    begin = time.perf_counter()
+    k = EIGENVECTORS - STEPS * STEP
+    functional_map = p2p_to_FM(start, y.eigenvectors[:, :k], x.eigenvectors[:, :k], A2=x.A)
+    bases = (shape.eigenvectors[:, :EIGENVECTORS] for shape in (y, x))
+    _, pointwise_map = zoomout_refine(
+        functional_map, *bases, nit=STEPS, step=STEP, A2=x.A, return_p2p=True, n_jobs=-1
+    )
+    return pointwise_map, time.perf_counter() - begin
+
+
+def geomfum_from_files(files: list[str], start: np.ndarray) -> Refined:
+    """Refine by geomfum's ZoomOut with vertex areas.
+
+    Its default ignores vertex areas, and is slower and less accurate.
+    """
+    from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
+    from geomfum.laplacian import LaplacianSpectrumFinder
+    from geomfum.refine import ZoomOut
+    from geomfum.shape import TriangleMesh
+
+    find = LaplacianSpectrumFinder(spectrum_size=EIGENVECTORS)
+    x, y = (find(TriangleMesh.from_file(file), as_basis=True, recompute=True) for file in files)
+    begin = time.perf_counter()
+    k = EIGENVECTORS - STEPS * STEP
+    convert = FmFromP2pConverter(pseudo_inverse=True)
+    functional_map = convert(start, y.truncate(k), x.truncate(k))
+    refined = ZoomOut(nit=STEPS, step=STEP, fm_from_p2p_converter=convert)(functional_map, y, x)
+    return P2pFromFmConverter()(refined, y, x), time.perf_counter() - begin
+
+
+# The package, the method, and the method's further arguments.
+LIBRARIES: dict[str, tuple[Any, ...]] = {
+    "jaxsmw, paper, NumPy": ("jaxsmw", ours_from_files, "paper", "numpy"),
+    "jaxsmw, paper, JAX": ("jaxsmw", ours_from_files, "paper", "jax"),
+    "jaxsmw, accurate, NumPy": ("jaxsmw", ours_from_files, "accurate", "numpy"),
+    "pyFM, its defaults": ("pyFM", pyfm_defaults_from_files),
+    "pyFM, ZoomOut 20 to 100": ("pyFM", pyfm_from_files),
+    "geomfum, ZoomOut 20 to 100": ("geomfum", geomfum_from_files),
+}
 
 
 def finer(mesh: Mesh, number_of_vertices: int, *, seed: int = 0) -> Mesh:
@@ -511,15 +533,6 @@ def split_faces(
     return np.concatenate([np.stack(corners, axis=1) for corners in parts[number]])
 
 
-def peak_memory() -> float:
-    """Return the peak memory of this process so far, in GiB."""
-    status = Path("/proc/self/status")
-    if status.exists():  # the peak of `getrusage` can include the memory of the parent process
-        (kilobytes,) = re.findall(r"VmHWM:\s*(\d+) kB", status.read_text("utf-8"))
-        return int(kilobytes) / 2**20
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
-
-
 class FromFiles(NamedTuple):
     """The measurements of a match from two mesh files to the map."""
 
@@ -531,375 +544,186 @@ class FromFiles(NamedTuple):
 
 def matched_from_files(files: list[str], preset: PresetName) -> FromFiles:
     """Match two mesh files, and measure the time of each step and the peak memory of the process."""
-    start, start_cpu = time.perf_counter(), time.process_time()
+    start = wall_and_cpu()
     meshes = [read_mesh(file) for file in files]
-    seconds = {"reading": time.perf_counter() - start}
+    seconds = {"reading": float((wall_and_cpu() - start)[0])}
     result = match(*meshes, preset=preset)
-    other = time.perf_counter() - start - sum(seconds.values()) - sum(result.seconds.values())
-    seconds |= {**result.seconds, "other": other}
-    cpu = time.process_time() - start_cpu
-    return FromFiles(seconds, cpu, peak_memory(), (result.initial_map, result.pointwise_map))
-
-
-def in_new_process(cache: Path, function: Callable[..., FromFiles], *arguments: Any) -> FromFiles:
-    """Call a function in a new process, which uses the given directory as its cache."""
-    before = dict(os.environ)
-    os.environ["JAXSMW_CACHE"] = str(cache)
-    cache_compiled_programs()  # sets variables that the new process inherits
-    try:
-        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
-            return executor.submit(function, *arguments).result()
-    finally:
-        os.environ.clear()
-        os.environ.update(before)
+    wall, cpu = (wall_and_cpu() - start).tolist()
+    seconds |= result.seconds
+    seconds["other"] = wall - sum(seconds.values())
+    return FromFiles(seconds, cpu, memory("VmHWM"), (result.initial_map, result.pointwise_map))
 
 
 def scale(options: argparse.Namespace) -> Iterator[Part]:
-    """For each of the presets `paper` and `accurate`, yield times and memory for shapes of several sizes."""
-    large = () if options.quick else LARGE
-    for preset in ("paper", "accurate"):
-        yield scaled(options, preset, (10_000, 30_000, *large))
-
-
-def scaled(options: argparse.Namespace, preset: PresetName, sizes: Sequence[int]) -> Part:
-    """Measure one preset at several sizes, cold and warm."""
-    truth = pair_with_truth(options)
-    measured: list[dict[str, Any]] = []
-    for size in sizes:
-        meshes = [finer(mesh, size, seed=size + side) for side, mesh in enumerate(truth.meshes)]
-        with tempfile.TemporaryDirectory() as directory:
-            files = [str(Path(directory) / f"{side}.ply") for side in range(2)]
-            for file, mesh in zip(files, meshes, strict=True):
-                write_mesh(Path(file), mesh)
-            cold, warm = (
-                in_new_process(Path(directory) / "cache", matched_from_files, files, preset) for _ in range(2)
+    """For each preset, yield times and memory for shapes of several sizes, cold and warm."""
+    (pair,) = known_pairs(options, 1)
+    for preset in PRESETS:
+        measured = []
+        for size in (10_000,) if options.quick else LARGE:
+            meshes = [finer(mesh, size, seed=size + side) for side, mesh in enumerate(pair.meshes)]
+            with tempfile.TemporaryDirectory() as directory:
+                files = written(meshes, Path(directory) / "meshes", ".ply")
+                cache = Path(directory) / "cache"
+                runs = [in_new_process(cache, matched_from_files, files, preset) for _ in range(2)]
+            cold, warm = runs
+            errors = [pair.error(of_run, target=meshes[1]) for of_run in cold.maps]
+            totals = [[sum(run.seconds.values()), run.cpu] for run in runs]
+            measured.append(
+                {
+                    "vertices": size,
+                    "seconds": cold.seconds,
+                    "cold and warm": totals,
+                    "peak GiB": [cold.peak, warm.peak],
+                    "errors": errors,
+                }
             )
-        errors = [truth.error(pointwise_map, meshes[1]) for pointwise_map in cold.maps]
-        totals = {}
-        for name, run in (("cold", cold), ("warm", warm)):
-            totals |= {name: sum(run.seconds.values()), f"{name}, CPU": run.cpu}
-        numbers = {"vertices": size, "seconds": cold.seconds, "totals": totals}
-        measured.append(numbers | {"peak_gib": cold.peak, "errors": errors})
-    # Some stages run only for some sizes, and only then have steps of their own.
-    names = [
-        list(dict.fromkeys(name for each in measured for name in each[kind]))
-        for kind in ("seconds", "totals")
-    ]
-    columns = [*names[0], *names[1], "peak GiB", "initial error", "refined error"]
-    rows = [
-        [
-            str(each["vertices"]),
-            *(f"{each['seconds'].get(name, 0):.1f}" for name in names[0]),
-            *(f"{each['totals'][name]:.1f}" for name in names[1]),
-            f"{each['peak_gib']:.2f}",
-            *(f"{error:.1f}" for error in each["errors"]),
-        ]
-        for each in measured
-    ]
-
-    def exponent(values: list[float]) -> str:
-        # The fit leaves out the smallest size, because constant costs dominate the time at this size.
-        if min(values[1:]) <= 0:
-            return ""
-        return f"{np.polyfit(np.log([m['vertices'] for m in measured[1:]]), np.log(values[1:]), 1)[0]:.2f}"
-
-    if len(measured) > 2:
-        exponents = [
-            exponent([m[kind].get(name, 0) for m in measured])
-            for kind, each in zip(("seconds", "totals"), names, strict=True)
-            for name in each
-        ]
-        memory = exponent([m["peak_gib"] for m in measured])
-        rows.append(["exponent", *exponents, memory, "", ""])
-    return (
-        f"Scale, {preset}",
-        f"Times of the preset {preset} from two PLY files to the map in seconds, without the start of "
-        "Python. Steps are measured cold, with an empty cache. A warm process uses the cache of the cold "
-        "process. The peak memory is the memory of the whole cold process. Errors are mean geodesic errors "
-        "x10^-3.",
-        [["vertices", *columns], *rows],
-        {"measured": measured},
-    )
-
-
-def peers(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the times of several libraries to read a pair, to compute eigenbases and to refine a map."""
-    truth = pair_with_truth(options)
-    missing = [name for name in ("pyFM", "geomfum") if not find_spec(name)]
-    if missing:
-        print(f"\npeers: {' and '.join(missing)} not installed: install with pip install 'jaxsmw[peers]'.")
-    with tempfile.TemporaryDirectory() as directory:
-        files = [str(Path(directory) / f"{side}.off") for side in range(2)]
-        for file, mesh in zip(files, truth.meshes, strict=True):
-            write_mesh(Path(file), mesh)
-        # The initial map is computed here, so the times of other libraries do not include its computation.
-        pair = Pair(*map(read_mesh, files))
-        first = initial_map(pair, *paired_spectra(pair, EIGENVECTORS))
-        runs: dict[str, Callable[[list[str]], tuple[np.ndarray, float]]] = {
-            "ours": ours_from_files,
-            "ours, search in patches": partial(ours_from_files, search="patches"),
-            "ours, on samples, in patches": partial(ours_from_files, search="patches", samples=SAMPLES),
-        }
-        if "pyFM" not in missing:
-            runs["pyFM, its defaults"] = pyfm_defaults_from_files
-            runs["pyFM, its defaults, ZoomOut on to 100"] = partial(pyfm_defaults_from_files, step=5)
-            runs["pyFM, ZoomOut 20 to 100 from our start"] = partial(pyfm_from_files, first=first)
-        if "geomfum" not in missing:
-            runs["geomfum, ZoomOut 20 to 100 from our start"] = partial(geomfum_from_files, first=first)
-        measured: dict[str, dict[str, Any]] = {}
-        for turn in range(2 if options.quick else 4):  # the first run of each library includes compilation
-            for name, run in runs.items():
-                if turn > 1 and name.startswith("geomfum"):
-                    continue  # geomfum is timed only once, because each of its runs takes a minute
-                start = time.perf_counter()
-                pointwise_map, refining = run(files)
-                taken = time.perf_counter() - start
-                of = measured.setdefault(name, {"all": [], "refining": [], "error": None})
-                of["all"].append(taken)
-                of["refining"].append(refining)
-                of["error"] = truth.error(pointwise_map, truth.meshes[1])
-    table = [["", "files to map, seconds", "of ours", "refinement", "of ours", "first time", "error x10^-3"]]
-    ours = [float(np.median(measured["ours"][kind][1:])) for kind in ("all", "refining")]
-    for name, of in measured.items():
-        whole, refining = (float(np.median(of[kind][1:])) for kind in ("all", "refining"))
-        table.append(
-            [
-                name,
-                f"{whole:.2f}",
-                f"{whole / ours[0]:.1f}",
-                f"{refining:.2f}",
-                f"{refining / ours[1]:.1f}",
-                f"{of['all'][0]:.1f}",
-                f"{of['error']:.1f}",
-            ]
+        steps = list(dict.fromkeys(chain.from_iterable(each["seconds"] for each in measured)))
+        totals = ["cold, wall", "CPU", "warm, wall", "CPU"]
+        rows = [["vertices", *steps, *totals, "peak GiB", "initial error", "refined error"]]
+        for each in measured:
+            seconds = (*(each["seconds"].get(step, 0) for step in steps), *chain(*each["cold and warm"]))
+            numbers = [*(f"{value:.1f}" for value in seconds), f"{max(each['peak GiB']):.2f}"]
+            rows.append([str(each["vertices"]), *numbers, *(f"{error:.1f}" for error in each["errors"])])
+        yield (
+            f"Scale, {preset}",
+            f"Times of the preset {preset} from two PLY files to the map in seconds, without the start of "
+            "Python. The steps are those of the cold process, which has an empty cache. The warm process "
+            "has the cache of the cold one. Errors are mean geodesic errors x10^-3.",
+            rows,
+            {"measured": measured},
         )
-    m, n = (len(mesh.vertices) for mesh in truth.meshes)
-    yield (
-        f"Peers, {m} x {n} vertices",
-        "Times are medians of runs in one process. Only the first time includes compilation. Our rows use "
-        f"k = {EIGENVECTORS} and {ITERATIONS} iterations from SHOT. Rows from our start begin with our "
-        "initial map, and leave out the time to compute this map.",
-        table,
-        {"measured": measured},
-    )
 
 
-def throughput(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the pairs per minute and the errors of several libraries, for pairs of ten meshes of people."""
-    if options.data is None:
-        print("\nthroughput: left out, because it needs the option --data.")
-        return
-    names = [f"tr_reg_{number:03}" for number in range(0, 70, 7)]
-    pairs = list(permutations(names, 2))
-    files = {name: str(options.data / "off" / f"{name}.off") for name in names}
-    measured: dict[str, dict[str, Any]] = {}
+def refinement(options: argparse.Namespace) -> Iterator[Part]:
+    """For each size, yield the times to refine one pair by NumPy and by JAX."""
+    import jax
+    import jax.numpy as jnp
 
-    def add(name: str, matched: list[tuple[str, str]], maps: list[np.ndarray], seconds: float) -> None:
-        truths = [truth_of(options.data, *pair) for pair in matched]
-        errors = [truth.error(T, truth.meshes[1], 400) for truth, T in zip(truths, maps, strict=True)]
-        measured[name] = {"pairs": len(matched), "seconds": seconds, "errors": errors}
+    from jaxsmw.runtime.compilation import compiled
 
-    with tempfile.TemporaryDirectory() as directory:
-        for preset in ("accurate", "paper"):
-            os.environ["JAXSMW_CACHE"] = str(Path(directory) / preset)
-            start = time.perf_counter()
-            starts, maps = {}, []  # only the maps are kept, because results contain both spectra
-            for pair in tqdm(pairs, f"throughput, {preset}"):
-                result = match(*(read_mesh(files[name]) for name in pair), preset=preset)
-                starts[pair] = result.initial_map
-                maps.append(result.pointwise_map)
-            add(f"jaxsmw, {preset}", pairs, maps, time.perf_counter() - start)
-        os.environ["JAXSMW_CACHE"] = "off"
-    for name, library, run, matched in (
-        (
-            "pyFM, its defaults, ZoomOut on to 100",
-            "pyFM",
-            partial(pyfm_defaults_from_files, step=5),
-            pairs[::2],
-        ),
-        ("pyFM, ZoomOut 20 to 100 from our start", "pyFM", pyfm_from_files, pairs[::2]),
-        ("geomfum, ZoomOut 20 to 100 from our start", "geomfum", geomfum_from_files, pairs[::6]),
-    ):
-        if find_spec(library):
-            arguments = [([files[x], files[y]], starts[x, y]) for x, y in matched]
-            add(name, matched, *in_ten_processes(run, arguments, library))
-        else:
-            print(f"\nthroughput: {library} not installed: install with pip install 'jaxsmw[peers]'.")
-    rows = [["", "pairs", "seconds", "pairs per minute", "error x10^-3"]]
-    for name, of in measured.items():
-        rate = 60 * of["pairs"] / of["seconds"]
-        error = np.mean(of["errors"])
-        rows.append([name, str(of["pairs"]), f"{of['seconds']:.0f}", f"{rate:.1f}", f"{error:.1f}"])
-    yield (
-        "Throughput",
-        "Ordered pairs of ten meshes of people, each with about 5000 vertices. jaxsmw runs in one process, "
-        "and its times include compilation. Each other library runs in ten processes, and its times leave "
-        "out the start of the processes. Errors are measured at 400 points per pair.",
-        rows,
-        {"measured": measured},
-    )
+    for size in options.sizes:
+        pair = creature_pair(vertices=size)
+        meshes = pair.source, pair.target
+        spectra = [compute_spectrum(mesh, EIGENVECTORS, eigensolver="exact") for mesh in meshes]
+        start = initial_map(Pair(*meshes), *spectra, init="wks")
+        samples = tuple(farthest_point_samples(mesh, SAMPLES) for mesh in meshes)
+        of_numpy = jax.tree.map(np.asarray, (*spectra, start))
+        of_jax = jax.tree.map(jnp.asarray, (*spectra, start))
+
+        def once(run: Callable, arguments: tuple, samples: tuple | None = None) -> Callable[[], Any]:
+            def refined() -> Any:
+                with one_blas_thread():  # `match` also limits BLAS to one thread
+                    return run(*arguments, iterations=ITERATIONS, samples=samples)
+
+            return refined
+
+        def products(a=of_numpy[0].eigenvectors, b=of_numpy[1].eigenvectors.T) -> None:
+            # Each block of products fits into the processor's cache. Only the maximum of each row is kept.
+            for row in range(0, ITERATIONS * len(a), 256):
+                (a[row % len(a) :][:256] @ b).max(axis=1)
+
+        by_jax = once(compiled(refine), of_jax)
+        begin = time.perf_counter()
+        jax.block_until_ready(by_jax())
+        first = time.perf_counter() - begin
+        candidates = {
+            "matrix products alone": products,
+            "NumPy": once(refine_at_once, of_numpy),
+            "NumPy, on samples": once(refine_at_once, of_numpy, samples),
+            "JAX": by_jax,
+            "JAX, on samples": once(compiled(refine), of_jax, tuple(map(jnp.asarray, samples))),
+        }
+        seconds = medians(candidates, options.rounds)
+        m, n = (len(mesh.vertices) for mesh in meshes)
+        yield (
+            f"Refinement, {m} x {n} vertices",
+            f"k = {EIGENVECTORS}, {ITERATIONS} iterations, float32. The first refinement by JAX took "
+            f"{first:.2f} s, because it was compiled.",
+            compared(seconds, "matrix products alone"),
+            {"vertices": [m, n], "seconds": seconds, "first": first},
+        )
 
 
-def in_ten_processes(
-    run: Callable[..., tuple[np.ndarray, float]], arguments: list[tuple[Any, ...]], library: str
-) -> tuple[list[np.ndarray], float]:
-    """Call a function in ten processes, each with one BLAS thread.
+def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
+    """For each size, yield the CPU times of several eigensolvers on one shape."""
+    for size in [*options.sizes, *([] if options.quick else [100_000])]:
+        mesh = finer(creature_pair(vertices=min(size, SIZES[-1])).source, size)
+        stiffness, areas = assemble_laplacian(mesh)
+        masses = sp.diags(areas / areas.sum()).tocsc()
 
-    **Returns:** The first result of each call, and the seconds of all calls together after the imports.
-    """
-    spawned = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(10, spawned, initializer=import_alone, initargs=(library,)) as pool:
-        list(pool.map(time.sleep, [5] * 10))  # all processes start
-        start = time.perf_counter()
-        calls = [pool.submit(run, *of_pair) for of_pair in arguments]
-        maps = [call.result()[0] for call in calls]
-        return maps, time.perf_counter() - start
+        def usual(stiffness=stiffness, masses=masses) -> object:
+            with threadpool_limits(1, "blas"):
+                return eigsh(stiffness, EIGENVECTORS, masses, sigma=-1e-2)
 
+        def ours(solver: Eigensolver, mesh=mesh) -> np.ndarray:
+            return eigenpairs(mesh, EIGENVECTORS, eigensolver=solver)[0]
 
-def import_alone(library: str) -> None:
-    """Import a library, and let BLAS use one thread in this process."""
-    import_module(library)
-    threadpool_limits(1, "blas")
-
-
-def ours_from_files(
-    files: list[str], search: Search = "auto", samples: int | None = None
-) -> tuple[np.ndarray, float]:
-    """Match with this library, and return the map and the seconds that refinement takes."""
-    refiner = WaveletPreservation(search=search)
-    stage = Stage(
-        refiner, number_of_eigenvectors=EIGENVECTORS, iterations=ITERATIONS, number_of_samples=samples
-    )
-    result = match(*map(read_mesh, files), preset=stage)
-    return result.pointwise_map, result.seconds["refinement"]
+        candidates = {
+            "SciPy's eigsh": usual,
+            "exact": lambda: ours("exact"),
+            "approximate": lambda: ours("approximate"),
+        }
+        seconds = medians(candidates, options.rounds, time.process_time, warm=False)
+        excess = ours("approximate")[1:] / ours("exact")[1:] - 1
+        yield (
+            f"Eigenbasis, {len(mesh.vertices)} vertices",
+            f"{EIGENVECTORS} eigenpairs, one thread, CPU time. Our times include the assembly of the "
+            f"Laplacian and a check of the result. Approximate eigenvalues are {excess.mean():.2%} too large "
+            f"on average, and at most {excess.max():.2%} too large.",
+            compared(seconds, "SciPy's eigsh"),
+            {"vertices": len(mesh.vertices), "seconds": seconds, "excess": excess.tolist()},
+        )
 
 
-def pyfm_defaults_from_files(
-    files: list[str], first: object = None, step: int = 1
-) -> tuple[np.ndarray, float]:
-    """Match with `pyFM.functional.FunctionalMapping`, its default descriptors, and ZoomOut.
-
-    ZoomOut starts from 50 eigenvectors and takes ten steps, each of which adds `step` eigenvectors. The
-    initial map `first` is not used.
-    """
-    from pyFM.functional import FunctionalMapping
-    from pyFM.mesh import TriMesh
-
-    x, y = (TriMesh.load(file) for file in files)
-    model = FunctionalMapping(y, x)
-    model.preprocess()
-    model.fit(verbose=False)
-    start = time.perf_counter()
-    pointwise_map = model.get_p2p(model.zoomout_refine(step=step))
-    return np.asarray(pointwise_map), time.perf_counter() - start
-
-
-def pyfm_from_files(files: list[str], first: np.ndarray) -> tuple[np.ndarray, float]:
-    """Refine an initial map with `pyFM.refine.zoomout_refine` in steps of 5 eigenvectors."""
-    from pyFM.mesh import TriMesh
-    from pyFM.refine import zoomout_refine
-    from pyFM.spectral import p2p_to_FM
-
-    x, y = (TriMesh.load(file).process(k=EIGENVECTORS) for file in files)
-    start = time.perf_counter()
-    k = EIGENVECTORS - ZOOMOUT_STEPS * 5
-    functional_map = p2p_to_FM(first, y.eigenvectors[:, :k], x.eigenvectors[:, :k], A2=x.A)
-    _, pointwise_map = zoomout_refine(
-        functional_map,
-        y.eigenvectors[:, :EIGENVECTORS],
-        x.eigenvectors[:, :EIGENVECTORS],
-        nit=ZOOMOUT_STEPS,
-        step=5,
-        A2=x.A,
-        return_p2p=True,
-        n_jobs=-1,
-    )
-    return np.asarray(pointwise_map), time.perf_counter() - start
-
-
-def geomfum_from_files(files: list[str], first: np.ndarray) -> tuple[np.ndarray, float]:
-    """Refine an initial map with `geomfum.refine.ZoomOut` in steps of 5 eigenvectors.
-
-    The conversion from pointwise to functional maps uses vertex areas. geomfum's default conversion ignores
-    vertex areas, and is slower and less accurate.
-    """
-    from geomfum.convert import FmFromP2pConverter, P2pFromFmConverter
-    from geomfum.laplacian import LaplacianSpectrumFinder
-    from geomfum.refine import ZoomOut
-    from geomfum.shape import TriangleMesh
-
-    find = LaplacianSpectrumFinder(spectrum_size=EIGENVECTORS)
-    x, y = (find(TriangleMesh.from_file(file), as_basis=True, recompute=True) for file in files)
-    start = time.perf_counter()
-    k = EIGENVECTORS - ZOOMOUT_STEPS * 5
-    convert = FmFromP2pConverter(pseudo_inverse=True)
-    functional_map = convert(first, y.truncate(k), x.truncate(k))
-    refined = ZoomOut(nit=ZOOMOUT_STEPS, step=5, fm_from_p2p_converter=convert)(functional_map, y, x)
-    return np.asarray(P2pFromFmConverter()(refined, y, x)), time.perf_counter() - start
-
-
-# With 16 steps of 5 eigenvectors, ZoomOut goes from 20 to 100 eigenvectors.
-ZOOMOUT_STEPS = 16
-
-
-def draw(numbers: dict[str, Any], file: Path) -> None:
-    """Plot the times of `refinement`, `eigenbasis` and `scale`, and the peak memory, against the size."""
-    panels: dict[str, dict[str, list[tuple[int, float]]]] = {}
-    for part in ("refinement", "eigenbasis"):
-        for measured in numbers.get(part, []):
-            curves = panels.setdefault(part.capitalize(), {})
-            for name, seconds in measured["seconds"].items():
-                curves.setdefault(name, []).append((int(np.max(measured["vertices"])), seconds))
-    for measured in numbers["scale"][0]["measured"] if numbers.get("scale") else ():
-        curves = panels.setdefault("From files to map", {})
-        totals = {f"in all, {name}": value for name, value in measured["totals"].items()}
-        of_steps = {**measured["seconds"], **totals, "peak memory, GiB": measured["peak_gib"]}
-        for name, value in of_steps.items():
-            curves.setdefault(name, []).append((measured["vertices"], value))
-    if not panels:
-        return
-    figure, axes = plt.subplots(
-        1, len(panels), figsize=(5 * len(panels), 5.5), layout="constrained", squeeze=False
-    )
-    for axis, (title, curves) in zip(axes[0], panels.items(), strict=True):
-        colors: dict[str, str] = {}
-        for name, points in curves.items():
-            # A dotted line shows a run without our compiler options, or CPU times. The solid line of the same
-            # colour shows the run with these options, or wall times.
-            usual = name.removesuffix(XLA_DEFAULTS).removesuffix(", CPU")
-            color = "black" if "GiB" in name else colors.setdefault(usual, f"C{len(colors)}")
-            style = {"color": color, "linestyle": "-" if usual == name else ":", "marker": "o"}
-            axis.loglog(*zip(*points, strict=True), label=name, **style)
-        axis.set(title=title, xlabel="vertices", ylabel="seconds")
-        axis.legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.14))
-    save_figure(file, figure)
-    plt.close(figure)
+def stages(options: argparse.Namespace) -> Iterator[Part]:
+    """For each size, yield the times of computations on the host for one shape."""
+    for size in options.sizes:
+        mesh = creature_pair(vertices=size).source
+        sources = np.arange(0, len(mesh.vertices), len(mesh.vertices) // 100)
+        spread = poisson_disk_samples(mesh, 10_000)
+        with tempfile.TemporaryDirectory() as directory:
+            file = Path(directory) / "mesh.off"
+            write_mesh(file, mesh)
+            candidates = {
+                "eigenbasis": lambda mesh=mesh: eigenpairs(mesh, EIGENVECTORS, eigensolver="exact"),
+                "10 000 samples": lambda mesh=mesh: poisson_disk_samples(mesh, 10_000),
+                "SHOT of all": lambda mesh=mesh: shot_descriptors(mesh),
+                "SHOT of samples": lambda mesh=mesh, at=spread: shot_descriptors(mesh, samples=at),
+                "farthest points": lambda mesh=mesh: farthest_point_samples(mesh, SAMPLES),
+                "geodesics from 100": lambda mesh=mesh, at=sources: geodesic_distances(mesh, at),
+                "reading OFF": lambda file=file: read_mesh(file),
+            }
+            seconds = medians(candidates, options.rounds, warm=False)
+        yield (
+            f"Stages, {len(mesh.vertices)} vertices",
+            f"k = {EIGENVECTORS}, {SAMPLES} samples.",
+            compared(seconds, "eigenbasis"),
+            {"vertices": len(mesh.vertices), "seconds": seconds},
+        )
 
 
 PARTS = {
-    part.__name__: part
-    for part in (
-        refinement,
-        eigenbasis,
-        side_by_side_eigenbases,
-        stages,
-        command,
-        later_pairs,
-        peers,
-        throughput,
-        scale,
-    )
+    "commands": commands,
+    "one_process": one_process,
+    "memory": memory_of_many,
+    "peers": peers,
+    "scale": scale,
+    "refinement": refinement,
+    "eigenbasis": eigenbasis,
+    "stages": stages,
 }
 
 
 def main() -> None:
     parser = make_parser(__doc__, parts=PARTS, faust=True, output="speed")
-    parser.add_argument("--quick", action="store_true", help="measure only the smallest sizes")
+    parser.add_argument("--quick", action="store_true", help="measure only the smallest sizes, once")
+    parser.add_argument("--rounds", type=int, default=5, help="runs of each candidate (default: %(default)s)")
     options = parser.parse_args()
-    options.sizes, options.repeats = (SIZES[:1], 3) if options.quick else (SIZES, 9)
+    options.sizes = SIZES
+    if options.quick:
+        options.sizes, options.rounds = SIZES[:1], 1
     os.environ["JAXSMW_CACHE"] = "off"
-
-    measure_parts("Speed", PARTS, options, draw)
+    measure_parts("Speed", PARTS, options)
 
 
 if __name__ == "__main__":

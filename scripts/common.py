@@ -5,18 +5,18 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import os
+import shlex
+import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
 import numpy as np
 
 from jaxsmw.benchmark.journal import Journal
-from jaxsmw.benchmark.tables import markdown
 from jaxsmw.io import Landmarks, read_landmark_file
-from jaxsmw.report.summary import provenance
 from jaxsmw.runtime.files import atomic_write, make_directory
 
 Part = tuple[str, str, list[list[str]], dict[str, Any]]
@@ -68,8 +68,14 @@ def measure_parts(
     The tables and all numbers are written to files in `options.output`, with names made from the title. The
     function `draw` draws the numbers to a file.
     """
+    # These modules import JAX, which processes that measure their memory must not do.
+    from jaxsmw.benchmark.tables import markdown
+    from jaxsmw.report.summary import provenance
+
     file = make_directory(options.output) / title.lower()
-    origin = provenance()
+    # Other machines have other paths.
+    arguments = [Path(argument).name if os.path.isabs(argument) else argument for argument in sys.argv]
+    origin = {"command": shlex.join(["python", *arguments]), **provenance()}
     texts, numbers = [f"# {title}\n\n{json.dumps(origin)}"], {"provenance": origin}
     print(texts[0])
     for name in options.only:
@@ -104,7 +110,9 @@ def medians(
     for turn in range(repeats + warm):
         for name, candidate in candidates.items():
             start = clock()
-            jax.block_until_ready(candidate())
+            result = candidate()
+            if jax := sys.modules.get("jax"):
+                jax.block_until_ready(result)
             if turn >= warm:
                 seconds[name].append(clock() - start)
     return {name: np.median(times, axis=0).tolist() for name, times in seconds.items()}

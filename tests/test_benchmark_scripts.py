@@ -81,7 +81,7 @@ def test_matrix_products_are_counted_in_loops():
 def test_each_part_of_the_speed_benchmark_measures_positive_times(part, monkeypatch):
     monkeypatch.setattr(benchmark_speed, "EIGENVECTORS", 30)
     monkeypatch.setattr(benchmark_speed, "SAMPLES", 100)
-    measured = list(part(Namespace(sizes=[1000], repeats=1, quick=True, data=None)))
+    measured = list(part(Namespace(sizes=[1000], rounds=1, quick=True, data=None)))
     assert measured
     for title, note, (header, *rows), numbers in measured:
         assert title and note and rows and all(len(row) == len(header) for row in rows)

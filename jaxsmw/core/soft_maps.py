@@ -134,8 +134,8 @@ class Recovery(Module):
 
     This class is the abstract base class of recoveries, for the argument `recovery` of `refine_softly` and
     `WaveletPreservationLayer`. There, the m queries are embedded vertices of X, and the n database rows are
-    embedded vertices of Y. Ready subclasses are `Softmax`, `NearestFew` and `Sinkhorn`. A subclass is an
-    equinox module that defines `__call__(queries, database, query_areas, database_areas)`.
+    embedded vertices of Y. Ready subclasses are `Softmax`, `NearestFew` and `Sinkhorn`. A subclass
+    defines `__call__(queries, database, query_areas, database_areas)`.
 
     The ready subclasses have a `temperature`, a positive, finite number, by default 0.1. Its unit is the
     area-weighted mean squared distance from queries to their nearest database rows (`sinkhorn` explains the

@@ -160,7 +160,7 @@ class WaveletPreservationLayer(Module):
     """A neural-network layer that matches two shapes by features of their vertices.
 
     The layer computes a soft map from the distances between the features of X and Y, and refines it by
-    `refine_softly`. It is an equinox module, whose trainable parameters are its array leaves, such as the
+    `refine_softly`. It is a pytree, whose trainable parameters are its array leaves, such as the
     parameters of the filter bank and the temperatures of both recoveries. `equinox.partition` can freeze some
     of them. The layer is a pure function of arrays, so flax and haiku models can also call it.
 
