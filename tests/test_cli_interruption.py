@@ -65,8 +65,8 @@ def assert_interrupted(
 @pytest.mark.parametrize(
     "module",
     first_always(
-        ["argparse", "numpy", "jaxlib._jax", "jaxsmw.cli.match", "jax", "equinox", "scipy.sparse", "igl"],
-        always=3,
+        ["argparse", "numpy", "jaxsmw.cli.match", "jaxlib._jax", "jax", "equinox", "scipy.sparse", "igl"],
+        always=4,
     ),
 )
 def test_an_interrupted_import_ends_with_one_line(pair, tmp_path, module):
@@ -77,7 +77,7 @@ def test_an_interrupted_import_ends_with_one_line(pair, tmp_path, module):
                 interrupt()
     sys.meta_path.insert(0, Interrupting)
     """
-    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m")
+    call = ("match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "m", "--backend", "jax")
     assert_interrupted(started(program, *call), tmp_path)
 
 

@@ -9,18 +9,32 @@ import numpy as np
 import pytest
 from sampled_cases import first_always
 from scipy.spatial import KDTree
-from synthetic import bumpy_mesh, in_precision, refine_in, to_namespace
+from synthetic import bumpy_mesh, in_precision, random_spectrum, refine_in, to_namespace
 from threadpoolctl import threadpool_limits
 
 from jaxsmw.core import host_search
 from jaxsmw.core.arrays import cond, fori_loop, in_blocks, on_host, replaced, scan, segment_min
 from jaxsmw.core.arrays import namespace as namespace_of
-from jaxsmw.core.banks import CubicSpline, FilterBank, Gabor, Heat, Identity, Meyer, SoftmaxFrame, tighten
+from jaxsmw.core.banks import (
+    CubicSpline,
+    FilterBank,
+    Gabor,
+    Heat,
+    Held,
+    Identity,
+    Logarithm,
+    Meyer,
+    SoftmaxFrame,
+    tighten,
+)
+from jaxsmw.core.functional_map import encode
 from jaxsmw.core.module import leaves
+from jaxsmw.core.pointwise_map import decode
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
+from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.signatures import wave_kernel_signature
 from jaxsmw.core.solutions.closed_form import Filtering, LeastSquares, NearestOrthogonal
 from jaxsmw.geometry.eigenbasis import compute_spectrum
@@ -303,3 +317,46 @@ def test_inputs_are_not_changed_and_their_namespace_is_kept():
         on_host(np.zeros(2, np.int64)).dtype == np.int32 and on_host(np.zeros(2, np.float32)).dtype == float
     )
     assert on_host(np.zeros(2, bool)).dtype == bool
+
+
+def _alone():
+    """Functions of one argument, which close over NumPy arrays, and the argument."""
+    x, y = (to_namespace(random_spectrum(40, 6, seed=seed), "numpy") for seed in (0, 1))
+    matches = np.arange(40)[::-1].copy()
+    refiner = WaveletPreservation()
+    functional_map = encode(matches, x, y)
+    return {
+        "map of encode": (lambda t: encode(t, x, y), matches),
+        "map of energy": (lambda t: refiner.problem(x, y).energy(t)(functional_map), matches),
+        "functional map": (lambda c: decode(c, x, y), functional_map),
+        "samples": (lambda rows: x.sample(rows).eigenvectors, matches[:9]),
+        "mask": (lambda mask: x.excluding(mask).vertex_areas, matches < 5),
+        "ratio": (lambda ratio: CubicSpline(ratio=ratio)(x.eigenvalues, x.eigenvalues), np.float64(9)),
+        "edge": (lambda edge: Held(edge=edge)(x.eigenvalues, x.eigenvalues), np.float64(0.4)),
+        "width": (lambda width: Gabor(width=width)(x.eigenvalues, x.eigenvalues), np.float64(0.4)),
+        "strength": (lambda s: Logarithm(s)(x.eigenvalues, x.eigenvalues), np.float64(9)),
+        "eigenvalues": (lambda values: Meyer()(values, x.eigenvalues), x.eigenvalues),
+        "queries": (lambda rows: nearest_neighbor(rows, y.eigenvectors), x.eigenvectors),
+        "database": (lambda rows: nearest_neighbor(x.eigenvectors, rows), y.eigenvectors),
+    }
+
+
+@pytest.mark.parametrize("name", list(_alone()))
+def test_each_argument_can_be_traced_alone(name):
+    function, argument = _alone()[name]
+    expected = function(argument)
+    np.testing.assert_allclose(jax.jit(function)(jnp.asarray(argument)), expected, rtol=1e-5, atol=1e-6)
+    batch = jnp.stack([jnp.asarray(argument)] * 2)
+    np.testing.assert_allclose(jax.vmap(function)(batch)[1], expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_searches_refuse_arrays_that_do_not_fit(namespace):
+    xp = {"numpy": np, "jax": jnp}[namespace]
+    points = xp.zeros((5, 3))
+    with pytest.raises(ValueError, match="one entry for each row"):
+        nearest_neighbor(points, points, database_mask=xp.ones(3, bool))
+    with pytest.raises(ValueError, match="at least one row"):
+        nearest_neighbor(points, points[:0])
+    with pytest.raises(TypeError, match="same space"):
+        nearest_neighbor(points, points[:, :2])

@@ -8,6 +8,7 @@ imports JAX, unless an array of JAX exists already.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -48,15 +49,17 @@ def namespace(*arrays: object) -> Any:
     return sys.modules["jax.numpy"] if is_traced(*arrays) else np
 
 
-def default_namespace() -> Any:
-    """Return the namespace for new arrays that users may trace: `jax.numpy` once JAX is imported."""
-    return sys.modules.get("jax.numpy", np)
-
-
 def float_type() -> type[np.floating]:
-    """Return the default type of floats: float32, unless `jax_enable_x64` is set."""
-    jax = sys.modules.get("jax")
-    return np.float64 if jax is not None and jax.config.jax_enable_x64 else np.float32
+    """Return the default type of floats: float32, unless the setting `jax_enable_x64` of JAX is True.
+
+    The environment variable of the setting counts until JAX is imported.
+    """
+    config = getattr(sys.modules.get("jax"), "config", None)
+    if config is None:
+        chosen = os.environ.get("JAX_ENABLE_X64", "").lower() in ("1", "true", "t", "yes", "y", "on")
+    else:
+        chosen = config.jax_enable_x64
+    return np.float64 if chosen else np.float32
 
 
 def on_host(array: Any) -> Any:
@@ -73,6 +76,11 @@ def stop_gradient(array: Array) -> Array:
     from jax import lax
 
     return lax.stop_gradient(array)
+
+
+def rows_at(array: Array, index: Array) -> Array:
+    """Return the rows of an array at the indices, of which either can be an array of JAX."""
+    return namespace(array, index).asarray(array)[index]
 
 
 def replaced(array: Array, index: Any, values: Any) -> Array:

@@ -11,7 +11,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 from jaxtyping import Bool
 
-from jaxsmw.core.arrays import Array, default_namespace, float_type, is_array, is_tracer, namespace
+from jaxsmw.core.arrays import Array, float_type, is_array, is_tracer, namespace
 from jaxsmw.core.module import Module, leaves
 
 Parameters = ParamSpec("Parameters")
@@ -20,7 +20,8 @@ Returned = TypeVar("Returned")
 
 def as_parameter(value: Array | float | Sequence[float | int]) -> Array:
     """Return a continuous parameter as an array of the default float type, which JAX can trace."""
-    return default_namespace().asarray(value, dtype=float_type())
+    entries = value if isinstance(value, list | tuple) else (value,)
+    return namespace(*entries).asarray(value, dtype=float_type())
 
 
 def all_finite(tree: object) -> Bool[Array, ""]:

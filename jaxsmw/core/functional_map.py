@@ -40,10 +40,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
+import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import DTypeLike
 
-from jaxsmw.core.arrays import Array, default_namespace, namespace
+from jaxsmw.core.arrays import Array, namespace, rows_at
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import check_option
 from jaxsmw.core.linear_algebra import (
@@ -157,7 +158,7 @@ def pull_back(pointwise_map: PointwiseMap, functions_on_y: Float[Array, "n p"]) 
     """
     if hasattr(pointwise_map, "pull_back"):
         return pointwise_map.pull_back(functions_on_y)
-    return functions_on_y[pointwise_map]
+    return rows_at(functions_on_y, pointwise_map)
 
 
 def multiscale_kernel(
@@ -193,8 +194,7 @@ class QuadraticEnergy(Module):
     @classmethod
     def zero(cls, k_out: int, k_in: int, dtype: DTypeLike) -> QuadraticEnergy:
         """Return the energy that is zero for every C."""
-        xp = default_namespace()
-        return cls(xp.zeros((k_in, k_in), dtype), xp.zeros((k_out, k_in), dtype), xp.zeros((), dtype))
+        return cls(np.zeros((k_in, k_in), dtype), np.zeros((k_out, k_in), dtype), np.zeros((), dtype))
 
     def __call__(self, functional_map: FunctionalMap) -> Float[Array, ""]:
         """Return the energy of a functional map. Rounding errors can make it slightly negative."""

@@ -135,7 +135,8 @@ def _cores() -> int:
 
 def _prepare(problem: _Problem) -> tuple[Sequence[_Block], _Search]:
     """Choose the search for a problem. Return the blocks of queries that it searches for at once, and it."""
-    queries, database = (np.asarray(points) for points in problem[:2])
+    both = np.result_type(*problem[:2], np.float32)  # other types have no fast matrix products
+    queries, database = (np.asarray(points, both) for points in problem[:2])
     mask = None if problem[2] is None else np.asarray(problem[2])
     rows = _distinct_rows(database, mask)
     points = database if len(rows) == len(database) else database[rows]

@@ -7,6 +7,9 @@ import dataclasses
 import functools
 import sys
 from collections.abc import Callable, Iterator
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec
 from threading import Lock
 from typing import Any, ParamSpec, TypeVar, dataclass_transform
 
@@ -36,23 +39,23 @@ class Module(abc.ABC):  # noqa: B024 (a base of abstract classes)
     """The base class of the classes of the core: frozen dataclasses, which are pytrees of JAX.
 
     `equinox.Module` is the model, and the functions of Equinox work with these classes as well. Unlike with
-    Equinox, JAX need not be imported: subclasses become pytrees when JAX is imported and a module is made. If
-    a subclass has a method `__check_init__`, the constructor calls the methods of this name of all classes.
-    Two modules are equal if they have equal fields.
+    Equinox, JAX need not be imported: subclasses become pytrees when JAX is imported. If a subclass has a
+    method `__check_init__`, the constructor calls the methods of this name of all classes. A subclass cannot
+    have an `__init__` or `__post_init__` of its own. Two modules are equal if they have equal fields.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        if not vars(cls).keys().isdisjoint(("__init__", "__post_init__")):
+            raise TypeError(
+                f"{cls.__name__} defines __init__ or __post_init__, which would skip the checks of its base "
+                "class: give its fields a converter (field), and check them in __check_init__"
+            )
         dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
         for one in _fields(cls):
             if one.metadata.get("converter") is not None:
                 cls.__init__.__annotations__[one.name] = Any  # the constructor accepts what can be converted
-        _unregistered.append(cls)
-        _register()
-
-    def __new__(cls, *_: Any, **__: Any) -> Any:
-        _register()
-        return super().__new__(cls)
+        _register_now_or_later(cls)
 
     def __post_init__(self) -> None:
         for one in _fields(type(self)):
@@ -97,13 +100,21 @@ def leaves(tree: Any) -> Iterator[Any]:
     elif isinstance(tree, tuple):
         for child in tree:
             yield from leaves(child)
-    elif tree is not None:
+    elif is_array(tree):
         yield tree
+    elif tree is not None:
+        # Users' states can contain other trees.
+        import jax
+
+        yield from jax.tree.leaves(tree)
 
 
 def _equal(mine: Any, theirs: Any) -> bool:
-    if is_array(mine) and is_array(theirs):
-        return mine.dtype == theirs.dtype and np.array_equal(mine, theirs)
+    if is_array(mine) or is_array(theirs):
+        both = is_array(mine) and is_array(theirs) and mine.dtype == theirs.dtype
+        return both and np.array_equal(mine, theirs)
+    if isinstance(mine, tuple) and isinstance(theirs, tuple):
+        return len(mine) == len(theirs) and all(map(_equal, mine, theirs))
     return bool(mine == theirs)
 
 
@@ -112,20 +123,11 @@ def _shown(value: Any) -> str:
     return f"{value.dtype}{list(value.shape)}" if is_array(value) else repr(value)
 
 
-def import_jax() -> Any:
-    """Import JAX, which then knows all modules as pytrees, and return it."""
-    import jax
-
-    _register()
-    return jax
-
-
 def jitted(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
     """Decorate a function, which JAX compiles at its first call by `equinox.filter_jit`."""
 
     @functools.cache
     def compiled() -> Any:
-        import_jax()
         import equinox as eqx
 
         return eqx.filter_jit(function)
@@ -137,21 +139,45 @@ def jitted(function: Callable[Parameters, Returned]) -> Callable[Parameters, Ret
     return call
 
 
-# The classes that JAX does not know yet. A class is removed after it is registered, under the lock.
-_unregistered: list[type] = []
+# The classes that wait for the import of JAX, and the lock under which they are listed and registered.
+_waiting: list[type] = []
 _lock = Lock()
 
 
-def _register() -> None:
-    """Make pytrees of all classes, if JAX is imported."""
-    jax = sys.modules.get("jax")
-    # While JAX is imported, it has no attributes yet.
-    if not _unregistered or jax is None or not hasattr(jax, "tree_util"):
-        return
+def _register_now_or_later(kind: type) -> None:
     with _lock:
-        while _unregistered:
-            _register_class(jax.tree_util, _unregistered[-1])
-            _unregistered.pop()
+        if "jax" not in sys.modules:
+            _waiting.append(kind)
+            return
+    import jax  # If another thread is importing JAX, this statement waits for it.
+
+    _register_class(jax.tree_util, kind)
+
+
+class _ImportOfJax(MetaPathFinder):
+    """Registers the waiting classes at the end of the import of JAX."""
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        if name != "jax":
+            return None
+        sys.meta_path.remove(self)
+        spec = find_spec(name)
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def execute_and_register(module: Any) -> None:
+                execute(module)
+                with _lock:
+                    for kind in _waiting:
+                        _register_class(module.tree_util, kind)
+                    _waiting.clear()
+
+            spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
+        return spec
+
+
+if "jax" not in sys.modules:
+    sys.meta_path.insert(0, _ImportOfJax())
 
 
 def _register_class(tree_util: Any, kind: type) -> None:

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 from jaxtyping import Bool, Float, Int, Int32
 
-from jaxsmw.core.arrays import Array, namespace
+from jaxsmw.core.arrays import Array, namespace, rows_at
 from jaxsmw.core.functional_map import Convention
 from jaxsmw.core.module import Module, field
 from jaxsmw.core.pointwise_map import spectral_embeddings
@@ -162,7 +162,9 @@ class Refiner(Module, Generic[PreparedT, StateT]):
         """
         queries, database = self.embeddings(prepared, state)
         xp, areas = namespace(queries), prepared.spectrum_x.vertex_areas
-        return xp.sum(areas * xp.sum((queries - database[pointwise_map]) ** 2, axis=1)) / xp.sum(areas)
+        return xp.sum(areas * xp.sum((queries - rows_at(database, pointwise_map)) ** 2, axis=1)) / xp.sum(
+            areas
+        )
 
     def is_settled(self, state: StateT) -> Bool[Array, ""]:
         """Return whether all iterations after a state use the same settings; True by default.

@@ -37,6 +37,21 @@ def nearest_neighbor(
     **Raises:** `TypeError` if queries and database have different dimensions d. `ValueError` if the database
     is empty, an array does not have two dimensions, or `database_mask` does not have shape (n,).
     """
+    if queries.ndim != 2 or database.ndim != 2 or not len(database):
+        raise ValueError(
+            f"the queries have shape {queries.shape} and the database has shape {database.shape}, but (m, d) "
+            "and (n, d) with at least one row are needed"
+        )
+    if queries.shape[1] != database.shape[1]:
+        raise TypeError(
+            f"the queries have {queries.shape[1]} dimensions, and the database has {database.shape[1]}: give "
+            "points of the same space"
+        )
+    if database_mask is not None and database_mask.shape != database.shape[:1]:
+        raise ValueError(
+            f"the mask has shape {database_mask.shape}, but the database has {len(database)} rows: give one "
+            "entry for each row"
+        )
     return _implementation(queries, database).nearest_neighbor(queries, database, database_mask)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from jaxtyping import Bool, Float, Int
 
-from jaxsmw.core.arrays import Array, namespace
+from jaxsmw.core.arrays import Array, namespace, rows_at
 from jaxsmw.core.module import Module
 
 
@@ -130,12 +130,12 @@ class Spectrum(Module):
         """
         xp = namespace(self.vertex_areas)
         share = xp.sum(self.vertex_areas) / vertices.shape[0]
-        sampled = self._map_vertex_arrays(lambda field: field[vertices])
+        sampled = self._map_vertex_arrays(lambda field: rows_at(field, vertices))
         return dataclasses.replace(sampled, vertex_areas=xp.full(vertices.shape, share))
 
     def excluding(self, vertices: Bool[Array, " n"]) -> Spectrum:
         """Return the spectrum with area zero where the mask `vertices` is True, and the same total area."""
-        xp = namespace(self.vertex_areas)
+        xp = namespace(self.vertex_areas, vertices)
         areas = xp.where(vertices, 0, self.vertex_areas)
         return dataclasses.replace(self, vertex_areas=areas * (xp.sum(self.vertex_areas) / xp.sum(areas)))
 

@@ -16,7 +16,6 @@ from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, spl
 from jaxsmw.choices import APPROXIMATE_FROM, NUMBER_OF_EIGENVECTORS, Eigensolver, Laplacian
 from jaxsmw.core.arrays import float_type
 from jaxsmw.core.checks import check_kind
-from jaxsmw.core.module import import_jax
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.coarsening import coarsen
@@ -89,7 +88,7 @@ def compute_spectrum(
     solved accurately. `TypeError` if `mesh` is not a `Mesh`.
     """
 
-    jax = import_jax()
+    import jax
 
     pairs = eigenpairs(mesh, number_of_eigenvectors, laplacian=laplacian, eigensolver=eigensolver)
     return jax.device_put(as_spectrum(mesh, *pairs))

@@ -16,7 +16,6 @@ from jaxtyping import Float, Float64
 from numpy.typing import ArrayLike
 
 from jaxsmw.core.arrays import Array
-from jaxsmw.core.module import import_jax
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_suffix, naming
 from jaxsmw.geometry.mesh import Mesh, to_host
@@ -88,7 +87,9 @@ def make_spectrum(
         _check_basis(values, vectors, areas)
     total, vectors = areas.sum(), np.where(areas[:, None] > 0, vectors, 0)
     arrays = np.maximum(values, 0) * total, vectors * np.sqrt(total), areas / total, areas > 0
-    return import_jax().device_put(Spectrum(*arrays))
+    import jax
+
+    return jax.device_put(Spectrum(*arrays))
 
 
 def _check_basis(values: np.ndarray, vectors: np.ndarray, areas: np.ndarray) -> None:

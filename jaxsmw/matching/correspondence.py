@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.choices import Backend
 from jaxsmw.core.arrays import is_traced, namespace
-from jaxsmw.core.module import import_jax
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.spectrum import Spectrum
@@ -299,7 +298,7 @@ class Correspondence:
                 f"a soft map cannot have temperature {temperature} and {iterations} iterations: give a "
                 "positive temperature, such as 0.3, and at least 1 iteration."
             )
-        jax = import_jax()
+        import jax
 
         from jaxsmw.core.soft_maps import sinkhorn
         from jaxsmw.runtime.compilation import compiled
@@ -404,6 +403,6 @@ class Correspondence:
         """Return a context manager in which JAX, if it is used, has the float type of the functional map."""
         if not is_traced(self.refinement.functional_map):
             return nullcontext()
-        jax = import_jax()
+        import jax
 
         return jax.enable_x64(self.functional_map.dtype == np.float64)

@@ -12,7 +12,6 @@ from jaxtyping import Float, Float64, Int, Int64, Shaped
 
 from jaxsmw.choices import DEFAULT_BACKEND, Backend, Eigensolver, Laplacian
 from jaxsmw.core.arrays import Array, namespace, on_host
-from jaxsmw.core.module import import_jax
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.creases import crease_eigenvectors
@@ -172,7 +171,8 @@ def prepare_shapes(
         ]
     if chosen_backend(backend) == "numpy":
         return shapes
-    jax = import_jax()
+    import jax
+
     return [
         replace(shape, spectrum=jax.device_put(shape.spectrum), samples=jax.device_put(shape.samples))
         for shape in shapes

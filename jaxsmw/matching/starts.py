@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.choices import DEFAULT_INITIAL_MAP, InitialMap
 from jaxsmw.core.arrays import Array, namespace
-from jaxsmw.core.module import import_jax
 from jaxsmw.core.pointwise_map import spectral_embeddings
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.search import nearest_neighbor
@@ -178,7 +177,7 @@ def _functional_features(prepared: PreparedPair) -> _Features:
 
     **Raises:** `ArithmeticError` if the functional map cannot be computed.
     """
-    jax = import_jax()
+    import jax
     import jax.numpy as jnp
 
     from jaxsmw.core.solutions.descriptors import DescriptorPair

@@ -9,10 +9,6 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 
-from jaxsmw.core.module import import_jax
-
-import_jax()
-
 Function = TypeVar("Function", bound=Callable)
 
 _OPTIONS: dict[str, str | bool] = {

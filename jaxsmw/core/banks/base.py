@@ -6,7 +6,7 @@ import abc
 
 from jaxtyping import Float
 
-from jaxsmw.core.arrays import Array, namespace
+from jaxsmw.core.arrays import Array, is_tracer, namespace
 from jaxsmw.core.checks import check_integer
 from jaxsmw.core.module import Module
 
@@ -46,7 +46,9 @@ def sample_bank(bank: FilterBank, points: Points, eigenvalues: Eigenvalues) -> R
 
     **Raises:** `ValueError` if the responses are not of shape (filters, p).
     """
-    responses = namespace(points).asarray(bank(points, eigenvalues))
+    responses = bank(points, eigenvalues)
+    if not is_tracer(responses):  # a user's bank can return arrays of JAX for arrays of NumPy
+        responses = namespace(points, eigenvalues).asarray(responses)
     if responses.ndim != 2 or responses.shape[1] != points.shape[0]:
         raise ValueError(
             f"the bank {type(bank).__name__} returned responses of shape {responses.shape} for "

@@ -33,7 +33,7 @@ class _LogSpacedDilates(FilterBank):
         """Return the scaling function at `scaled`, which is `ratio * lambda / lambda_max`."""
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        xp = namespace(points)
+        xp = namespace(points, eigenvalues, self.ratio)
         relative, ratio = points / eigenvalues[-1], xp.asarray(self.ratio, points.dtype)
         # The scales are in units of 1 / lambda_max.
         scales = (2 * ratio) ** xp.linspace(1, 0, self.filters - 1, dtype=points.dtype)
@@ -112,6 +112,6 @@ class Heat(FilterBank):
             raise ValueError("the times of Heat must be a list of at least one time")
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        xp = namespace(points)
+        xp = namespace(points, eigenvalues, self.times)
         relative = points / eigenvalues[-1]
         return xp.exp(-xp.asarray(self.times, points.dtype)[:, None] * relative[None, :])

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+import numpy as np
 from jaxtyping import Float
 
-from jaxsmw.core.arrays import Array, default_namespace, float_type, namespace, stop_gradient
+from jaxsmw.core.arrays import Array, float_type, namespace, stop_gradient
 from jaxsmw.core.banks.base import Eigenvalues, FilterBank, Points, Responses, sample_bank
 from jaxsmw.core.checks import as_parameter, check_option
 from jaxsmw.core.module import field
@@ -73,8 +74,8 @@ class Tightened(FilterBank):
     bank: FilterBank
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        xp = namespace(points)
         responses = self.bank(points, eigenvalues)
+        xp = namespace(responses)
         # Division by the largest response prevents underflow of the squares. This divisor cancels in
         # `scaled / sqrt(frame)`.
         largest = stop_gradient(xp.max(xp.abs(responses), axis=0, keepdims=True))
@@ -147,12 +148,11 @@ class SoftmaxFrame(FilterBank):
                 "SoftmaxFrame.like needs at least 2 knots and a floor of at least 1e-12 and below 1, not "
                 f"knots={knots} and floor={floor}"
             )
-        xp = default_namespace()
-        points = xp.linspace(0, 1, knots, dtype=float_type())
-        return cls(2 * xp.log(xp.maximum(xp.abs(sample_bank(bank, points, points)), floor)))
+        points = np.linspace(0, 1, knots, dtype=float_type())
+        return cls(2 * np.log(np.maximum(np.abs(sample_bank(bank, points, points)), floor)))
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        xp = namespace(points)
+        xp = namespace(points, self.logits)
         knots = xp.linspace(0, 1, self.logits.shape[1], dtype=points.dtype)
         relative, logits = points / eigenvalues[-1], xp.asarray(self.logits, points.dtype)
         heights = xp.stack([xp.interp(relative, knots, row) for row in logits])

@@ -26,8 +26,8 @@ class _Transitions(FilterBank):
         """Return the angle of each transition, divided by pi / 2. The quotient rises from 0 to 1."""
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        xp = namespace(points)
         theta = math.pi / 2 * self.transitions(points, eigenvalues[-1])
+        xp = namespace(theta)
         fall, rise = xp.cos(theta), xp.sin(theta)
         return xp.concatenate([fall[:1], rise[:-1] * fall[1:], rise[-1:]])
 
@@ -50,7 +50,7 @@ class _DyadicBands(_Transitions):
     def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
         # The limit of 100 octaves prevents overflow of `2.0**octaves`. It does not change the responses,
         # because no positive eigenvalue is 100 octaves below lambda_max.
-        xp = namespace(points)
+        xp = namespace(points, lambda_max)
         octaves = np.minimum(np.arange(self.filters - 1, 0, -1), 100)
         ratios = (points / lambda_max)[None, :] * xp.asarray(2.0**octaves, points.dtype)[:, None]
         return self.profile(xp.clip(ratios - 1, 0, 1))
@@ -110,7 +110,7 @@ class _TwoBands(_Transitions):
         """Return `theta / (pi / 2)` for each value of `excess`, which is `lambda / edge - 1`."""
 
     def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
-        edge = lambda_max * namespace(points).asarray(self.edge, points.dtype)
+        edge = lambda_max * namespace(points, self.edge).asarray(self.edge, points.dtype)
         return self.profile(points / edge - 1)[None, :]
 
 
@@ -185,7 +185,7 @@ class Regular(_Transitions):
             raise ValueError(f"the degree of Regular cannot be negative, but is {self.degree}")
 
     def transitions(self, points: Points, lambda_max: Float[Array, ""]) -> Float[Array, "wavelets p"]:
-        xp = namespace(points)
+        xp = namespace(points, lambda_max)
         sine = xp.clip(2 * points / lambda_max - 1, -1, 1)
         for _ in range(self.degree):
             sine = xp.sin(math.pi / 2 * sine)
@@ -216,7 +216,7 @@ class ExponentialWindow(FilterBank):
         check_between(self, "slope", self.slope)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        xp = namespace(points)
+        xp = namespace(points, eigenvalues, self.edge, self.slope)
         edge, slope = (xp.asarray(leaf, points.dtype) for leaf in (self.edge, self.slope))
         # Clipping excludes u = 0 and u = 1, where an exponent is infinite and has no gradient.
         tiny = xp.finfo(points.dtype).eps
@@ -242,7 +242,7 @@ class LowPass(FilterBank):
         check_between(self, "edge", self.edge, high=1.0)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        xp = namespace(points)
+        xp = namespace(points, eigenvalues, self.edge)
         edge = eigenvalues[-1] * xp.asarray(self.edge, points.dtype)
         # Beyond twice the edge, this sine is exactly zero, but the equivalent `cos(pi / 2)` has a rounding
         # error.

@@ -28,7 +28,7 @@ class _UniformTranslates(FilterBank):
         """Return the window at positions in (-1/2, 1/2), which are in units of the window's width."""
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        xp = namespace(points)
+        xp = namespace(points, eigenvalues)
         steps = points / eigenvalues[-1] * (self.filters - self.overlap + 1)
         centres = xp.arange(self.filters, dtype=points.dtype) + (1 - self.overlap / 2)
         position = (steps[None, :] - centres[:, None]) / self.overlap
@@ -104,7 +104,7 @@ class Gabor(FilterBank):
         check_between(self, "width", self.width)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Responses:
-        xp = namespace(points)
+        xp = namespace(points, eigenvalues, self.width)
         steps = points / eigenvalues[-1] * (self.filters - 1)
         centres = xp.arange(self.filters, dtype=points.dtype)
         offsets = (steps[None, :] - centres[:, None]) / xp.asarray(self.width, points.dtype)

@@ -60,7 +60,7 @@ class Logarithm(Warp):
         check_between(self, "strength", self.strength)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
-        xp = namespace(points)
+        xp = namespace(points, eigenvalues, self.strength)
         return xp.log1p(xp.asarray(self.strength, points.dtype) * (points / eigenvalues[-1]))
 
 
@@ -77,7 +77,7 @@ class Power(Warp):
         check_between(self, "exponent", self.exponent)
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
-        xp = namespace(points)
+        xp = namespace(points, eigenvalues, self.exponent)
         relative = points / eigenvalues[-1]
         # For exponents below 1 the slope at the eigenvalue 0 is infinite, so gradients use the slope 0 there.
         positive = xp.where(relative > 0, relative, 1)
@@ -98,7 +98,7 @@ class SpectralDistribution(Warp):
     """
 
     def __call__(self, points: Points, eigenvalues: Eigenvalues) -> Float[Array, " p"]:
-        xp = namespace(points)
+        xp = namespace(points, eigenvalues)
         # Eigensolvers return repeated eigenvalues as nearly equal numbers, so eigenvalues are compared with a
         # tolerance.
         tolerance = 1e-6 * eigenvalues[-1]

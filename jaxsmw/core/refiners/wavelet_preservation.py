@@ -72,7 +72,7 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
         **Raises:** `ValueError` if the responses of the bank do not have shape (filters, eigenvalues).
         """
         eigenvalues_x, eigenvalues_y = spectrum_x.eigenvalues, spectrum_y.eigenvalues
-        xp = namespace(eigenvalues_x)
+        xp = namespace(eigenvalues_x, eigenvalues_y)
         layout_x, layout_y = eigenvalues_x, eigenvalues_y
         if self.lambda_max == "common":
             layout_x = layout_y = xp.sort(xp.concatenate([eigenvalues_x, eigenvalues_y]))
