@@ -100,10 +100,10 @@ def leaves(tree: Any) -> Iterator[Any]:
     elif isinstance(tree, tuple):
         for child in tree:
             yield from leaves(child)
-    elif is_array(tree):
+    elif hasattr(tree, "dtype") or isinstance(tree, int | float):
         yield tree
     elif tree is not None:
-        # Users' states can contain other trees.
+        # Users' states can contain other trees, which JAX knows.
         import jax
 
         yield from jax.tree.leaves(tree)
