@@ -38,7 +38,7 @@ the MWP paper. In the area norm, this holds for pushforwards, and for pullbacks 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -190,6 +190,8 @@ class QuadraticEnergy(Module):
     gram: Float[Array, "k_in k_in"]
     cross: Float[Array, "k_out k_in"]
     constant: Float[Array, ""]
+
+    __array_ufunc__: ClassVar[None] = None  # weights of NumPy leave the multiplication to `__rmul__`
 
     @classmethod
     def zero(cls, k_out: int, k_in: int, dtype: DTypeLike) -> QuadraticEnergy:
