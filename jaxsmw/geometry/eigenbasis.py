@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Literal
 
 import numpy as np
@@ -39,6 +40,9 @@ _DENSE = 400
 _BLOCK = 4
 # The number of subspace dimensions per eigenvector.
 _DIMENSIONS_OF_SUBSPACE = 30
+# If a mesh has at least this number of vertices, the two meshes of a pair are prepared one after the other,
+# which takes half of the memory.
+ONE_BY_ONE_FROM = 200_000
 # If one more smoothing step lowers an eigenvalue by more than this fraction, the approximation is rejected.
 # The relative error of an accepted eigenvalue is up to three times this fraction.
 _MOST_LOWERED = 0.015
@@ -423,8 +427,13 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     n, single = stiffness.shape[0], combinations.astype(np.float32)
     basis, eigenvectors = np.empty((n, taken)), np.empty((n, k))
     grams = np.zeros((2, taken, taken))  # only the upper triangles of these matrices are filled
-    for columns in _slices(taken):
+
+    def smooth(columns: slice) -> None:
         basis[:, columns] = coarse.smooth(coarse.prolongation @ single[:, columns])
+
+    # Meshes of such sizes are prepared one after the other, so each of them may use two cores.
+    with ThreadPoolExecutor(2 if n >= ONE_BY_ONE_FROM else 1) as executor:
+        list(executor.map(smooth, _slices(taken)))
     for columns in _slices(taken):
         for gram, matrix in zip(grams, (stiffness, mass), strict=True):
             gram[: columns.stop, columns] = basis[:, : columns.stop].T @ (matrix @ basis[:, columns])

@@ -15,7 +15,7 @@ from jaxsmw.core.arrays import Array, namespace, on_host
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.creases import crease_eigenvectors
-from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
+from jaxsmw.geometry.eigenbasis import ONE_BY_ONE_FROM, as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples, poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
@@ -30,9 +30,6 @@ Computed = TypeVar("Computed")
 # cannot distinguish two vertices whose distance is below a few hundredths of the square root of the area.
 # Therefore 10 000 samples are dense enough.
 _COMPARED, _COMPARED_FROM = 10_000, 15_000
-# If a mesh has at least this number of vertices, two meshes are prepared one after the other, which takes
-# half of the memory.
-_ONE_BY_ONE_FROM = 200_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +143,7 @@ def prepare_shapes(
     """
     if eigensolver == "auto":
         eigensolver = choose_eigensolver(*meshes)
-    pairwise = len(meshes) == 2 and max(len(mesh.vertices) for mesh in meshes) < _ONE_BY_ONE_FROM
+    pairwise = len(meshes) == 2 and max(len(mesh.vertices) for mesh in meshes) < ONE_BY_ONE_FROM
 
     def each(compute: Callable[[Mesh], Computed]) -> Sequence[Computed]:
         return side_by_side(compute, *meshes) if pairwise else [compute(mesh) for mesh in meshes]
