@@ -47,10 +47,10 @@ nb_execution_timeout = 180
 
 # Every name of this library in docstrings and pages must exist.
 nitpicky = True
-# Type variables have no entry in the reference.
+# Type variables and private classes have no entry in the reference.
 nitpick_ignore_regex = [
     ("py:.*", r"(?!jaxsmw\b).*"),
-    ("py:class", r"jaxsmw\.[\w.]*(StateT|PreparedT|\.(Side|Carry|Value))"),
+    ("py:class", r"jaxsmw\.[\w.]*(StateT|PreparedT|\.(Side|Carry|Value|_\w+))"),
 ]
 default_role = "code"
 autodoc_class_signature = "mixed"
