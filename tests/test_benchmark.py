@@ -428,8 +428,7 @@ def test_the_command_refuses_damaged_results_with_one_sentence(scape, tmp_path, 
 
 
 @pytest.mark.slow
-def test_a_benchmark_does_not_change_the_calling_process(measure, monkeypatch):
-    monkeypatch.setattr("jaxsmw.runtime.compilation._LARGEST_SHARE", 0.0)
+def test_a_benchmark_does_not_change_the_calling_process(measure):
     double = jax.jit(lambda x: 2 * x)
     double(1.0)
     environment, listeners = dict(os.environ), list(monitoring.get_event_duration_listeners())

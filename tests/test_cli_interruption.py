@@ -84,11 +84,17 @@ def test_an_interrupted_import_ends_with_one_line(pair, tmp_path, module):
 # Python discards exceptions in callbacks of the garbage collector. JAX registers such a callback.
 IN_GARBAGE_COLLECTION = """
     import gc
+    import jaxsmw.matching.match
+    usual = jaxsmw.matching.match.match
     def interrupt_late(phase, _):
-        if phase == "start" and "jaxsmw.matching.match" in sys.modules:
+        if phase == "start":
             gc.callbacks.clear()
             interrupt()
-    gc.callbacks.append(interrupt_late)
+    def match_with_garbage(*arguments, **options):
+        gc.callbacks.append(interrupt_late)
+        gc.collect()
+        return usual(*arguments, **options)
+    jaxsmw.matching.match.match = match_with_garbage
     """
 IN_A_WRITE = """
     import numpy as np

@@ -81,7 +81,7 @@ def _check_results(
 ) -> None:
     """Check that the summary and the page state the results of the match."""
     assert list(summary) == [
-        "settings", "result", "distortion", "suspicious", "wrong_probability", "errors", "seconds",
+        "settings", "result", "backend", "distortion", "suspicious", "wrong_probability", "errors", "seconds",
         "provenance",
     ]  # fmt: skip
     assert summary["settings"] == {"seed": 3}
