@@ -11,7 +11,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
@@ -26,14 +26,10 @@ from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.descriptors import DescriptorAxes
 from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset
+from jaxsmw.runtime.backends import Device
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress
 from jaxsmw.runtime.workers import run_tasks
-
-if TYPE_CHECKING:
-    from jax import Device
-else:
-    Device = Any
 
 logger = logging.getLogger("jaxsmw")
 

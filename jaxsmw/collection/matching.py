@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,14 +24,10 @@ from jaxsmw.geometry.shortcuts import points_on_uncut
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
+from jaxsmw.runtime.backends import Device, check_devices
 from jaxsmw.runtime.cache import Store
 from jaxsmw.runtime.progress import Progress, no_progress, timed
 from jaxsmw.transfer.registered_mesh import DEFAULT_STIFFNESS, register_mesh
-
-if TYPE_CHECKING:
-    from jax import Device
-else:
-    Device = Any
 
 # The largest number of times that contradicted edges are matched again.
 _ROUNDS = 2
@@ -111,10 +106,7 @@ def match_collection(
     check_number("stiffness", stiffness, positive=True)
     check_number("edges_per_shape", edges_per_shape, positive=True)
     seed = check_whole_number("seed", seed, 0)
-    if devices is not None:
-        from jaxsmw.runtime.batches import check_devices
-
-        check_devices(devices)
+    check_devices(devices)
     if directory is not None and not Path(directory).is_dir():
         raise InputError(f"{directory}: is not a directory: create it first.")
     named = _named_meshes(meshes, names)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Int64
@@ -23,13 +22,8 @@ from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
 from jaxsmw.matching.starts import make_starts
-from jaxsmw.runtime.backends import chosen_backend
+from jaxsmw.runtime.backends import Device, check_devices, chosen_backend
 from jaxsmw.runtime.threads import one_blas_thread
-
-if TYPE_CHECKING:
-    from jax import Device
-else:
-    Device = Any
 
 # Each device refines this number of pairs before their maps are judged and repaired.
 _PAIRS_PER_DEVICE = 64
@@ -67,10 +61,7 @@ def match_pairs(
     """
     uncut = [as_mesh(mesh, f"mesh {number}") for number, mesh in enumerate(meshes)]
     checked = check_pairs(pairs, len(uncut), "pair")
-    if devices is not None:
-        from jaxsmw.runtime.batches import check_devices
-
-        check_devices(devices)
+    check_devices(devices)
     if batch_size is not None:
         check_whole_number("batch_size", batch_size, 1)
     preset = choose_preset(preset)

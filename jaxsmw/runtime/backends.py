@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterable, Sequence
 from importlib.metadata import entry_points
 from importlib.util import find_spec
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from jaxsmw.choices import Backend
+from jaxsmw.errors import InputError
+
+if TYPE_CHECKING:
+    from jax import Device
+else:
+    Device = Any  # the class is in JAX, which need not be imported
 
 
 def chosen_backend(backend: Backend) -> Literal["numpy", "jax"]:
@@ -35,3 +42,14 @@ def device() -> str:
     import jax
 
     return jax.devices()[0].device_kind
+
+
+def check_devices(devices: Sequence[Device] | None) -> None:
+    """Raise `InputError` unless `devices` is None or contains JAX devices only, at least one."""
+    if devices is None:
+        return
+    import jax
+
+    checked = list(devices) if isinstance(devices, Iterable) else []
+    if not checked or not all(isinstance(device, jax.Device) for device in checked):
+        raise InputError(f"devices is {devices!r}: give at least one JAX device, or None for all devices.")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple, TypeVar, Unpack
 
@@ -21,6 +21,7 @@ from jaxsmw.core.refinement import Refinement, RefineSettings, refine
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.core.traced_search import BLOCK, queries_per_block
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.backends import check_devices
 from jaxsmw.runtime.compilation import compiled
 from jaxsmw.runtime.threads import one_blas_thread
 
@@ -73,15 +74,6 @@ def stack(spectra: Sequence[Spectrum]) -> Spectrum:
         )
     largest = max(spectrum.mask.shape[0] for spectrum in spectra)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(spectrum.pad(largest) for spectrum in spectra))
-
-
-def check_devices(devices: Sequence[jax.Device] | None) -> None:
-    """Raise `InputError` unless `devices` is None or contains JAX devices only, at least one."""
-    if devices is None:
-        return
-    checked = list(devices) if isinstance(devices, Iterable) else []
-    if not checked or not all(isinstance(device, jax.Device) for device in checked):
-        raise InputError(f"devices is {devices!r}: give at least one JAX device, or None for all devices.")
 
 
 def refine_pairs(
