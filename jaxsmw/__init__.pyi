@@ -24,7 +24,7 @@ from .matching.correspondence import Correspondence
 from .matching.match import match
 from .matching.pair import Pair
 from .matching.preparation import paired_spectra
-from .matching.settings import RepairSettings
+from .matching.settings import SearchSettings
 from .matching.stages import PRESETS, Preset, Stage
 from .matching.starts import initial_map
 from .runtime.batches import refine_pairs, stack
@@ -49,7 +49,7 @@ __all__ = [
     "Refinement",
     "Refiner",
     "Registration",
-    "RepairSettings",
+    "SearchSettings",
     "Spectrum",
     "Stage",
     "WaveletPreservation",

@@ -4,7 +4,7 @@
         [--preset NAME ...] [--output FILE.md]
 
 The script draws pairs at random from each data set (see `docs/datasets.md`), matches them with each preset,
-and prints four tables:
+and prints three tables:
 
 - The first table compares `Correspondence.expected_error` with the true errors. The table states the rank
   correlation of expected and true errors, and the share of gross errors. A gross error exceeds 0.1 times the
@@ -13,20 +13,14 @@ and prints four tables:
 - For the second table, the script sorts the vertices of all pairs by expected error, and divides them into
   ten groups of equal size. The table states the true errors of each group.
 - The third table compares `Correspondence.wrong_probability` with the share of wrong maps. A map is wrong if
-  at least 2 % of its errors exceed 0.25 times the square root of the area. The note below the table states
-  the coefficients of a logistic regression on the measured maps.
-- The fourth table states, for each score, the number of pairs on which the result has a better score than a
-  mirrored map. The script prints this table only for the preset `accurate`. The table covers only pairs of
-  full shapes whose mirrored ground truth exists and maps vertices to vertices. To compute the mirrored map,
-  the script starts from the mirrored ground truth, and skips the first stage and the repair. To compute the
-  uncertainty of a map, the script runs a feature regression with this map as its initial map.
+  at least 2 % of its errors exceed 0.25 times the square root of the area. `scripts/learn_judge.py` fits the
+  numbers on which the probability depends.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from itertools import pairwise, product
 from pathlib import Path
 from typing import NamedTuple
@@ -34,16 +28,12 @@ from typing import NamedTuple
 import numpy as np
 from common import make_parser, write_text
 from jaxtyping import Float64
-from scipy.optimize import minimize
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
-from jaxsmw import InputError, geodesic_error, match, read_mesh
+from jaxsmw import geodesic_error, match, read_mesh
 from jaxsmw.benchmark.datasets import DataPair, choose_pairs, open_data_set
 from jaxsmw.benchmark.tables import markdown
-from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.judge import dirichlet_energy_ratio, distortion, wrong_probability
-from jaxsmw.matching.settings import WrongProbabilitySettings
 from jaxsmw.matching.stages import PRESETS, PresetName
 from jaxsmw.runtime.provenance import made_with
 
@@ -52,21 +42,14 @@ GROSS, TENTH = 0.1, 0.1
 WRONG_SHARE, WRONG_ERROR = 0.02, 0.25
 # The third table groups the maps by predicted probability. These numbers are the limits of the groups.
 PROBABILITIES = (0, 0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 1)
-# If stages are given instead of a preset, `match` does not repair maps.
-WITHOUT_REPAIR = PRESETS["accurate"].stages[1:]
 
 
 class Measured(NamedTuple):
-    """The measurements of one pair: errors of the evaluated vertices (p,), and scores of the whole map.
-
-    For each score, `scores` contains its values for the result and for the mirrored map, if there is one.
-    """
+    """The errors of the evaluated vertices of one pair (p,), and the predicted probability of a wrong map."""
 
     true: Float64[np.ndarray, " p"]
     expected: Float64[np.ndarray, " p"]
-    distortion: float
-    mean_expected: float
-    scores: dict[str, tuple[float, float]]
+    probability: float
 
     @property
     def wrong(self) -> bool:
@@ -77,7 +60,7 @@ class Measured(NamedTuple):
 def measure(
     pair: DataPair, seed: int, preset: PresetName = "accurate", number_of_samples: int | None = 1000
 ) -> Measured:
-    """Match a pair, and measure the errors and the scores of the result."""
+    """Match a pair, and measure the errors of the result."""
     mesh_x, mesh_y = (read_mesh(file) for file in pair.meshes)
     result = match(mesh_x, mesh_y, preset=preset, partial=pair.partial)
     truth = pair.ground_truth(mesh_x, mesh_y)
@@ -85,53 +68,13 @@ def measure(
         mesh_y, result.pointwise_map, truth, number_of_samples=number_of_samples, seed=seed
     )
     finite = np.isfinite(error.errors)
-    scores: dict[str, tuple[float, float]] = {}
-    mirrored = None
-    if preset == "accurate":
-        with suppress(InputError):
-            mirrored = pair.ground_truth(mesh_x, mesh_y, mirrored=True)
-    if mirrored is not None and isinstance(mirrored.targets, np.ndarray) and not pair.partial:
-        reflected = match(mesh_x, mesh_y, init=mirrored.everywhere(mesh_x), preset=WITHOUT_REPAIR)
-        direct, other = map(scores_of, (result, reflected))
-        scores = {name: (direct[name], other[name]) for name in direct}
-    expected = result.expected_error()
-    return Measured(
-        error.errors[finite],
-        expected[error.source_vertices][finite],
-        result.distortion,
-        float(mesh_x.average(expected)),
-        scores,
-    )
+    expected = result.expected_error()[error.source_vertices]
+    return Measured(error.errors[finite], expected[finite], result.wrong_probability())
 
 
-def scores_of(result: Correspondence) -> dict[str, float]:
-    """Return a dictionary from the name of each score to its value for a map. Lower values are better."""
-    measured_map = result.pair, result.pointwise_map, result.spectrum_x
-    regression = match(*result.pair.meshes, init=result.pointwise_map, preset=WITHOUT_REPAIR[0])
-    uncertainty = regression.refinement.state.uncertainty
-    assert uncertainty is not None
-    return {
-        "Dirichlet energy ratio": dirichlet_energy_ratio(*measured_map),
-        "uncertainty of the regression": float(uncertainty),
-        "distortion": distortion(*measured_map),
-    }
-
-
-def fitted(maps: Sequence[Measured]) -> WrongProbabilitySettings:
-    """Fit the coefficients of `jaxsmw.matching.judge` to maps by logistic regression."""
-    features = np.array([[1, np.log(m.distortion), np.log(m.mean_expected)] for m in maps])
-    signs = np.where([m.wrong for m in maps], 1, -1)
-
-    def loss(weights: Float64[np.ndarray, " 3"]) -> float:
-        # The penalty keeps the weights finite if a plane separates the right maps from the wrong maps.
-        return float(np.logaddexp(0, -signs * (features @ weights)).mean() + 1e-3 * weights[1:] @ weights[1:])
-
-    return WrongProbabilitySettings(*minimize(loss, np.zeros(3)).x.round(2).tolist())
-
-
-def calibration(maps: Sequence[Measured], settings: WrongProbabilitySettings) -> str:
+def calibration(maps: Sequence[Measured]) -> str:
     """Return a table that compares predicted probabilities with the shares of wrong maps."""
-    predicted = np.array([wrong_probability(m.distortion, m.mean_expected, settings) for m in maps])
+    predicted = np.array([m.probability for m in maps])
     wrong = np.array([m.wrong for m in maps])
     rows = [["probability", "maps", "mean probability", "wrong"]]
     for low, high in pairwise(PROBABILITIES):
@@ -143,7 +86,7 @@ def calibration(maps: Sequence[Measured], settings: WrongProbabilitySettings) ->
 
 
 def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
-    """Yield the four tables as Markdown."""
+    """Yield the three tables as Markdown."""
     rows = [
         ["", "pairs", "mean error", "mean expected", "rank correlation", "gross errors", "in the worst tenth"]
     ]
@@ -183,22 +126,7 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
         rows[-1].append(f"{np.mean(own > GROSS):.1%}")
     yield "Vertices of all pairs, in ten groups of equal size by expected error:\n\n" + markdown(rows)
 
-    settings = WrongProbabilitySettings()
-    yield (
-        "Probability that a map is wrong:\n\n"
-        + calibration(everything, settings)
-        + f"\nThe chosen coefficients are {settings}. Logistic regression on these maps gives "
-        f"{fitted(everything)}.\n"
-    )
-
-    names = list(dict.fromkeys(name for pair in everything for name in pair.scores))
-    if names:
-        rows = [["pairs on which the score prefers the result to the mirrored map", *names]]
-        for data_set, pairs in measured.items():
-            if with_both := [pair.scores for pair in pairs if pair.scores]:
-                right = [sum(scores[name][0] < scores[name][1] for scores in with_both) for name in names]
-                rows.append([data_set, *(f"{number} of {len(with_both)}" for number in right)])
-        yield markdown(rows)
+    yield "Probability that a map is wrong:\n\n" + calibration(everything)
 
 
 def main() -> None:

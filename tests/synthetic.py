@@ -12,12 +12,6 @@ from jaxsmw.core.refinement import Refinement, refine, refine_at_once
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.matching.judge import Scored
-from jaxsmw.matching.match import refine_and_judge
-from jaxsmw.matching.outcome import Start
-from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.search.repair import repair_map
-from jaxsmw.matching.stages import Preset
 
 
 def random_spectrum(n: int, k: int, *, seed: int = 0, dtype: type = np.float64) -> Spectrum:
@@ -146,8 +140,3 @@ def body_with_arms(subdivisions: int = 4) -> Mesh:
     directions = sphere.vertices / np.linalg.norm(sphere.vertices, axis=1, keepdims=True)
     length = 1 + 1.5 * np.exp(-10 * (1 - np.abs(directions[:, 0])))
     return make_mesh(directions * length[:, None], sphere.faces)
-
-
-def refine_and_repair(prepared: PreparedPair, start: Start, preset: Preset) -> Scored:
-    """Run and judge the stages before the final ones, and repair the map, as `match` does."""
-    return repair_map(prepared, start, preset, refine_and_judge(prepared, start, preset))

@@ -7,6 +7,7 @@ from itertools import combinations, permutations
 import jax
 import numpy as np
 import pytest
+from jaxsmw.matching.search.chirality import Decision
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -33,7 +34,6 @@ from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.executor import run, run_batches
 from jaxsmw.matching.outcome import Start
-from jaxsmw.matching.search.chirality import Decision
 from jaxsmw.matching.shape import prepare_shapes
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage

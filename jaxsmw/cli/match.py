@@ -14,6 +14,7 @@ from jaxsmw.cli.arguments import (
     add_up,
     path,
     refuse_without,
+    whole_number,
 )
 from jaxsmw.cli.console import Stopwatch, report_progress, show
 from jaxsmw.cli.inputs import check_inputs, read_meshes, read_truth
@@ -69,6 +70,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "is projected onto the target and transferred to the source by the map",
             "--report DIR": "write pictures, an interactive 3D page and a summary to this directory",
         },
+    )
+    parser.add_argument(
+        "--alternatives",
+        metavar="K",
+        type=whole_number(1),
+        help="write up to K other maps that could be right beside --output, the most probable first, for "
+        "example map_alternative_1.txt beside map.txt",
     )
     add_up(parser)
     add_ground_truth(
@@ -128,11 +136,12 @@ def _check(options: argparse.Namespace) -> None:
     for file, contents in ((expected, "expected errors are"), (overlap, "the overlap is")):
         if file and Path(file).suffix.lower() in (".npy", ".mat"):
             raise InputError(f"{file}: {contents} written as text: choose another suffix, such as .txt.")
+    alternatives = [_alternative_file(options.output, k + 1) for k in range(options.alternatives or 0)]
     inputs = [options.source, options.target, *init_files, *(options.ground_truth or ())]
     check_inputs(*inputs)
     check_outputs(
         inputs,
-        files=[options.output, points, options.one_to_one, expected, overlap],
+        files=[options.output, points, options.one_to_one, expected, overlap, *alternatives],
         report=options.report,
         texture=options.texture,
     )
@@ -153,6 +162,11 @@ def _write_files(
     with stopwatch.step("writing"):
         write_pointwise_map(options.output, correspondence.pointwise_map)
     report_written(options.output)
+    for number, other in enumerate(correspondence.alternatives[: options.alternatives or 0], 1):
+        file = _alternative_file(options.output, number)
+        with stopwatch.step("writing"):
+            write_pointwise_map(file, other.pointwise_map)
+        report_written(file)
     if options.one_to_one:
         with stopwatch.step("one-to-one map", announced=True):
             maps["one-to-one"] = one_to_one = correspondence.one_to_one()
@@ -167,6 +181,12 @@ def _write_files(
         if options.surface_points:
             maps["surface"] = points
     return maps | {"refined": correspondence.pointwise_map}
+
+
+def _alternative_file(output: str, number: int) -> str:
+    """Return the name of the file of an alternative map, beside the output."""
+    file = Path(output)
+    return str(file.with_name(f"{file.stem}_alternative_{number}{file.suffix}"))
 
 
 def _write_points(options: argparse.Namespace, correspondence: Correspondence, points: SurfacePoints) -> None:

@@ -102,13 +102,16 @@ def show_quality(correspondence: Correspondence) -> None:
     parts = [
         f"distortion {correspondence.distortion:.3f} (1 for isometries)",
         f"area-weighted mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)",
-        f"wrong on a part of the body with probability {percentage(correspondence.wrong_probability())}",
+        f"wrong as a whole with probability {percentage(correspondence.wrong_probability())}",
     ]
     if correspondence.left_out:
         parts.append(f"{correspondence.left_out:.1%} of the source has no counterpart (small components)")
-    if correspondence.suspicious:
-        parts.append("the map is suspicious")
     show(f"quality:     {', '.join(parts)}")
+    for number, other in enumerate(correspondence.alternatives, 1):
+        name = "other maps:" if number == 1 else ""
+        show(
+            f"{name:12} {number}. {other.difference}, right with probability {percentage(other.probability)}"
+        )
 
 
 def show_match(

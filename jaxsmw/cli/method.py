@@ -96,7 +96,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_MIRROR,
         help="whether to match the mirror image of the source, because the meshes are of opposite hands, "
         "such as a left and a right tooth; the map belongs to the same source vertices; auto compares both "
-        "hands, unless the meshes are nearly their own mirror images, like people (default: %(default)s)",
+        "hands if the map is uncertain (default: %(default)s)",
     )
     group.add_argument(
         "--precision",
@@ -204,11 +204,8 @@ def match_meshes(
     stopwatch.add(correspondence.seconds)
     if isinstance(scale, str):
         show(f"scale:       {correspondence.pair.scale:.4g} (lengths on the target / lengths on the source)")
-    evidence = correspondence.mirror_evidence
-    if correspondence.mirrored or evidence is not None:
-        hand = "the mirror image of the source" if correspondence.mirrored else "the source itself"
-        reason = "" if evidence is None else f" (evidence for the mirror image: {evidence:+.2f})"
-        show(f"hand:        {hand}{reason}")
+    if correspondence.mirrored:
+        show("hand:        the mirror image of the source")
     return correspondence
 
 

@@ -91,19 +91,14 @@ class EdgeTask(NamedTuple):
     x: PreparedShape
     y: PreparedShape
     init: InitialMap = None
-    aligned: bool = False
 
 
 def match_edges(
     tasks: Iterable[EdgeTask], preset: Preset, devices: Sequence[Device] | None = None
 ) -> Iterator[EdgeMap | ArithmeticError]:
-    """Match edges as `match_many` does, and yield their maps, or the error of a failed refinement.
-
-    A map that looks wrong is repaired, but no alternative maps are tried, because the maps of other edges
-    provide a better initial map later.
-    """
-    prepared = (prepare_task(task.x, task.y, init=task.init, aligned=task.aligned) for task in tasks)
-    for matched in match_many(prepared, preset.without_alternatives(), devices=devices):
+    """Match edges as `match_many` does, and yield their maps, or the error of a failed refinement."""
+    prepared = (prepare_task(task.x, task.y, init=task.init) for task in tasks)
+    for matched in match_many(prepared, preset, devices=devices):
         try:
             yield matched if isinstance(matched, ArithmeticError) else EdgeMap.of(matched)
         except ArithmeticError as error:
@@ -118,7 +113,6 @@ class EdgeMatcher:
 
     - `shapes`: the prepared shapes, with descriptors in the common `axes` if the preset uses descriptors.
     - `preset`, `eigensolver`: the preset and the eigensolver with which the shapes were prepared.
-    - `aligned`: whether edges without an initial map also start from `"aligned"`; see `prepare_task`.
     - `store`: the store in which finished maps are kept.
     - `executor`: the executor of the worker processes. With None, this process matches all edges.
     - `devices`: the JAX devices of this process; see `jaxsmw.refine_pairs`.
@@ -129,7 +123,6 @@ class EdgeMatcher:
     axes: DescriptorAxes | None
     preset: Preset
     eigensolver: Eigensolver
-    aligned: bool
     store: Store
     executor: Executor | None = None
     devices: Sequence[Device] | None = None
@@ -167,9 +160,7 @@ class EdgeMatcher:
 
     def _computed(self, inits: Mapping[Edge, InitialMap]) -> Iterator[tuple[Edge, EdgeMap | BaseException]]:
         if self.executor is None:
-            tasks = (
-                EdgeTask(self.shapes[i], self.shapes[j], init, self.aligned) for (i, j), init in inits.items()
-            )
+            tasks = (EdgeTask(self.shapes[i], self.shapes[j], init) for (i, j), init in inits.items())
             yield from zip(inits, match_edges(tasks, self.preset, self.devices), strict=True)
             return
         kept = self.store.directory
@@ -179,9 +170,7 @@ class EdgeMatcher:
             names = [shape.mesh.name for shape in self.shapes]
             edges = {f"{i} {j}": (i, j) for i, j in inits}
             stored_tasks = {
-                name: _StoredTask(
-                    place, (keys[i], keys[j]), (names[i], names[j]), self.preset, inits[i, j], self.aligned
-                )
+                name: _StoredTask(place, (keys[i], keys[j]), (names[i], names[j]), self.preset, inits[i, j])
                 for name, (i, j) in edges.items()
             }
             for name, result in run_tasks(_match_stored, stored_tasks, self.executor):
@@ -202,7 +191,7 @@ class EdgeMatcher:
         x, y = (shape_key(self.shapes[number], self.preset, self.eigensolver) for number in edge)
         axes = () if self.axes is None else (self.axes.principal.axes,)
         first = DEFAULT_INITIAL_MAP if init is None else init
-        return (*x, *y, *axes, *preset_key(self.preset), str(self.aligned), first)
+        return (*x, *y, *axes, *preset_key(self.preset), first)
 
 
 class _StoredTask(NamedTuple):
@@ -213,7 +202,6 @@ class _StoredTask(NamedTuple):
     names: tuple[str, str]
     preset: Preset
     init: InitialMap
-    aligned: bool
 
 
 @functools.lru_cache(maxsize=16)
@@ -226,7 +214,7 @@ def _stored_shape(directory: Path, key: str, name: str) -> PreparedShape:
 
 def _match_stored(task: _StoredTask) -> EdgeMap:
     x, y = (_stored_shape(task.directory, key, name) for key, name in zip(task.keys, task.names, strict=True))
-    (result,) = match_edges([EdgeTask(x, y, task.init, task.aligned)], task.preset)
+    (result,) = match_edges([EdgeTask(x, y, task.init)], task.preset)
     if isinstance(result, ArithmeticError):
         raise result
     return result

@@ -12,7 +12,10 @@ from jaxsmw.collection.consistency import Edge
 from jaxsmw.collection.graph import choose_edges, shape_distances
 from jaxsmw.collection.shapes import shape_key
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.search.chirality import Decision, Hands
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.search.evidence import MIRRORED
+from jaxsmw.matching.search.race import hand_evidence
+from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset
 from jaxsmw.runtime.cache import Store
@@ -20,11 +23,12 @@ from jaxsmw.runtime.progress import Progress
 
 # The number of pairs whose hands are compared, divided by the number of shapes.
 _COMPARED_PER_SHAPE = 1.5
-# This number of pairs is compared first. If none of these pairs is asymmetric, no further pairs are compared.
-_COMPARED_FIRST = 5
+# This number of pairs is compared first. No further pairs are compared if the evidence of each of these pairs
+# differs by less than `_SYMMETRIC` from that of shapes that are their own mirror images.
+_COMPARED_FIRST, _SYMMETRIC = 5, 3.0
 
 
-def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.ndarray, " N"]:
+def choose_hands(number: int, evidence: Mapping[Edge, float]) -> Bool[np.ndarray, " N"]:
     """Choose one of two hands for each shape of a collection, from the evidence of all edges.
 
     The signs of the leading eigenvector of the matrix of evidence give the first hands (synchronisation over
@@ -35,16 +39,15 @@ def choose_hands(number: int, decisions: Mapping[Edge, Decision]) -> Bool[np.nda
     **Arguments:**
 
     - `number`: the number N of shapes.
-    - `decisions`: the `Decision` of each compared edge (i, j), with the 0-based numbers of two shapes. Those
-      without evidence and those on symmetric shapes are ignored.
+    - `evidence`: the evidence that the shapes of each compared edge (i, j) have opposite hands; see
+      `compare_hands`. The edge consists of the 0-based numbers of two shapes.
 
     **Returns:** A Boolean array (N,), whose entry i is True if the mirror image of shape i is matched. At
     most half of the entries are True.
     """
     agreement = np.zeros((number, number))
-    for (i, j), decision in decisions.items():
-        if decision.evidence is not None and decision.asymmetric:
-            agreement[i, j] = agreement[j, i] = -decision.evidence
+    for (i, j), of_edge in evidence.items():
+        agreement[i, j] = agreement[j, i] = -of_edge
     if not agreement.any():
         return np.zeros(number, bool)
     _, vectors = np.linalg.eigh(agreement)
@@ -67,35 +70,31 @@ def compare_hands(
     seed: int,
     store: Store,
     progress: Progress,
-) -> dict[Edge, Decision]:
-    """Compare the hands of the pairs of a sparse graph, and keep each `Decision` in the store.
+) -> dict[Edge, float]:
+    """Compare the hands of the pairs of a sparse graph, and keep the evidence in the store.
 
-    A few pairs are compared first. If one of them is asymmetric, all other pairs are compared as well.
+    A few pairs are compared first. If one of them is not its own mirror image, all other pairs are compared.
+
+    **Returns:** For each compared edge, the `hand_evidence` that its shapes have opposite hands.
     """
 
-    def decision(edge: Edge) -> Decision:
+    def evidence(edge: Edge) -> float:
         x, y = (shapes[number] for number in edge)
 
         def compute() -> dict[str, np.ndarray]:
-            decided = Hands(Pair(x.mesh, y.mesh), x.spectrum, y.spectrum).decide("auto")
-            evidence = np.nan if decided.evidence is None else decided.evidence
-            values = decided.mirrored, evidence, decided.doubtful, decided.asymmetric
-            return {"decision": np.array(values, float)}
+            reading = Reading.of(PreparedPair.of(Pair(x.mesh, y.mesh), x, y))
+            return {"evidence": np.array(hand_evidence(reading))}
 
         key_x, key_y = (shape_key(shape, preset, eigensolver) for shape in (x, y))
-        arrays = store.get("hand", (*key_x, *key_y), compute)
-        mirrored, evidence, doubtful, asymmetric = arrays["decision"].tolist()
-        return Decision(
-            bool(mirrored), None if np.isnan(evidence) else evidence, bool(doubtful), bool(asymmetric)
-        )
+        return float(store.get("hand", (*key_x, *key_y), compute)["evidence"])
 
     edges = choose_edges(shape_distances(shapes), edges_per_shape=_COMPARED_PER_SHAPE, seed=seed)
     first = edges[:: max(1, len(edges) // _COMPARED_FIRST)][:_COMPARED_FIRST]
-    decisions = {edge: decision(edge) for edge in first}
-    if not any(decided.asymmetric for decided in decisions.values()):
-        return decisions
+    compared = {edge: evidence(edge) for edge in first}
+    if all(abs(of_edge - MIRRORED) < _SYMMETRIC for of_edge in compared.values()):
+        return compared
     for number, edge in enumerate(edges):
-        if edge not in decisions:
-            decisions[edge] = decision(edge)
+        if edge not in compared:
+            compared[edge] = evidence(edge)
         progress("hands", number + 1, len(edges))
-    return decisions
+    return compared

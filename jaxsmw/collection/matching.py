@@ -119,12 +119,11 @@ def match_collection(
     _check_usable(named, usable, left_out, template)
     kept, shapes = [named[number] for number in usable], list(usable.values())
     with timed("hands", seconds):
-        decisions = {}
         if mirror == "no":
             mirrored = np.zeros(len(shapes), bool)
         elif mirror == "auto":
-            decisions = compare_hands(shapes, preset, eigensolver, seed=seed, store=store, progress=report)
-            mirrored = choose_hands(len(shapes), decisions)
+            evidence = compare_hands(shapes, preset, eigensolver, seed=seed, store=store, progress=report)
+            mirrored = choose_hands(len(shapes), evidence)
         else:
             mirrored = np.array([bool(mirror[number]) for number in usable])
         shapes = [s.mirrored() if other else s for s, other in zip(shapes, mirrored, strict=True)]
@@ -132,10 +131,7 @@ def match_collection(
         shapes, axes = describe_shapes(shapes, preset, store)
     with timed("graph", seconds):
         edges = extended_graph(shapes, edges_per_shape, seed=seed, store=store)
-    # Asymmetric shapes are matched from two initial maps, and expected errors decide between the two results.
-    # Without repair, expected errors do not lead to the correct choice.
-    aligned = preset.repair is not None and any(decision.asymmetric for decision in decisions.values())
-    matcher = EdgeMatcher(shapes, axes, preset, eigensolver, aligned, store, executor, devices, report)
+    matcher = EdgeMatcher(shapes, axes, preset, eigensolver, store, executor, devices, report)
     with timed("edges", seconds):
         maps = matcher.match(dict.fromkeys(edges), "edges")
         _check_connected(maps, shapes)

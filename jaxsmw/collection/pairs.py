@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int64
@@ -21,7 +22,7 @@ from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset, PresetName, choose_preset
-from jaxsmw.matching.starts import make_starts
+from jaxsmw.matching.starts import make_start
 from jaxsmw.runtime.backends import Device, check_devices, chosen_backend
 from jaxsmw.runtime.threads import one_blas_thread
 
@@ -48,8 +49,7 @@ def match_pairs(
     - `meshes`: the meshes of the shapes, each a `Mesh` or a mesh that `make_mesh` accepts. The meshes may
       have different units of length, because each shape is scaled to area 1.
     - `pairs`: a tuple (source X, target Y) for each pair, as 0-based positions in `meshes`.
-    - `preset`: `"accurate"` (the default), `"fast"`, `"paper"` or a `Preset`; see `match`. Without
-      alternative maps (`Preset.without_alternatives`), suspicious maps take less time.
+    - `preset`: `"accurate"` (the default), `"fast"`, `"paper"` or a `Preset`; see `match`.
     - `batch_size`: the number of pairs that each device refines at the same time; see `refine_pairs`.
     - `devices`: the JAX devices. The default is all devices of the default backend.
 
@@ -78,8 +78,12 @@ def match_pairs(
     return results()
 
 
-Task = tuple[PreparedPair, list[Start]]
-"""A prepared pair and the starts from which it is matched."""
+class Task(NamedTuple):
+    """A prepared pair, its initial map, and whether other initial maps are tried if its map is uncertain."""
+
+    prepared: PreparedPair
+    start: Start
+    hypotheses: bool
 
 
 def prepare_task(
@@ -88,24 +92,20 @@ def prepare_task(
     *,
     given: Pair | None = None,
     init: Int64[np.ndarray, " m"] | None = None,
-    aligned: bool = False,
 ) -> Task:
-    """Return the prepared pair of two full shapes, and its starts.
+    """Return the prepared pair of two full shapes, and its initial map.
 
     **Arguments:**
 
     - `x`, `y`: the source X (m vertices) and the target Y, with descriptors in common axes.
     - `given`: the pair to whose vertices the result refers. The default is the meshes of the shapes.
-    - `init`: the initial map X -> Y (m,), as 0-based vertices of Y; None for `"shot"`.
-    - `aligned`: whether a pair without an initial map also starts from `"aligned"`.
+    - `init`: the initial map X -> Y (m,), as 0-based vertices of Y; None for `"auto"`, see `match`.
     """
     pair = Pair(x.mesh, y.mesh)
     prepared = PreparedPair.of(pair, x, y, given=given)
     with warned_already(), one_blas_thread():
-        starts = make_starts(
-            prepared, DEFAULT_INITIAL_MAP if init is None else init, rigid=aligned and init is None
-        )
-    return prepared, starts
+        start = make_start(prepared, DEFAULT_INITIAL_MAP if init is None else init)
+    return Task(prepared, start, init is None)
 
 
 def match_many(
@@ -122,37 +122,32 @@ def match_many(
     """
     batched = batch_size is not None or devices is not None or chosen_backend("auto") == "jax"
 
-    def fitted() -> Iterator[tuple[Preset, PreparedPair, list[Start]]]:
-        for prepared, starts in tasks:
-            own = fitted_preset(preset, *prepared.pair.meshes)
-            yield prepared.usable(own), prepared, starts
+    def fitted() -> Iterator[tuple[Preset, Task]]:
+        for task in tasks:
+            own = fitted_preset(preset, *task.prepared.pair.meshes)
+            yield task.prepared.usable(own), task
 
     if not batched:
-        for own, prepared, starts in fitted():
-            yield _matched(prepared, starts, own)
+        for own, task in fitted():
+            yield _matched(task, own)
         return
     if devices is None:
         import jax
 
         devices = jax.devices()
     # All pairs of a batch run the same stages.
-    for own, group in itertools.groupby(fitted(), key=lambda task: task[0]):
-        while waiting := list(itertools.islice(group, _PAIRS_PER_DEVICE * len(devices))):
-            flat = [(pair.spectra, start) for _, pair, starts in waiting for start in starts]
-            outcomes = iter(run_batches(own.before_final, flat, batch_size=batch_size, devices=devices))
-            for _, prepared, starts in waiting:
-                of_pair = list(itertools.islice(outcomes, len(starts)))
-                yield _matched(prepared, starts, own, of_pair)
+    for own, group in itertools.groupby(fitted(), key=lambda fitted: fitted[0]):
+        while waiting := [task for _, task in itertools.islice(group, _PAIRS_PER_DEVICE * len(devices))]:
+            flat = [(task.prepared.spectra, task.start) for task in waiting]
+            outcomes = run_batches(own.before_final, flat, batch_size=batch_size, devices=devices)
+            for task, outcome in zip(waiting, outcomes, strict=True):
+                yield _matched(task, own, outcome)
 
 
-def _matched(
-    prepared: PreparedPair,
-    starts: Sequence[Start],
-    preset: Preset,
-    outcomes: Sequence[Outcome] = (),
-) -> Correspondence | ArithmeticError:
+def _matched(task: Task, preset: Preset, outcome: Outcome | None = None) -> Correspondence | ArithmeticError:
+    prepared, start, hypotheses = task
     try:
         with one_blas_thread():
-            return match_prepared(prepared, starts, preset, outcomes=outcomes)
+            return match_prepared(prepared, start, preset, hypotheses=hypotheses, outcome=outcome)
     except ArithmeticError as error:
         return error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +21,9 @@ _TO_PLANES = 10
 _MUCH_SMALLER = 0.5
 # The first iterations move at most this number of points of x.
 _MOVED_FIRST = 500
+# Two alignments are different if the root mean square distance between the moved points exceeds this share of
+# the root mean square distance of y from its mean.
+_DIFFERENT = 0.25
 # A rotation is nearly ambiguous if `divisor` is at most `_AMBIGUOUS`. Otherwise, Newton's method for the
 # trace converges in 4 to 14 steps, and the error of the rotation is below 1e-10.
 _NEWTON_STEPS, _AMBIGUOUS = 16, 1e-3
@@ -57,31 +62,75 @@ def align_rigidly(
     - `x`, `y`: points (p, 3) and (q, 3), evenly spread over the surfaces, in the same unit.
     - `normals`: unit normals of the surface at y (q, 3), or None.
     """
-    middle_x, middle_y = x.mean(axis=0), y.mean(axis=0)
     tree = KDTree(y)
-    between_axes = _principal_axes(y - middle_y) @ Rotation.create_group("O").as_matrix()
-    rotations = [
-        np.eye(3),
-        *between_axes @ _principal_axes(x - middle_x).T,
-        *Rotation.create_group("I").as_matrix(),
-    ]
-
-    def closest_points(motion: Alignment, iterations: int, step: int = 1) -> Alignment:
-        moving = x[::step]
-        for _ in range(iterations):
-            _, nearest = tree.query(motion.apply(moving))
-            motion = rigid_fit(moving, y[nearest])
-        return motion
-
-    def distance(motion: Alignment) -> float:
-        moved = motion.apply(x)
-        return float(tree.query(moved)[0].mean() + KDTree(moved).query(y)[0].mean())
-
-    starts = [Alignment(rotation, middle_y - rotation @ middle_x) for rotation in rotations]
-    step = -(-len(x) // _MOVED_FIRST)
-    first = sorted((closest_points(start, _FIRST, step) for start in starts), key=distance)[:_BEST]
-    best = min((closest_points(motion, _FURTHER) for motion in first), key=distance)
+    first = _iterated(x, y, tree, [*_between_axes(x, y), *Rotation.create_group("I").as_matrix()])[:_BEST]
+    further = [_closest_points(x, y, tree, motion, _FURTHER) for _, motion in first]
+    best = min(further, key=lambda motion: _distance(x, y, tree, motion))
     return best if normals is None else _slide(x, y, normals, tree, best)
+
+
+def alignments(x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "q 3"], number: int) -> list[Alignment]:
+    """Return rigid motions that bring the points x near the points y in different ways, the nearest first.
+
+    The method of `align_rigidly` runs from the identity and from the 24 rotations between the principal axes.
+
+    **Arguments:**
+
+    - `x`, `y`: points (p, 3) and (q, 3), evenly spread over the surfaces, in the same unit.
+    - `number`: the largest number of motions.
+    """
+    least = _DIFFERENT**2 * ((y - y.mean(axis=0)) ** 2).sum(axis=1).mean()
+    kept: list[tuple[Alignment, Float64[np.ndarray, "p 3"]]] = []
+    for _, motion in _iterated(x, y, KDTree(y), _between_axes(x, y)):
+        moved = motion.apply(x)
+        if all(((moved - other) ** 2).sum(axis=1).mean() > least for _, other in kept):
+            kept.append((motion, moved))
+        if len(kept) == number:
+            break
+    return [motion for motion, _ in kept]
+
+
+def _between_axes(
+    x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "q 3"]
+) -> list[Float64[np.ndarray, "3 3"]]:
+    """Return the identity and the 24 rotations that take principal axes of x to principal axes of y."""
+    axes_x, axes_y = (_principal_axes(points - points.mean(axis=0)) for points in (x, y))
+    return [np.eye(3), *axes_y @ Rotation.create_group("O").as_matrix() @ axes_x.T]
+
+
+def _iterated(
+    x: Float64[np.ndarray, "p 3"],
+    y: Float64[np.ndarray, "q 3"],
+    tree: KDTree,
+    rotations: Sequence[Float64[np.ndarray, "3 3"]],
+) -> list[tuple[float, Alignment]]:
+    """Run the first iterations from each rotation. Return the mean distances and motions, the best first."""
+    middle_x, middle_y = x.mean(axis=0), y.mean(axis=0)
+    few = x[:: -(-len(x) // _MOVED_FIRST)]
+    starts = (Alignment(rotation, middle_y - rotation @ middle_x) for rotation in rotations)
+    motions = [_closest_points(few, y, tree, start, _FIRST) for start in starts]
+    return sorted(((_distance(x, y, tree, motion), motion) for motion in motions), key=itemgetter(0))
+
+
+def _closest_points(
+    x: Float64[np.ndarray, "p 3"],
+    y: Float64[np.ndarray, "q 3"],
+    tree: KDTree,
+    motion: Alignment,
+    iterations: int,
+) -> Alignment:
+    for _ in range(iterations):
+        _, nearest = tree.query(motion.apply(x))
+        motion = rigid_fit(x, y[nearest])
+    return motion
+
+
+def _distance(
+    x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "q 3"], tree: KDTree, motion: Alignment
+) -> float:
+    """Return the mean distance from x to y plus that from y to x, after the motion."""
+    moved = motion.apply(x)
+    return float(tree.query(moved)[0].mean() + KDTree(moved).query(y)[0].mean())
 
 
 def _slide(

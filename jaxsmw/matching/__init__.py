@@ -8,9 +8,9 @@
 - `preparation`: spectra, samples and descriptors of both shapes.
 - `outcome`: what stages start from, and what they leave.
 - `starts`: initial maps.
-- `executor`: runs stages, padded and compiled, on one pair or on many.
-- `judge`: whether a map looks right, and which of two is better.
-- `search`: mirror images, alternative maps, repair and trimming.
+- `executor`: runs stages on one pair or on many.
+- `judge`: measures of maps without ground truth.
+- `search`: the search for the right map, its judge, and the trimming of partial shapes.
 - `correspondence`: the result, for the vertices of the given meshes.
 - `advice`: what `match` tells about a map that may be wrong.
 - `match`: all of these in one function, in the order in which they run.

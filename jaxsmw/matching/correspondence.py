@@ -22,10 +22,11 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
 from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map
-from jaxsmw.matching.judge import Scored, estimate_error, overlap, wrong_probability
-from jaxsmw.matching.outcome import StageRun, Start
+from jaxsmw.matching.judge import distortion, estimate_error, overlap
+from jaxsmw.matching.outcome import Outcome, StageRun, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.search.alternatives import Alternative
 from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset, Stage
@@ -53,31 +54,26 @@ class Correspondence:
     - `functional_map`: the functional map of the last iteration, a property without unit. Its shape is
       (k_X, k_Y) for a pullback, which is the usual convention, and (k_Y, k_X) for a pushforward.
     - `initial_map`: the map from which refinement started (m,), int64, as 0-based vertices of Y.
-    - `origin`: where the initial map comes from; see `Start`. If repair chose an alternative initial map,
-      `initial_map` is the alternative.
-    - `preset`: the `Preset` with the stages of refinement and the settings of the repair, adapted to the
+    - `origin`: where the first initial map comes from; see `Start`. If the search chose another map,
+      `initial_map` is the map from which that map was refined.
+    - `preset`: the `Preset` with the stages of refinement and the settings of the search, adapted to the
       meshes; see `Preset.fitted`.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y in `Pair.units_of_length`, each a `Spectrum` with the
       k_X or k_Y eigenvectors that the last stage uses. If a mesh was cut before it was matched
       (`jaxsmw.geometry.cut_shortcuts`), or was trimmed (`jaxsmw.matching.search.trimming`), the spectrum
       belongs to the cut or trimmed mesh. The mask of the spectrum is False for trimmed vertices.
-    - `stage`: the last `Stage`. After trimming, its levels are `RepairSettings.trimmed_levels`.
+    - `stage`: the last `Stage`. After trimming, its levels are `SearchSettings.trimmed_levels`.
     - `refinement`: the `Refinement` of the last stage. The `Refinement` contains a `History` if `match` was
       called with `history=True`.
     - `iterations`: the total number of iterations of all stages.
     - `distortion`: the distortion of the map (`jaxsmw.matching.judge.distortion`), a number without unit. The
       distortion is 1 for isometries and larger for worse maps.
-    - `suspicious`: whether the map looks wrong. If the preset has repair, the value is True if limbs still
-      look swapped or the body still looks upside down after repair. If the preset has no repair, the value is
-      True if the distortion is at least 1.25. In both cases, the value is also True if `match` is uncertain
-      whether X or its mirror image corresponds to Y, for example if `mirror_evidence` is between 0 and 0.1.
+    - `probability`: the probability, from 0 to 1, that the map is right as a whole: not turned, not mirrored,
+      and without exchanged limbs.
+    - `alternatives`: other maps that could be right, as a tuple of `Alternative`, the most probable first.
     - `mirrored`: True if the mirror image of X was matched instead of X, because X and Y are of opposite
       hands, such as a left and a right tooth. Entry i of `pointwise_map` is always the match of vertex i of
       X, even if X was mirrored.
-    - `mirror_evidence`: the evidence that the mirror image of X, and not X itself, corresponds to Y, a number
-      without unit; None if `match` computed no evidence. If X and Y differ enough from their own mirror
-      images, a value of at least 0.05 leads to `mirrored=True`. Most correct decisions with `mirrored=True`
-      have values above 0.3. See `jaxsmw.matching.search.chirality.Hands`.
     - `left_out`: the share of X's area in small components that have no counterpart on Y and only move with
       their surroundings; see `jaxsmw.transfer.match_small_components`.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. If JAX refines meshes of
@@ -95,19 +91,27 @@ class Correspondence:
     refinement: Refinement
     iterations: int
     distortion: float
-    suspicious: bool = False
+    probability: float
+    alternatives: tuple[Alternative, ...] = ()
     mirrored: bool = False
-    mirror_evidence: float | None = None
     left_out: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, prepared: PreparedPair, start: Start, preset: Preset, scored: Scored) -> Correspondence:
+    def of(
+        cls,
+        prepared: PreparedPair,
+        start: Start,
+        preset: Preset,
+        outcome: Outcome,
+        probability: float,
+        alternatives: tuple[Alternative, ...] = (),
+    ) -> Correspondence:
         """Make the result of `match`, which refers to the vertices of the given meshes.
 
         **Raises:** `ArithmeticError` if a stage failed.
         """
-        pair, outcome = prepared.given, scored.outcome
+        pair = prepared.given
         last = outcome.last.refinement
         if last.result != RESULTS.successful:
             cure = ' If the units of length differ, set scale="unknown".' if pair.partial else ""
@@ -128,8 +132,9 @@ class Correspondence:
                 last, pointwise_map=namespace(last.pointwise_map).asarray(pointwise_map, np.int32)
             ),
             iterations=sum(int(run.refinement.iterations) for run in outcome.runs),
-            distortion=scored.distortion,
-            suspicious=scored.suspicious,
+            distortion=distortion(prepared.pair, outcome.pointwise_map, seen.x),
+            probability=probability,
+            alternatives=alternatives,
             mirrored=prepared.mirrored,
             left_out=left_out,
         )
@@ -139,6 +144,11 @@ class Correspondence:
         flag = (", mirrored" if self.mirrored else "") + (", suspicious" if self.suspicious else "")
         judged = f"distortion {self.distortion:.3f}{flag}"
         return f"Correspondence({self.pair.name}: {m} to {n} vertices, {judged})"
+
+    @property
+    def suspicious(self) -> bool:
+        """Whether the map is wrong with a probability above one half."""
+        return self.probability < 0.5
 
     @property
     def mesh_x(self) -> Mesh:
@@ -355,14 +365,8 @@ class Correspondence:
         )
 
     def wrong_probability(self) -> float:
-        """Estimate the probability that the map is wrong on a part of the body, without ground truth.
-
-        A map is called wrong if at least 2 % of X's area have errors above 0.25 times the square root of Y's
-        area, for example because limbs are swapped; see `jaxsmw.matching.judge.wrong_probability`.
-
-        **Returns:** A probability, from 0 to 1.
-        """
-        return wrong_probability(self.distortion, float(self.mesh_x.average(self._expected_error)))
+        """Return the probability, from 0 to 1, that the map is wrong as a whole: 1 - `probability`."""
+        return 1 - self.probability
 
     @functools.cached_property
     def _expected_error(self) -> Float[np.ndarray, " m"]:
@@ -376,7 +380,6 @@ class Correspondence:
                 self.pointwise_map,
                 self._last,
                 settings,
-                self.preset.criteria.scores,
             )
 
     def _embeddings(self) -> tuple[Float[np.ndarray, "m d"], Float[np.ndarray, "n d"]]:

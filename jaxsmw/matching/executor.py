@@ -16,6 +16,8 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.matching.outcome import Outcome, StageRun, Start
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Stage
+from jaxsmw.runtime.backends import chosen_backend
+from jaxsmw.runtime.threads import side_by_side
 
 
 def run(stages: Sequence[Stage], spectra: SpectralPair, start: Start) -> Outcome:
@@ -36,6 +38,18 @@ def run(stages: Sequence[Stage], spectra: SpectralPair, start: Start) -> Outcome
         runs.append(StageRun(stage, spectra, refinement))
         matches = refinement.pointwise_map
     return Outcome(start.pointwise_map, tuple(runs))
+
+
+def run_all(stages: Sequence[Stage], tasks: Sequence[tuple[SpectralPair, Start]]) -> list[Outcome]:
+    """Run stages on several pairs of equal sizes: in one batch on accelerators, else in two threads.
+
+    Pairs that batches cannot contain run one after another; see `run_batches`.
+    """
+    if chosen_backend("auto") == "numpy":
+        return list(side_by_side(lambda task: run(stages, *task), *tasks))
+    alone = [pair.partial or pair.on_host or start.excluded is not None for pair, start in tasks]
+    batch = iter(run_batches(stages, [task for task, one in zip(tasks, alone, strict=True) if not one]))
+    return [run(stages, *task) if one else next(batch) for task, one in zip(tasks, alone, strict=True)]
 
 
 def refine_stage(stage: Stage, seen: SpectralPair, matches: Int[Array, " m"]) -> Refinement:

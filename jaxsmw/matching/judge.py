@@ -1,4 +1,4 @@
-"""Judges maps without ground truth: how good a map is, where it is wrong, and which of two is better.
+"""Measures of maps without ground truth: how much a map distorts, and where it is probably wrong.
 
 The functions share these arguments. `pair` is the `Pair` of the source X (m vertices) and the target Y (n
 vertices). `pointwise_map` is T: X -> Y (m,), 0-based vertices of Y. `reverse_map` is a map Y -> X (n,),
@@ -9,27 +9,15 @@ without padding and with a few hundred eigenvectors. `settings` and `scores` are
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.mesh import connected_components, extend_from
 from jaxsmw.geometry.sampling import coarse_edges
-from jaxsmw.matching.outcome import Outcome, StageRun
+from jaxsmw.matching.outcome import StageRun
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.settings import (
-    ExpectedErrorSettings,
-    JudgeSettings,
-    ScoreSettings,
-    WrongProbabilitySettings,
-)
-from jaxsmw.matching.spectral_pair import SpectralPair
-from jaxsmw.matching.stages import Stage
+from jaxsmw.matching.settings import ExpectedErrorSettings, ScoreSettings
 
 _DEFAULT = ScoreSettings()
 
@@ -275,169 +263,6 @@ def expected_error(
         expected *= 1 + settings.area_weight * np.log(max(difference / settings.isometric_difference, 1))
     expected += settings.misplaced_weight * misplaced * sizes
     return expected * unit_y / pair.mesh_y.area**0.5
-
-
-def wrong_probability(
-    distortion: float,
-    mean_expected_error: float,
-    settings: WrongProbabilitySettings = WrongProbabilitySettings(),  # noqa: B008 (immutable)
-) -> float:
-    """Estimate the probability that a map is wrong, without ground truth.
-
-    A map is called wrong if its errors exceed 0.25 times the square root of Y's area on at least 2 % of X's
-    area. Maps with swapped limbs, mirrored maps and upside-down maps are wrong in this sense. A map with only
-    small errors is not wrong in this sense. The estimate is a logistic regression on the logarithms of the
-    distortion and of the mean expected error.
-
-    **Arguments:**
-
-    - `distortion`: the distortion of the map (`jaxsmw.matching.judge.distortion`), at least 0.
-    - `mean_expected_error`: the mean of `expected_error`, in units of the square root of the area.
-    - `settings`: the coefficients of the regression.
-
-    **Returns:** A probability, from 0 to 1. `docs/accuracy.md` shows the calibration.
-    """
-    tiny = 1e-6
-    evidence = (
-        settings.intercept
-        + settings.distortion_weight * math.log(max(distortion, tiny))
-        + settings.expected_error_weight * math.log(max(mean_expected_error, tiny))
-    )
-    return 1 / (1 + math.exp(-min(max(evidence, -500), 500)))
-
-
-@dataclass(frozen=True, eq=False)
-class Scored:
-    """An outcome of stages and its scores.
-
-    **Attributes:**
-
-    - `outcome`: the `Outcome`.
-    - `distortion`: `jaxsmw.matching.judge.distortion` of the map; infinite if a stage failed.
-    - `deformation`: `jaxsmw.matching.search.proxies.deformation` of the map; 0 if it was not measured.
-    - `suspicious`: whether limbs may be swapped, or the body may be upside down.
-    - `rivals`: other maps of repair with nearly the same score. If the map looks right, its rivals look right
-      as well.
-    """
-
-    outcome: Outcome
-    distortion: float
-    deformation: float = 0.0
-    suspicious: bool = False
-    rivals: tuple[Scored, ...] = ()
-
-    @property
-    def successful(self) -> bool:
-        """Whether all stages succeeded."""
-        return self.outcome.successful
-
-    @property
-    def pointwise_map(self) -> Int64[np.ndarray, " m"]:
-        """The map of the last stage (m,), 0-based vertices of Y."""
-        return self.outcome.pointwise_map
-
-
-@dataclass(frozen=True, eq=False)
-class Judge:
-    """The criteria by which maps of one pair are judged without ground truth.
-
-    **Attributes:**
-
-    - `pair`: the source X (m vertices) and the target Y.
-    - `spectra`: the spectra of X and Y with the largest available number of eigenvectors, because more
-      eigenvectors make faults easier to detect.
-    - `settings`: the thresholds and weights of the repair.
-    - `measure_deformation`: a function that takes a map X -> Y (m,) and returns its deformation; None if maps
-      are judged without deformations.
-    """
-
-    pair: Pair
-    spectra: SpectralPair
-    settings: JudgeSettings
-    measure_deformation: Callable[[Int64[np.ndarray, " m"]], float] | None = None
-
-    @classmethod
-    def of(cls, prepared: PreparedPair, stages: Sequence[Stage], settings: JudgeSettings) -> Judge:
-        """Return a judge that sees the spectra of the stage with the most eigenvectors."""
-        seen = (prepared.spectra.seen_by(stage) for stage in stages)
-        finest = max(seen, key=lambda spectra: spectra.x.eigenvalues.shape[0])
-        return cls(prepared.pair, finest, settings)
-
-    def judged(self, outcome: Outcome) -> Scored:
-        """Measure an outcome, and decide whether it is suspicious. A failed outcome is suspicious."""
-        scored = self.measured(outcome)
-        suspicious = not scored.distortion < self.settings.suspicious
-        if not suspicious and self.settings.suspicious_area < 1:
-            largest = max(map(self.pair.mesh_x.average, self.faults(scored.pointwise_map)), default=0)
-            suspicious = bool(largest >= self.settings.suspicious_area)
-        return replace(scored, suspicious=suspicious)
-
-    def measured(self, outcome: Outcome, *, suspicious: bool = False) -> Scored:
-        """Compute what determines the `score` of an outcome."""
-        if not outcome.successful:
-            return Scored(outcome, np.inf, suspicious=suspicious)
-        return Scored(outcome, *self._measures(outcome.pointwise_map), suspicious)
-
-    def score(self, scored: Scored) -> float:
-        """Return the score of a map, for comparison with other maps of the pair; infinite after a failure."""
-        if not scored.successful:
-            return np.inf
-        return self._weighted(scored.distortion, scored.outcome.uncertainty, scored.deformation)
-
-    def score_map(self, pointwise_map: Int64[np.ndarray, " m"], uncertainty: float) -> float:
-        """Return the score of a map (m,) with a known uncertainty; see `score`."""
-        distorted, deformation = self._measures(pointwise_map)
-        return self._weighted(distorted, uncertainty, deformation)
-
-    def _measures(self, pointwise_map: Int64[np.ndarray, " m"]) -> tuple[float, float]:
-        """Return the distortion and the deformation of a map (m,)."""
-        deformation = 0.0 if self.measure_deformation is None else self.measure_deformation(pointwise_map)
-        return distortion(self.pair, pointwise_map, self.spectra.x, self.settings.scores), deformation
-
-    def _weighted(self, distorted: float, uncertainty: float, deformation: float) -> float:
-        """Return the logarithm of the distortion plus the weighted other measures; lower is better."""
-        weights = self.settings
-        return (
-            float(np.log(distorted))
-            + weights.uncertainty_weight * uncertainty
-            + weights.deformation_weight * deformation
-        )
-
-    def faults(self, pointwise_map: Int64[np.ndarray, " m"]) -> list[Bool[np.ndarray, " m"]]:
-        """Return the faults that repair can remove from a map, each as a mask of X's vertices (m,).
-
-        The two possible faults are the vertices with orientation reversal and the vertices in discontinuous
-        parts. A fault is not returned if its share of X's area is at most `negligible_area` or at least
-        `excessive_area` in the settings.
-        """
-        scores = self.settings.scores
-        both = (
-            orientation_reversal(self.pair, pointwise_map, self.spectra.x, scores),
-            discontinuous_parts(self.pair, pointwise_map, scores),
-        )
-        low, high = self.settings.negligible_area, self.settings.excessive_area
-        return [fault for fault in both if low < self.pair.mesh_x.average(fault) < high]
-
-    def looks_right(self, scored: Scored) -> bool:
-        """Return whether a judged map looks right.
-
-        A map looks right if it is not suspicious. A map without faults also looks right if its distortion is
-        below `doubtful` in the settings.
-        """
-        slightly_distorted = scored.distortion < self.settings.doubtful
-        return not scored.suspicious or (slightly_distorted and not self.faults(scored.pointwise_map))
-
-    def area_change(self, scored: Scored) -> float:
-        """Return the `area_shape_difference` of a map.
-
-        The result is near 0 for poses of one body. For partial pairs, the result is 0, because parts of the
-        full shape have no match.
-        """
-        if self.pair.partial:
-            return 0.0
-        return area_shape_difference(
-            self.pair, scored.pointwise_map, self.spectra.x, self.spectra.y, self.settings.scores
-        )
 
 
 def estimate_error(

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import functools
-import logging
 import warnings
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 
 from numpy.typing import ArrayLike
@@ -30,20 +28,16 @@ from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.advice import advice
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import Judge, Scored, estimate_error
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, prepare
-from jaxsmw.matching.search.chirality import Decision, Hands
-from jaxsmw.matching.search.repair import refine_further, repair_map
+from jaxsmw.matching.search.alternatives import alternatives
+from jaxsmw.matching.search.search import search
 from jaxsmw.matching.search.trimming import match_trimmed
-from jaxsmw.matching.settings import ExpectedErrorSettings
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
-from jaxsmw.matching.starts import check_initial_map, make_starts
+from jaxsmw.matching.starts import check_initial_map, make_start
 from jaxsmw.runtime.progress import Step, no_step, timed
 from jaxsmw.runtime.threads import one_blas_thread
-
-logger = logging.getLogger("jaxsmw")
 
 
 def match(
@@ -62,12 +56,12 @@ def match(
 ) -> Correspondence:
     """Find for every vertex of X the vertex of Y at the same point of the body.
 
-    If the preset has repair, each mesh is first cut where its surface is fused with itself, for example a
+    If the preset has a search, each mesh is first cut where its surface is fused with itself, for example a
     hand with a hip; see `jaxsmw.geometry.cut_shortcuts`. The result refers to the given meshes.
 
-    The function issues a `UserWarning` if the final map looks wrong, if X and its mirror image match Y about
-    equally well, or if a mesh is too coarse for the descriptors of the preset. It also issues one if small
-    components without a counterpart have more than 5 % of X's area.
+    The function issues a `UserWarning` if the map is probably wrong as a whole, if one mesh was recognised as
+    a part of the other, or if a mesh is too coarse for the descriptors of the preset. It also issues one if
+    small components without a counterpart have more than 5 % of X's area.
 
     **Arguments:**
 
@@ -76,7 +70,7 @@ def match(
       `make_mesh`.
     - `preset`: the method of refinement, which is one of the following.
 
-        - `"accurate"` (the default): four stages, with repair; see `jaxsmw.PRESETS`.
+        - `"accurate"` (the default): four stages, with a search; see `jaxsmw.PRESETS`.
         - `"paper"`: the method of the MWP paper.
         - `"fast"`: the method of the MWP paper on 500 samples of each shape.
         - a `Preset`. Its sizes are adapted to small meshes; see `Preset.fitted`.
@@ -85,13 +79,11 @@ def match(
 
     - `init`: the initial map, which is one of the following.
 
-        - `"auto"` (the default): `"shot"`. If shapes differ from their own mirror images, as teeth do,
-          `"aligned"` is refined as well and preferred; see `RepairSettings.aligned_preference`. This happens
-          only if `partial` is False and the preset has repair.
+        - `"auto"` (the default): `"shot"`. If its map is uncertain and the preset has a search, many other
+          initial maps are tried; see docs/how_it_works.md.
         - `"shot"`, `"wks"`, `"hks"`, `"wavelet"`, `"functional"`, `"aligned"`, a given map (m,) or landmarks
-          (l, 2): see `initial_map`. With `"shot"`, repair also tries alternative maps. `"functional"` is
-          smoother than `"shot"` and has smaller errors, but after refinement, the map often has larger errors
-          (docs/results.md).
+          (l, 2): see `initial_map`. No other initial maps are tried. `"functional"` is smoother than `"shot"`
+          and has smaller errors, but after refinement, the map often has larger errors (docs/results.md).
 
     - `laplacian`, `eigensolver`: see `compute_spectrum`. `"auto"` chooses `"approximate"` for both meshes if
       one mesh has at least 50 000 referenced vertices, else `"exact"`.
@@ -103,9 +95,8 @@ def match(
       mirror image of X is matched instead of X. Whether X is mirrored or not, entry i of the map is the match
       of vertex i of X.
 
-        - `"auto"` (the default): the mirror image is matched if a coarse map of it preserves distances better
-          than a coarse map of X itself; see `jaxsmw.matching.search.chirality.Hands`. X itself is matched if
-          X and Y are nearly their own mirror images, as people and animals are, or if `partial` is True.
+        - `"auto"` (the default): if the preset has a search and the map of X itself is uncertain, maps of
+          the mirror image are tried as well. They are chosen only if they are clearly better.
         - `"no"`: match X itself.
         - `"yes"`: match the mirror image of X.
 
@@ -135,8 +126,8 @@ def match(
         method = method.fitted(fewest)
     if history:
         method = method.with_history()
-    automatic = isinstance(init, str) and init == "auto"
     # The check runs before the slow computation of the eigenbases.
+    automatic = isinstance(init, str) and init == "auto"
     first_init = check_initial_map(pair, DEFAULT_INITIAL_MAP if automatic else init)
 
     seconds: dict[str, float] = {}
@@ -152,49 +143,39 @@ def match(
             backend=backend,
             step=step,
         )
-        aligns = automatic and method.repair is not None  # "aligned" is used only for asymmetric shapes
-        decision = Decision(mirror == "yes")
-        if (mirror == "auto" or aligns) and not partial:
-            with step("mirror test"):
-                decision = Hands(surfaces, *prepared.spectra.both).decide(mirror)
         # SHOT changes in a mirror image, so initial maps and descriptors are computed after this decision.
-        if decision.mirrored:
-            if mirror == "auto":
-                logger.info("%s: the mirror image of the source is matched", pair.name)
+        if mirror == "yes":
             prepared = prepared.mirror()
         with step("initial map"):
-            starts = make_starts(prepared, first_init, rigid=aligns and decision.asymmetric)
+            start = make_start(prepared, first_init)
         if method.number_of_descriptors:
             with step("descriptors"):
                 prepared = prepared.describe(method.number_of_descriptors, required=not adapts)
-        correspondence = match_prepared(prepared, starts, method, step=step)
-    # The advice distinguishes a map that looks wrong from a doubtful hand. The result does not.
-    for text in advice(correspondence, decision):
+        correspondence = match_prepared(
+            prepared, start, method, mirror=mirror, hypotheses=automatic, step=step
+        )
+    for text in advice(correspondence, partial=partial):
         warnings.warn(text, stacklevel=2)
-    return replace(
-        correspondence,
-        suspicious=correspondence.suspicious or decision.doubtful,
-        mirror_evidence=decision.evidence,
-        seconds=seconds,
-    )
+    return replace(correspondence, seconds=seconds)
 
 
 def match_prepared(
     prepared: PreparedPair,
-    starts: Sequence[Start],
+    start: Start,
     preset: Preset,
     *,
-    outcomes: Sequence[Outcome] = (),
+    mirror: Mirror = "no",
+    hypotheses: bool = True,
+    outcome: Outcome | None = None,
     step: Step = no_step,
 ) -> Correspondence:
-    """Run all stages and the repair from each start, and return the better map.
+    """Search for the right map, and run the final stages.
 
     **Arguments:**
 
     - `prepared`: the prepared pair. If it has no descriptors, the stages use none.
-    - `starts`: the initial maps: one map, or `"shot"` and `"aligned"`.
-    - `preset`: the stages and the repair.
-    - `outcomes`: the outcome of `preset.before_final` for each start, if these stages have already run.
+    - `start`, `mirror`, `hypotheses`, `outcome`: see `jaxsmw.matching.search.search`.
+    - `preset`: the stages and the settings of the search.
     - `step`: reports and measures the steps. By default, nothing is reported.
 
     **Returns:** The `Correspondence`.
@@ -202,61 +183,14 @@ def match_prepared(
     **Raises:** `ArithmeticError` if refinement fails numerically from every start, or in the final stages.
     """
     preset = prepared.usable(preset)
-    known: Sequence[Outcome | None] = outcomes or [None] * len(starts)
-    candidates = []
     with step("refinement"):
-        for start, outcome in zip(starts, known, strict=True):
-            scored = refine_and_judge(prepared, start, preset, outcome)
-            candidates.append((start, repair_map(prepared, start, preset, scored)))
-    successful = [(start, scored) for start, scored in candidates if scored.successful]
-    start, scored = (successful or candidates)[0]
-    if len(successful) > 1:
-        with step("choice of start"):
-            start, scored = _choose(prepared, preset, successful)
-    last = step("final stages") if preset.final or preset.repair else nullcontext()
-    with last:
-        if trimmed := match_trimmed(prepared, preset, scored):
-            prepared, scored = trimmed
-        else:
-            scored = refine_further(prepared, start, preset, scored)
-            scored = _run_final(prepared, preset, scored)
-    return Correspondence.of(prepared, start, preset, scored)
-
-
-def refine_and_judge(
-    prepared: PreparedPair, start: Start, preset: Preset, outcome: Outcome | None = None
-) -> Scored:
-    """Run all stages before the final ones from a start, unless their outcome is given, and judge the map."""
-    if outcome is None:
-        outcome = run(preset.before_final, prepared.spectra, start)
-    return Judge.of(prepared, preset.before_final, preset.criteria).judged(outcome)
-
-
-def _choose(
-    prepared: PreparedPair, preset: Preset, candidates: Sequence[tuple[Start, Scored]]
-) -> tuple[Start, Scored]:
-    """Choose the start whose map has the smallest mean expected error. Rigid starts are preferred.
-
-    The expected errors have `area_weight` 0. A positive weight would multiply them by a factor that depends
-    on the shapes, not on the quality of the map. (Entry R24 of docs/research_log.md)
-    """
-    repair, mesh_x = preset.repair, prepared.given.mesh_x
-    if repair is None:
-        return candidates[0]
-    settings = ExpectedErrorSettings(area_weight=0.0), repair.judge.scores
-
-    def error(candidate: tuple[Start, Scored]) -> float:
-        start, scored = candidate
-        errors = estimate_error(prepared.matched, scored.pointwise_map, scored.outcome.last, *settings)
-        return (repair.aligned_preference if start.is_rigid else 1.0) * float(mesh_x.average(errors))
-
-    return min(reversed(candidates), key=error)  # of equal errors, that of the last start counts
-
-
-def _run_final(prepared: PreparedPair, preset: Preset, scored: Scored) -> Scored:
-    """Run the final stages from a map. The result is as suspicious as the given map."""
-    if not (preset.final and scored.successful):
-        return scored
-    after = run(preset.final, prepared.spectra, Start(scored.pointwise_map))
-    judge = Judge.of(prepared, preset.final, preset.criteria)
-    return judge.measured(scored.outcome.followed_by(after), suspicious=scored.suspicious)
+        best, *others = search(prepared, start, preset, mirror=mirror, hypotheses=hypotheses, outcome=outcome)
+    prepared, outcome = best.reading.prepared, best.outcome
+    if outcome.successful and (preset.final or preset.search):
+        with step("final stages"):
+            if trimmed := match_trimmed(prepared, preset, outcome):
+                prepared, outcome = trimmed
+            elif preset.final:
+                final = run(preset.final, prepared.spectra, Start(outcome.pointwise_map))
+                outcome = outcome.followed_by(final)
+    return Correspondence.of(prepared, start, preset, outcome, *alternatives(best, others))

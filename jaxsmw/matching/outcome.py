@@ -31,15 +31,11 @@ class Start(NamedTuple):
       or `"stages"` for the map of earlier stages.
     - `excluded`: a mask of the vertices of X (m,) that the first stage leaves out; None to use all vertices.
       If the stage iterates on samples, the vertices are left out only in its first functional map.
-    - `has_alternatives`: whether repair can try alternative maps, which are variants of the map.
-    - `is_rigid`: whether the map comes from a rigid alignment of shapes that differ in form, not in pose.
     """
 
     pointwise_map: Int64[np.ndarray, " m"]
     origin: str = "stages"
     excluded: Bool[np.ndarray, " m"] | None = None
-    has_alternatives: bool = False
-    is_rigid: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +117,6 @@ class Outcome:
     def last(self) -> StageRun:
         """The last stage that has run."""
         return self.runs[-1]
-
-    @property
-    def uncertainty(self) -> float:
-        """The uncertainty of the last stage whose refiner computes one; 0 if there is none."""
-        known = [u for run in self.runs if (u := run.refinement.state.uncertainty) is not None]
-        return float(known[-1]) if known else 0.0
 
     def followed_by(self, later: Outcome) -> Outcome:
         """Return the outcome of these stages and later ones, which started from their map."""

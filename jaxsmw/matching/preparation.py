@@ -13,9 +13,7 @@ from jaxtyping import Float
 from jaxsmw.choices import DEFAULT_BACKEND, Backend, Eigensolver, Laplacian
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError, check_whole_number
-from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.sampling import SurfaceSamples
-from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS, shot_descriptors
+from jaxsmw.geometry.shot import SHOT_DIMENSION, SHOT_RADIUS
 from jaxsmw.matching.descriptors import DescriptorAxes
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.shape import PreparedShape, prepare_shapes
@@ -115,20 +113,15 @@ class PreparedPair:
         """SHOT of X and Y at the compared vertices, with the usual radius."""
         return self.known_shot or self.shot_of_radius(SHOT_RADIUS)
 
-    def shot_of_radius(
-        self, radius: float, samples: tuple[SurfaceSamples, SurfaceSamples] | None = None
-    ) -> tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]:
-        """Compute SHOT of X and Y, with a radius in `Pair.units_of_length`.
+    def shot_of_radius(self, radius: float) -> tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]:
+        """Compute SHOT of X and Y at the compared vertices, with a radius in `Pair.units_of_length`."""
 
-        SHOT is computed at `samples`, by default at the compared vertices.
-        """
+        def of_one(side: tuple[PreparedShape, float]) -> Float[np.ndarray, "a d"]:
+            shape, unit = side
+            return shape.shot(radius * unit / shape.mesh.area**0.5)
 
-        def of_one(argument: tuple[Mesh, float, SurfaceSamples | None]) -> Float[np.ndarray, "a d"]:
-            mesh, unit, at = argument
-            return shot_descriptors(mesh, radius=radius * unit / mesh.area**0.5, samples=at)
-
-        at = samples or (self.x.compared, self.y.compared)
-        return side_by_side(of_one, *zip(self.pair.meshes, self.pair.units_of_length, at, strict=True))
+        of_x, of_y = side_by_side(of_one, *zip(self.shapes, self.pair.units_of_length, strict=True))
+        return of_x, of_y
 
     @property
     def matched(self) -> Pair:
@@ -141,8 +134,30 @@ class PreparedPair:
 
     def mirror(self) -> PreparedPair:
         """Return the prepared pair with the mirror image of X in place of X. There are no descriptors yet."""
-        x = self.x.mirrored()
-        return replace(self, pair=self.pair.mirrored(), x=x, mirrored=not self.mirrored, known_shot=None)
+        x, y = self.x.mirrored(), self.y.without_descriptors()
+        pair = self.pair.mirrored()
+        return replace(self, pair=pair, x=x, y=y, mirrored=not self.mirrored, known_shot=None)
+
+    def as_part(self, pair: Pair) -> PreparedPair:
+        """Return the prepared pair of the same meshes in which one full shape is a part of the other.
+
+        There are no descriptors yet, because their radii are in other units.
+
+        **Arguments:**
+
+        - `pair`: the partial pair of the meshes of `pair`.
+        """
+        x, y = (shape.without_descriptors() for shape in self.shapes)
+        given = replace(self.given, partial=True, scale=pair.scale)
+        return PreparedPair.of(
+            pair,
+            x,
+            y,
+            given=given,
+            mirrored=self.mirrored,
+            laplacian=self.laplacian,
+            eigensolver=self.eigensolver,
+        )
 
     def describe(self, number_of_descriptors: int, *, required: bool = False) -> PreparedPair:
         """Return the prepared pair with descriptors of both shapes in the same axes.

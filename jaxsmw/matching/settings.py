@@ -1,4 +1,4 @@
-"""The settings of the repair, of the judge, and of the expected error."""
+"""The settings of the search, of measures of maps, and of the expected error."""
 
 from __future__ import annotations
 
@@ -73,168 +73,32 @@ class ExpectedErrorSettings:
 
 
 @dataclass(frozen=True)
-class WrongProbabilitySettings:
-    """The coefficients of `jaxsmw.matching.judge.wrong_probability`, a logistic regression. (Table R31)
+class SearchSettings:
+    """The settings that determine how the right map is searched for.
 
-    **Attributes:**
-
-    - `intercept`: the log-odds that a map is wrong if its distortion and its mean expected error are both 1.
-    - `distortion_weight`: the weight of the logarithm of the distortion.
-    - `expected_error_weight`: the weight of the logarithm of the mean expected error.
-    """
-
-    intercept: float = 4.9
-    distortion_weight: float = 2.5
-    expected_error_weight: float = 2.1
-
-
-@dataclass(frozen=True)
-class AlternativeSettings:
-    """The settings of the alternative maps, which docs/how_it_works.md explains.
-
-    Lengths are in units of the square root of the area. Tables R1, R2, … are in `docs/research_log.md`.
-
-    **Attributes:**
-
-    - `samples`: the number of samples of each shape, at least 1.
-    - `radii`: the radii of SHOT in units of 0.06, as one tuple of positive integers per initial map from SHOT
-      alone.
-    - `compared_pairings`: the largest number of pairings of extremities whose features are compared.
-    - `pairings` (Tables R27 and R40): the number of initial maps from pairings of extremities, at least 0.
-    - `distance_weight`: the weight of the distances to extremities in features. SHOT has the weight 1.
-    - `position_weight`: the weight of the positions along the principal axes in features.
-    - `levels`, `descriptors`: the levels and the number of descriptors of the feature regression that refines
-      the initial maps.
-    - `crease_eigenvectors` (Table R45): the number of crease eigenvectors in the second attempt. With 0,
-      there is no second attempt.
-    - `repaired`: the number of refined maps whose faults are repaired, at least 0.
-    - `fine_levels` (Table R40): the levels of the second refinement of promising maps. As many levels as in
-      `levels` need no further program.
-    - `coarse_margin`: a map is promising if its score exceeds the best score by at most this number.
-    - `promising`: the largest number of promising maps, at least 1.
-    - `eigenvectors`: the number of eigenvectors from which the distortion of refined maps is computed.
-    - `patch_radius` (Table R28): the radius of the patches on which the deformation is measured.
-    - `different_distance`: two maps differ at a sample if the distance between its two matches along the
-      surface exceeds this value. Between connected components, the Euclidean distance counts.
-    - `different_areas` (Table R27): shares of X's area, each above 0. The second alternative map must differ
-      from all earlier ones on the first share, the third map on the second share, and so on. The last share
-      also applies to all further maps.
-    - `margin` (Table R28): the largest difference of scores between the best map and a returned map, after
-      the second refinement. Several maps are returned, because a wrong map can have the best score.
-
-    **Raises:** `InputError` if a number is out of its range, or if a tuple is empty.
-    """
-
-    samples: int = 1000
-    radii: tuple[tuple[int, ...], ...] = ((1,), (1, 2, 4), (2, 4))
-    compared_pairings: int = 64
-    pairings: int = 12
-    distance_weight: float = 2.25
-    position_weight: float = 10.0
-    levels: tuple[int, ...] = (8, 8, 11, 11, 15, 15, 20, 20, 26, 35)
-    descriptors: int = 30
-    crease_eigenvectors: int = 20
-    repaired: int = 3
-    fine_levels: tuple[int, ...] = (20, 20, 26, 26, 35, 35, 35, 35, 35, 35)
-    coarse_margin: float = 1.5
-    promising: int = 6
-    eigenvectors: int = 50
-    patch_radius: float = 0.2
-    different_distance: float = 0.2
-    different_areas: tuple[float, ...] = (0.03, 0.03, 0.2)
-    margin: float = 1.5
-
-    def __post_init__(self) -> None:
-        least = {"samples": 1, "pairings": 0, "crease_eigenvectors": 0, "repaired": 0, "promising": 1}
-        for name, number in least.items():
-            check_whole_number(name, getattr(self, name), number)
-        for name in ("levels", "fine_levels", "different_areas"):
-            values = getattr(self, name)
-            if not values or min(values) <= 0:
-                raise InputError(f"{name} is {values}: give at least one number, and only positive numbers.")
-
-
-@dataclass(frozen=True)
-class JudgeSettings:
-    """The settings by which maps are judged without ground truth.
-
-    docs/how_it_works.md explains distortions, faults and scores. Areas are shares of X's area, from 0 to 1.
-
-    **Attributes:**
-
-    - `suspicious` (Table R3): a positive number, usually above 1. A map with a distortion of at least this
-      value is suspicious and is repaired. Correct maps between poses of one body have smaller distortions.
-    - `suspicious_area` (Table R28): a map is also suspicious if a fault covers at least this share.
-    - `doubtful` (Table R3): after repair, a map without faults looks right if its distortion is below this
-      value. A value below `suspicious` has no effect. Between non-isometric shapes, some correct maps have
-      distortions up to this value.
-    - `negligible_area`: faults up to this share are not repaired. Small faults, such as at fingertips, appear
-      and disappear by chance.
-    - `excessive_area`: faults from this share on are not repaired. If most of a body is mapped upside down,
-      the rest of the map does not suffice to find the correct map.
-    - `uncertainty_weight`, `deformation_weight` (Table R28): the weights of the uncertainty and of the
-      deformation in the score, at least 0. The logarithm of the distortion has the weight 1.
-    - `scores`: the settings of the distortion and of the faults, a `ScoreSettings`.
-
-    **Raises:** `InputError` if a number is out of its range.
-    """
-
-    suspicious: float = 1.12
-    suspicious_area: float = 0.02
-    doubtful: float = 1.15
-    negligible_area: float = 0.002
-    excessive_area: float = 0.5
-    uncertainty_weight: float = 30.0
-    deformation_weight: float = 5.0
-    scores: ScoreSettings = ScoreSettings()
-
-    def __post_init__(self) -> None:
-        for name in ("suspicious_area", "negligible_area", "excessive_area"):
-            check_number(name, getattr(self, name), most=1.0)
-        for name in ("uncertainty_weight", "deformation_weight"):
-            check_number(name, getattr(self, name))
-        for name in ("suspicious", "doubtful"):
-            check_number(name, getattr(self, name), positive=True)
-
-
-WITHOUT_REPAIR = JudgeSettings(suspicious=1.25, suspicious_area=1.0, doubtful=1.25)
-"""The settings by which `match` judges the map of a preset that has no repair. (Entry R25)"""
-
-
-@dataclass(frozen=True)
-class RepairSettings:
-    """The settings that determine how maps are repaired, and when a repaired map looks wrong.
-
-    The settings are passed as `Preset(first, repeated, repair=RepairSettings(...))` and take effect in
-    `jaxsmw.match`. docs/how_it_works.md explains the steps of the repair. Tables and entries R1, R2, … are in
+    The settings are passed as `Preset(first, repeated, search=SearchSettings(...))` and take effect in
+    `jaxsmw.match`. docs/how_it_works.md explains the search. Tables and entries R1, R2, ... are in
     `docs/research_log.md`.
 
     **Attributes:**
 
-    - `compared` (Table R40): a positive number, usually above 1. A map of two full shapes with a distortion
-      of at least this value is compared with alternative maps, even if it is not suspicious.
-    - `rounds` (Table R5): the largest number of rounds of repair, at least 0.
-    - `finalists`: the largest number of alternative maps that are refined at all vertices, at least 0.
+    - `certain`: a probability. If the map of the first start is right with at least this probability, no
+      other map is tried. With 0, the first map is always taken.
+    - `finalists`: the largest number of maps that are refined at all vertices after the race, at least 1.
+    - `likely`: a share. A map of the race is refined at all vertices only if its probability is at least this
+      share of the best one.
     - `non_isometric` (Table R29): a number of at least 0. Two full shapes whose map has an area-based shape
       difference of at least this value are refined by further passes.
     - `passes` (Table R29): the number of usual passes, at least 0.
-    - `pass_tolerance` (Table R40): a number of at least 0. If all passes together increase the score without
-      the deformation by more than this value, the map before the passes is kept.
-    - `rival_margin` (entries R36 and R48): a number of at least 0. An outcome of repair whose score is worse
-      by at most this value is a rival, from which the passes also run. To replace a map that still looks
-      wrong after repair, the score of a rival must be better by more than this value.
+    - `pass_tolerance`: a number of at least 0. If all passes together lower the log-odds that the map is
+      right by more than this value, the map before the passes is kept.
     - `without_creases_from` (entry R47): a number of at least 0. From this area-based shape difference on,
       the passes use no crease eigenvectors.
     - `coarse_from` (Table R32): a number of at least 0. From this area-based shape difference on, coarse
       passes and a single usual pass run instead. A value below `non_isometric` has the same effect as
-      `non_isometric`. For two full shapes with the initial map `"aligned"`, coarse passes always run
-      (entry R24).
+      `non_isometric`.
     - `coarse_levels` (Table R32): the levels of the last repeated stage in each coarse pass, as one tuple per
       pass. Tuples with the same length and the same maximum share a compiled program.
-    - `aligned_preference` (entry R24): a number of at least 0. With `init="auto"`, asymmetric shapes are
-      matched from the initial maps `"shot"` and `"aligned"`. The map from `"shot"` is chosen if its mean
-      expected error is below this multiple of the other map's. Both expected errors are computed with
-      `ExpectedErrorSettings(area_weight=0)`, and before further passes.
     - `cut_shortcuts` (Table R41): whether a mesh is cut before it is matched, where its surface is fused with
       itself; see `jaxsmw.geometry.cut_shortcuts`.
     - `trims` (Table R46): the number of times that the larger shape of a partial pair is trimmed to the
@@ -245,44 +109,34 @@ class RepairSettings:
     - `trimmed_area` (Table R46): a positive number. The larger shape is trimmed to this multiple of the
       smaller area. The faces at the boundary of the kept region add to this area.
     - `trimmed_levels` (Table R46): the levels of the last stage on a trimmed pair, if its refiner has levels.
-    - `alternatives`: the settings of the alternative maps, an `AlternativeSettings`.
-    - `judge`: the settings by which maps are judged, a `JudgeSettings`.
 
     **Raises:** `InputError` if a number is out of its range.
     """
 
-    compared: float = 1.05
-    rounds: int = 4
-    finalists: int = 4
+    certain: float = 0.9
+    finalists: int = 3
+    likely: float = 0.05
     non_isometric: float = 0.14
     passes: int = 2
-    pass_tolerance: float = 0.35
-    rival_margin: float = 0.35
+    pass_tolerance: float = 1.0
     without_creases_from: float = 0.18
     coarse_from: float = 0.3
     coarse_levels: tuple[tuple[int, ...], ...] = ((12, 20, 35, 60), (20, 35, 60, 60))
-    aligned_preference: float = 0.9
     cut_shortcuts: bool = True
     trims: int = 2
     trimmed_from: float = 1.25
     trimmed_area: float = 1.05
     trimmed_levels: tuple[int, ...] = (10, 30, 80, 200)
-    alternatives: AlternativeSettings = AlternativeSettings()
-    judge: JudgeSettings = JudgeSettings()
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "finalists", "passes", "trims"):
+        check_whole_number("finalists", self.finalists, 1)
+        for name in ("passes", "trims"):
             check_whole_number(name, getattr(self, name), 0)
-        for name in (
-            "non_isometric",
-            "pass_tolerance",
-            "rival_margin",
-            "without_creases_from",
-            "coarse_from",
-            "aligned_preference",
-        ):
+        for name in ("certain", "likely"):
+            check_number(name, getattr(self, name), most=1.0)
+        for name in ("non_isometric", "pass_tolerance", "without_creases_from", "coarse_from"):
             check_number(name, getattr(self, name))
-        for name in ("compared", "trimmed_from", "trimmed_area"):
+        for name in ("trimmed_from", "trimmed_area"):
             check_number(name, getattr(self, name), positive=True)
         if not isinstance(self.cut_shortcuts, bool):
             raise InputError(f"cut_shortcuts is {self.cut_shortcuts!r}: give True or False.")

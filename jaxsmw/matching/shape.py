@@ -95,9 +95,14 @@ class PreparedShape:
         descriptors = namespace(self.spectrum.eigenvectors).asarray(everywhere)
         return replace(self, spectrum=self.spectrum.with_descriptors(descriptors))
 
+    def without_descriptors(self) -> PreparedShape:
+        """Return the shape without descriptors."""
+        return replace(self, spectrum=self.spectrum.with_descriptors(None))
+
     def mirrored(self) -> PreparedShape:
-        """Return the mirror image of a shape without descriptors."""
-        return replace(self, mesh=self.mesh.mirrored(), spectrum=self.spectrum.reflect())
+        """Return the mirror image, without descriptors, because those of a mirror image differ."""
+        spectrum = self.spectrum.reflect().with_descriptors(None)
+        return replace(self, mesh=self.mesh.mirrored(), spectrum=spectrum)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the shape as arrays, for a file."""

@@ -15,7 +15,7 @@ from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.geometry.shot import SHOT_DIMENSION
-from jaxsmw.matching.settings import WITHOUT_REPAIR, JudgeSettings, RepairSettings
+from jaxsmw.matching.settings import SearchSettings
 
 
 class _FromRefiner(int):
@@ -181,33 +181,34 @@ class Sizes(NamedTuple):
 
 @dataclass(frozen=True)
 class Preset:
-    """Stages of refinement and settings of the repair, for the argument `preset` of `jaxsmw.match`.
+    """Stages of refinement and settings of the search, for the argument `preset` of `jaxsmw.match`.
 
     The stages run in the order `first`, `repeated`, `final`, and each stage starts from the map of the
-    previous stage. A map is judged before the final stages run. Repair runs the repeated stages again.
+    previous stage. A map is judged before the final stages run. The search runs the repeated stages again.
     `jaxsmw.PRESETS` contains three ready presets.
 
     **Attributes:**
 
-    - `first`: a tuple of stages that run once, before the repeated stages. Without repair, these can be all
+    - `first`: a tuple of stages that run once, before the repeated stages. Without a search, these can be all
       stages.
-    - `repeated`: a tuple of stages that repair runs again. Without repair, they run once.
-    - `final`: a tuple of stages that run once, after repair (Table R42).
-    - `repair`: the `RepairSettings` that determine when and how a map is repaired; None (the default) for no
-      repair.
+    - `repeated`: a tuple of stages that the search runs again. Without a search, they run once.
+    - `final`: a tuple of stages that run once, after the search (Table R42).
+    - `search`: the `SearchSettings` that determine how the right map is searched for; None (the default) to
+      take the first map.
     - `large`: the preset that is used instead if both meshes have at least 15 000 vertices; None (the
       default) to use this preset for meshes of any size.
 
-    **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if there is repair,
-    but no repeated stage. `InputError` is also raised if one of these rules is broken. The last stage, and
-    the last stage before the final stages, must not end on samples. If a stage ends on samples, the next
-    stage must start on samples, and must not have more samples. The last repeated stage must have levels.
+    **Raises:** `InputError` if there is no stage, if an attribute has the wrong type, or if there is a
+    search, but no repeated stage. `InputError` is also raised if one of these rules is broken. The last
+    stage, and the last stage before the final stages, must not end on samples. If a stage ends on samples,
+    the next stage must start on samples, and must not have more samples. The last repeated stage must have
+    levels.
     """
 
     first: tuple[Stage, ...] = ()
     repeated: tuple[Stage, ...] = ()
     final: tuple[Stage, ...] = ()
-    repair: RepairSettings | None = None
+    search: SearchSettings | None = None
     large: Preset | None = None
 
     def __post_init__(self) -> None:
@@ -215,8 +216,8 @@ class Preset:
             stages = getattr(self, name)
             if not isinstance(stages, tuple) or not all(isinstance(stage, Stage) for stage in stages):
                 raise InputError(f"{name} is {stages!r}: give a tuple of stages.")
-        if self.repair is not None and not isinstance(self.repair, RepairSettings):
-            raise InputError(f"repair is {self.repair!r}: give RepairSettings or None.")
+        if self.search is not None and not isinstance(self.search, SearchSettings):
+            raise InputError(f"search is {self.search!r}: give SearchSettings or None.")
         if self.large is not None and not isinstance(self.large, Preset):
             raise InputError(f"large is {self.large!r}: give a Preset or None.")
         _check_order(self.stages)
@@ -228,14 +229,14 @@ class Preset:
                     "the last stage before the final stages ends on samples, but its map is judged at all "
                     "vertices: use the default."
                 )
-        if self.repair is None:
+        if self.search is None:
             return
         if not self.repeated:
-            raise InputError("repair has no stage to repeat: give the preset repeated stages.")
+            raise InputError("the search has no stage to repeat: give the preset repeated stages.")
         if not self.repeated[-1].refiner.levels:
             raise InputError(
-                f"repair repeats a stage of {type(self.repeated[-1].refiner).__name__}, which has no levels: "
-                "let the repeated stages end with a refiner with levels, such as Registration."
+                f"the search repeats a stage of {type(self.repeated[-1].refiner).__name__}, which has no "
+                "levels: let the repeated stages end with a refiner with levels, such as Registration."
             )
 
     @property
@@ -245,7 +246,7 @@ class Preset:
 
     @property
     def before_final(self) -> tuple[Stage, ...]:
-        """The stages before the final stages, whose map is judged and repaired."""
+        """The stages before the final stages, whose map is judged."""
         return self.first + self.repeated
 
     def fitted(self, number_of_vertices: int) -> Preset:
@@ -274,13 +275,6 @@ class Preset:
             return replace(self, repeated=recorded(self.repeated))
         return replace(self, first=recorded(self.first))
 
-    def without_alternatives(self) -> Preset:
-        """Return the preset whose repair tries no alternative maps."""
-        if self.repair is None:
-            return self
-        large = None if self.large is None else self.large.without_alternatives()
-        return replace(self, repair=replace(self.repair, finalists=0), large=large)
-
     def without_descriptors(self) -> Preset:
         """Return the preset with stages that use no descriptors."""
         return self._with_stages(Stage.without_descriptors)
@@ -291,14 +285,9 @@ class Preset:
         return replace(self, first=first, repeated=repeated, final=final, large=large)
 
     @property
-    def criteria(self) -> JudgeSettings:
-        """The settings by which maps are judged. Without repair, only grossly distorted maps look wrong."""
-        return WITHOUT_REPAIR if self.repair is None else self.repair.judge
-
-    @property
     def cuts_shortcuts(self) -> bool:
-        """Whether meshes are cut where they are fused with themselves; see `RepairSettings.cut_shortcuts`."""
-        return self.repair is not None and self.repair.cut_shortcuts
+        """Whether meshes are cut where they are fused with themselves; see `SearchSettings.cut_shortcuts`."""
+        return self.search is not None and self.search.cut_shortcuts
 
     @property
     def sizes(self) -> Sizes:
@@ -355,7 +344,7 @@ PRESETS: dict[PresetName, Preset] = {
         (_WAVELETS,),
         (_REGRESSION, _REGISTRATION),
         (_FINAL,),
-        RepairSettings(),
+        search=SearchSettings(),
         # On large meshes, searches that match all vertices take most of the time. Crease eigenvectors are
         # left out, because they need the exact eigensolver.
         large=Preset(
@@ -365,7 +354,7 @@ PRESETS: dict[PresetName, Preset] = {
                 replace(_REGISTRATION, starts_on_samples=True),
             ),
             (replace(_FINAL, number_of_samples=1000, starts_on_samples=True),),
-            RepairSettings(),
+            search=SearchSettings(),
         ),
     ),
 }
@@ -373,10 +362,10 @@ PRESETS: dict[PresetName, Preset] = {
 
 `"paper"` has the settings of the MWP paper: one stage of `WaveletPreservation` with 100 eigenvectors and 3
 iterations. `"fast"` has the same stage with iterations on 500 samples of each shape, as in the fast variant
-of the MWP authors' program. `"accurate"` has four stages and repair: the stage of `"paper"`,
+of the MWP authors' program. `"accurate"` has four stages and a search: the stage of `"paper"`,
 `FeatureRegression` with up to 35 eigenvectors, and `Registration` with up to 200 eigenvectors, twice. The
-fourth stage runs once, after repair. If both meshes have at least 15 000 vertices, all stages of `"accurate"`
-iterate on 1000 samples. `docs/accuracy.md` reports the errors of `"accurate"`.
+fourth stage runs once, after the search. If both meshes have at least 15 000 vertices, all stages of
+`"accurate"` iterate on 1000 samples. `docs/accuracy.md` reports the errors of `"accurate"`.
 """
 
 

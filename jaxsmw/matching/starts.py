@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, get_args
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float, Int, Int64
@@ -80,22 +80,13 @@ def make_start(prepared: PreparedPair, init: InitialMap | ArrayLike | SurfacePoi
     init = check_initial_map(prepared.pair, init)
     mesh_x = prepared.pair.mesh_x
     if isinstance(init, str):
-        features, has_alternatives, is_rigid = METHODS[init]
-        matches = nearest_map(prepared, _finite(prepared, init, features(prepared)))
-        pointwise_map = extend_to_unreferenced(mesh_x, matches)
-        return Start(pointwise_map, init, has_alternatives=has_alternatives, is_rigid=is_rigid)
+        matches = nearest_map(prepared, _finite(prepared, init, METHODS[init](prepared)))
+        return Start(extend_to_unreferenced(mesh_x, matches), init)
     if init.ndim == 1:
         return Start(extend_to_unreferenced(mesh_x, init), "map")
     matches = nearest_map(prepared, _finite(prepared, "landmark", _landmark_features(prepared, init)))
     matches[init[:, 0]] = init[:, 1]
     return Start(extend_to_unreferenced(mesh_x, matches), "landmarks")
-
-
-def make_starts(
-    prepared: PreparedPair, init: InitialMap | ArrayLike | SurfacePoints, *, rigid: bool
-) -> list[Start]:
-    """Return the start from `init` and, if the shapes may differ in form only, the start from `"aligned"`."""
-    return [make_start(prepared, one) for one in ((init, "aligned") if rigid else (init,))]
 
 
 def check_initial_map(
@@ -227,30 +218,18 @@ def _aligned_features(prepared: PreparedPair) -> _Features:
     return of_x, of_y
 
 
-class InitialMethod(NamedTuple):
-    """How an initial map with a name is computed: by the nearest neighbours in features.
-
-    **Attributes:**
-
-    - `features`: the function that computes the features of X (a, d) and of Y (b, d) at the compared
-      vertices.
-    - `has_alternatives`, `is_rigid`: see `Start`.
-    """
-
-    features: Callable[[PreparedPair], _Features]
-    has_alternatives: bool = False
-    is_rigid: bool = False
-
-
-METHODS: dict[InitialMap, InitialMethod] = {
-    "shot": InitialMethod(_shot_features, has_alternatives=True),
-    "wks": InitialMethod(partial(_signature_features, wave_kernel_signature)),
-    "hks": InitialMethod(partial(_signature_features, heat_kernel_signature)),
-    "wavelet": InitialMethod(partial(_signature_features, wavelet_signature)),
-    "functional": InitialMethod(_functional_features),
-    "aligned": InitialMethod(_aligned_features, is_rigid=True),
+METHODS: dict[InitialMap, Callable[[PreparedPair], _Features]] = {
+    "shot": _shot_features,
+    "wks": partial(_signature_features, wave_kernel_signature),
+    "hks": partial(_signature_features, heat_kernel_signature),
+    "wavelet": partial(_signature_features, wavelet_signature),
+    "functional": _functional_features,
+    "aligned": _aligned_features,
 }
-"""A dictionary from the name of each initial map to its `InitialMethod`."""
+"""A dictionary from the name of each initial map to the function that computes its features.
+
+The features of X (a, d) and of Y (b, d) at the compared vertices are matched by nearest neighbours.
+"""
 
 # Distances to landmarks, in units of the square root of the area, are multiplied by this weight. A distance
 # of half a unit becomes 1, which is the norm of a SHOT descriptor. On pairs of real bodies, weights from 1 to

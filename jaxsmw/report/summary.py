@@ -89,9 +89,10 @@ def write_report(
 ) -> list[Path]:
     """Write pictures of a match, an interactive page and a summary to a directory.
 
-    The function writes `report.html`, an interactive page with both bodies, the map and the initial map. It
-    also writes `correspondence.png`, `functional_map.png` and `summary.json`, `filters.png` if a stage has
-    filters, and `quality.png` if errors are given. The report contains the expected error.
+    The function writes `report.html`, an interactive page with both bodies, the map, the initial map and
+    other maps that could be right. It also writes `correspondence.png`, `functional_map.png` and
+    `summary.json`, `filters.png` if a stage has filters, and `quality.png` if errors are given. The report
+    contains the expected error.
 
     **Arguments:**
 
@@ -150,6 +151,10 @@ def write_report(
         "distortion": correspondence.distortion,
         "suspicious": correspondence.suspicious,
         "wrong_probability": correspondence.wrong_probability(),
+        "alternatives": [
+            {"difference": other.difference, "probability": other.probability}
+            for other in correspondence.alternatives
+        ],
         "errors": {name: error.as_dictionary() for name, error in errors.items()},
         "seconds": {**steps, "total": sum(steps.values())},
         "provenance": provenance(),
@@ -160,7 +165,7 @@ def write_report(
 
 
 def _shown_maps(correspondence: Correspondence, errors: Mapping[str, GeodesicError]) -> dict[str, ShownMap]:
-    """Return the refined map and the initial map, as the page shows them."""
+    """Return the refined map, the initial map and other maps that could be right, as the page shows them."""
     spectra = correspondence.spectrum_x, correspondence.spectrum_y
     convention = correspondence.preset.stages[-1].refiner.convention
     last = list(errors.values())[-1] if errors else None
@@ -168,9 +173,16 @@ def _shown_maps(correspondence: Correspondence, errors: Mapping[str, GeodesicErr
     initial_map = correspondence.initial_map
     encoded = _encoded(initial_map, *spectra, convention)
     expected = {EXPECTED_ERROR: correspondence.expected_error()}
+    others = {
+        f"other {number}: {other.difference} ({percentage(other.probability)})": _shown_map(
+            other.pointwise_map, _encoded(other.pointwise_map, *spectra, convention), None, convention
+        )
+        for number, other in enumerate(correspondence.alternatives, 1)
+    }
     return {
         "refined": replace(refined, errors={**refined.errors, **expected}),
         "initial": _shown_map(initial_map, encoded, errors.get("initial"), convention),
+        **others,
     }
 
 
@@ -354,21 +366,15 @@ def summarize(
         "iterations": str(correspondence.iterations),
         "refined by": {"numpy": "NumPy", "jax": "JAX"}[correspondence.backend],
     }
-    if correspondence.mirrored or correspondence.mirror_evidence is not None:
-        evidence = correspondence.mirror_evidence
-        facts["source mirrored"] = ("yes" if correspondence.mirrored else "no") + (
-            "" if evidence is None else f" (evidence {evidence:+.2f})"
-        )
+    if correspondence.mirrored:
+        facts["source mirrored"] = "yes"
     for name, error in errors.items():
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
-    limit, suspicion = correspondence.preset.criteria.suspicious, ""
-    if correspondence.suspicious and correspondence.distortion >= limit:
-        suspicion = f"; above {limit} limbs may be swapped"
-    facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}{suspicion}"
+    facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}"
     expected = correspondence.mesh_x.average(correspondence.expected_error())
     facts["expected error, mean"] = f"{expected:.4f} √area"
-    facts["probability of a wrong part"] = percentage(correspondence.wrong_probability())
+    facts["probability of a wrong map"] = percentage(correspondence.wrong_probability())
     if correspondence.left_out:
         facts["small components without counterpart"] = f"{correspondence.left_out:.1%} of the source's area"
     steps = correspondence.seconds if seconds is None else seconds

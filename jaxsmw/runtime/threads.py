@@ -1,4 +1,4 @@
-"""Limits the number of linear-algebra threads, and runs two computations side by side."""
+"""Limits the number of linear-algebra threads, and runs computations side by side."""
 
 from __future__ import annotations
 
@@ -30,11 +30,10 @@ def _libraries() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def side_by_side(compute: Callable[[Side], Result], x: Side, y: Side) -> tuple[Result, Result]:
-    """Return the results of a function for X and for Y, computed at the same time in two threads."""
+def side_by_side(compute: Callable[[Side], Result], *sides: Side) -> tuple[Result, ...]:
+    """Return the results of a function for X and for Y, or for more arguments, computed in two threads."""
     # Both threads share one context of `one_blas_thread`. With one context per thread, the first thread to
     # end would also remove the limit for the other thread.
     with one_blas_thread(), ThreadPoolExecutor(2) as executor:
-        futures = [executor.submit(copy_context().run, compute, side) for side in (x, y)]
-        result_x, result_y = (future.result() for future in futures)
-    return result_x, result_y
+        futures = [executor.submit(copy_context().run, compute, side) for side in sides]
+        return tuple(future.result() for future in futures)

@@ -14,8 +14,8 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
 from jaxsmw.geometry.scans import in_small_components
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import Judge, Scored, detours
-from jaxsmw.matching.outcome import Start
+from jaxsmw.matching.judge import detours
+from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.shape import prepare_shapes
@@ -72,17 +72,17 @@ def trimmed_stage(pair: Pair, preset: Preset) -> Stage | None:
     **Returns:** The stage, or None if the pair is not trimmed. A pair is trimmed only if it is a partial pair
     and the larger area is at least `trimmed_from` times the smaller area.
     """
-    repair = preset.repair
-    if repair is None or repair.trims == 0 or not pair.partial:
+    settings = preset.search
+    if settings is None or settings.trims == 0 or not pair.partial:
         return None
-    if max(pair.areas) < repair.trimmed_from * min(pair.areas):
+    if max(pair.areas) < settings.trimmed_from * min(pair.areas):
         return None
-    return preset.stages[-1].coarsened(repair.trimmed_levels)
+    return preset.stages[-1].coarsened(settings.trimmed_levels)
 
 
 def match_trimmed(
-    prepared: PreparedPair, preset: Preset, scored: Scored
-) -> tuple[PreparedPair, Scored] | None:
+    prepared: PreparedPair, preset: Preset, outcome: Outcome
+) -> tuple[PreparedPair, Outcome] | None:
     """Trim the larger shape of a partial pair, and match the pair again by the last stage.
 
     After trimming, both shapes cover nearly the same region, so their eigenfunctions are similar; see
@@ -91,33 +91,32 @@ def match_trimmed(
     **Arguments:**
 
     - `prepared`: the prepared pair.
-    - `preset`: the stages and the repair.
-    - `scored`: the map of `preset.before_final`, after repair.
+    - `preset`: the stages and the settings of the search.
+    - `outcome`: the successful outcome of the search.
 
-    **Returns:** The trimmed pair and its map, or None if the pair is not trimmed. The attribute `suspicious`
-    is copied from the given map.
+    **Returns:** The trimmed pair and its outcome, or None if the pair is not trimmed.
     """
-    repair, following = preset.repair, trimmed_stage(prepared.pair, preset)
-    if repair is None or following is None or not scored.successful:
+    settings, following = preset.search, trimmed_stage(prepared.pair, preset)
+    if settings is None or following is None:
         return None
     trimmed_match, given = None, prepared.pair
-    for _ in range(repair.trims):
-        reverse = extend_to_unreferenced(prepared.pair.mesh_y, scored.outcome.last.reverse_map())
-        pair = trimmed(given, _everywhere(prepared, scored), reverse, repair.trimmed_area)
-        again = _matched_again(prepared, pair, following, preset, scored)
+    for _ in range(settings.trims):
+        reverse = extend_to_unreferenced(prepared.pair.mesh_y, outcome.last.reverse_map())
+        pair = trimmed(given, _everywhere(prepared, outcome), reverse, settings.trimmed_area)
+        again = _matched_again(prepared, pair, following, outcome)
         if again is None:
             break
-        prepared, scored = trimmed_match = again
+        prepared, outcome = trimmed_match = again
     return trimmed_match
 
 
-def _everywhere(prepared: PreparedPair, scored: Scored) -> Int64[np.ndarray, " m"]:
-    return extend_to_unreferenced(prepared.pair.mesh_x, scored.pointwise_map)
+def _everywhere(prepared: PreparedPair, outcome: Outcome) -> Int64[np.ndarray, " m"]:
+    return extend_to_unreferenced(prepared.pair.mesh_x, outcome.pointwise_map)
 
 
 def _matched_again(
-    prepared: PreparedPair, pair: Pair, stage: Stage, preset: Preset, scored: Scored
-) -> tuple[PreparedPair, Scored] | None:
+    prepared: PreparedPair, pair: Pair, stage: Stage, outcome: Outcome
+) -> tuple[PreparedPair, Outcome] | None:
     """Run a stage on a trimmed pair from a map. Return None after a failure."""
     logger.info("the larger shape is trimmed and matched again ...")
     try:
@@ -127,13 +126,8 @@ def _matched_again(
         logger.info("the map is kept as it was before trimming: %s", error)
         return None
     nearest = extend_to_unreferenced(pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
-    start = Start(nearest[_everywhere(prepared, scored)])
-    again = run([stage], trimmed_pair.spectra, start)
-    if not again.successful:
-        return None
-    judge = Judge(pair, again.last.seen, preset.criteria)
-    outcome = scored.outcome.followed_by(again)
-    return trimmed_pair, judge.measured(outcome, suspicious=scored.suspicious)
+    again = run([stage], trimmed_pair.spectra, Start(nearest[_everywhere(prepared, outcome)]))
+    return (trimmed_pair, outcome.followed_by(again)) if again.successful else None
 
 
 def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage) -> PreparedPair:

@@ -1,3 +1,5 @@
+"""Hypotheses, and the extremities of bodies from which some of them follow."""
+
 import numpy as np
 import pytest
 from synthetic import body_with_arms, sphere_mesh
@@ -6,14 +8,14 @@ from jaxsmw import creature_pair
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching.search.proxies import Proxy, extremities, plausible_pairings
+from jaxsmw.matching.search.hypotheses import extremities, plausible_pairings
+from jaxsmw.matching.search.proxies import Proxy
+from jaxsmw.matching.shape import PreparedShape
 
 
 def reduced(mesh):
-    samples = farthest_point_samples(mesh, min(1000, len(mesh.vertices)))
-    return Proxy(mesh, compute_spectrum(mesh, 4), SurfaceSamples.along_surface(mesh, samples), mesh.area**0.5)
+    return Proxy(PreparedShape.of(mesh, compute_spectrum(mesh, 4)), mesh.area**0.5)
 
 
 def ends_of(mesh):

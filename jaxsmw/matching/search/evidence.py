@@ -1,0 +1,90 @@
+"""The judge: what shows without ground truth whether a map is right, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsmw.geometry.alignment import nearest_rotations
+from jaxsmw.matching.search.proxies import SampleMap
+from jaxsmw.matching.search.reading import Reading
+
+# The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py). The
+# number `_LEAST` is added to the deformation, because even right maps of samples have such a deformation.
+_INTERCEPT, _DEFORMATION, _DISSIMILARITY, MIRRORED = -3.7, -3.9, -5.5, -5.1
+_LEAST = 0.01
+
+
+class Evidence(NamedTuple):
+    """What shows whether a map is right, measured on the samples.
+
+    **Attributes:**
+
+    - `deformation`: how far the map is from a rigid motion around each sample, from 0 to 1; see
+      `deformation`.
+    - `dissimilarity`: the mean squared difference between the SHOT descriptors of samples and of their
+      matches, divided by its mean for random matches. It is 0 for congruent shapes.
+    - `mirrored`: whether X is mirrored. Most pairs are of the same hand, or their own mirror images.
+    """
+
+    deformation: float
+    dissimilarity: float
+    mirrored: bool
+
+    @classmethod
+    def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
+        """Measure a map of samples (s,)."""
+        x, y = (np.asarray(spectrum.descriptors) for spectrum in reading.spectra.both)
+        # The descriptors are principal components of variance 1.
+        differences = ((x - y[matches]) ** 2).mean(axis=1) / 2
+        areas = reading.x.areas
+        return cls(
+            float(areas @ deformation(reading, matches)), float(areas @ differences), reading.x.mirrored
+        )
+
+    @property
+    def log_odds(self) -> float:
+        """The logarithm of the odds that the map is right, rather than none."""
+        return float(
+            _INTERCEPT
+            + _DEFORMATION * np.log(self.deformation + _LEAST)
+            + _DISSIMILARITY * self.dissimilarity
+            + MIRRORED * self.mirrored
+        )
+
+
+def probabilities(log_odds: Sequence[float]) -> Float[np.ndarray, " c"]:
+    """Return the probability of each of several different maps to be right, given the log-odds of each (c,).
+
+    At most one of the maps is right, and perhaps none, as in a multinomial logistic regression.
+    """
+    largest = max([0.0, *log_odds])
+    odds = np.exp(np.asarray(log_odds) - largest)
+    return odds / (odds.sum() + np.exp(-largest))
+
+
+def deformation(reading: Reading, matches: SampleMap) -> Float[np.ndarray, " s"]:
+    """Measure how far a map deviates from a rigid motion on the patch around each sample of X.
+
+    A rotation and a translation carry the patch as close as possible to its matches. The deformation is the
+    mean squared distance that remains, divided by the size of the patch. The size is the variance of the
+    patch's positions plus the variance of its matches.
+
+    A map that bends a body at its joints deforms most patches little. A mirrored map deforms most patches,
+    because no rotation undoes a reflection. Upside-down maps also deform most patches. The deformation is an
+    "as-rigid-as-possible" energy (Sorkine, Alexa 2007).
+
+    **Returns:** The deformation of each patch (s,), from 0 for a rigid motion to at most 1.
+    """
+    source, target = reading.x.positions, reading.y.positions[matches]
+    products = np.einsum("sa,sb->sab", source, target).reshape(-1, 9)
+    squares = np.sum(source**2 + target**2, axis=1, keepdims=True)
+    columns = reading.patches @ np.hstack([source, target, products, squares])
+    mean_x, mean_y = columns[:, :3], columns[:, 3:6]
+    moments = columns[:, 6:15].reshape(-1, 3, 3) - np.einsum("sa,sb->sab", mean_x, mean_y)
+    size = columns[:, 15] - np.sum(mean_x**2 + mean_y**2, axis=1)
+    _, traces = nearest_rotations(moments)
+    return np.clip((size - 2 * traces) / np.maximum(size, np.finfo(float).tiny), 0, 1)

@@ -1,0 +1,185 @@
+"""Hypotheses: cheap and different maps of samples, one of which leads to the right map.
+
+Each function in `HYPOTHESES` is one kind of hypothesis. It takes a `Reading` and yields maps of samples. A
+new kind is one more function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64
+from scipy.spatial import KDTree
+
+from jaxsmw.geometry.alignment import alignments
+from jaxsmw.matching.search.proxies import Proxy, SampleMap
+from jaxsmw.matching.search.reading import Reading
+
+# The sets of radii of SHOT, in units of 0.06, that give one hypothesis each.
+_SHOT_RADII = ((1,), (1, 2, 4), (2, 4), (4, 8))
+# The weights of positions after an alignment, of positions along principal axes, and of the relative
+# distances to extremities. SHOT has the weight 1.
+_ALIGNED, _ALONG_AXES, _TO_EXTREMITIES = 9.0, 10.0, 2.25
+# The number of alignments that differ from each other, and of pairings of extremities: of the most plausible
+# ones, those with the most similar features.
+_ALIGNMENTS, _PLAUSIBLE, _PAIRINGS = 4, 64, 6
+# The identity and the half turns about the three principal axes, as factors of the three coordinates.
+_HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
+
+
+def by_descriptors(reading: Reading) -> Iterator[SampleMap]:
+    """Match samples with similar SHOT of several radii."""
+    for radii in _SHOT_RADII:
+        of_x, of_y = (np.hstack([side.shot(radius) for radius in radii]) for side in (reading.x, reading.y))
+        yield _squares(of_x, of_y).argmin(axis=1)
+
+
+def by_alignment(reading: Reading) -> Iterator[SampleMap]:
+    """Align X rigidly with Y in several ways, and match samples that are near and have similar SHOT."""
+    x, y = reading.x, reading.y
+    shot = _shot_squares(reading)
+    for motion in alignments(x.positions, y.positions, _ALIGNMENTS):
+        yield (shot + _ALIGNED * _squares(motion.apply(x.positions), y.positions)).argmin(axis=1)
+
+
+def by_given_positions(reading: Reading) -> Iterator[SampleMap]:
+    """Match samples at the nearest given positions, in case the meshes were aligned by their owner."""
+    if not reading.x.mirrored:
+        placed = [side.positions * side.unit for side in (reading.x, reading.y)]
+        yield KDTree(placed[1]).query(placed[0])[1]
+
+
+def by_principal_axes(reading: Reading) -> Iterator[SampleMap]:
+    """Match samples at similar positions along the principal axes, in each of four orientations."""
+    if reading.prepared.pair.partial:
+        return
+    shot, of_x, of_y = _shot_squares(reading), *map(_principal_frame, (reading.x, reading.y))
+    for signs in _HALF_TURNS:
+        yield (shot + _ALONG_AXES * _squares(of_x * signs, of_y)).argmin(axis=1)
+
+
+def by_extremities(reading: Reading) -> Iterator[SampleMap]:
+    """Match samples at similar distances from paired extremities, for several pairings.
+
+    Pairings with the most similar features come first.
+    """
+    if reading.prepared.pair.partial:
+        return
+    both = reading.x, reading.y
+    shot, ends = _shot_squares(reading), (extremities(reading.x), extremities(reading.y))
+    # Limbs of different animals differ in length, so distances are divided by their mean.
+    to_ends = [
+        side.distances[:, of_side.samples] / (side.areas @ side.distances[:, of_side.samples])
+        for side, of_side in zip(both, ends, strict=True)
+    ]
+
+    def costs(pairing: Int64[np.ndarray, "l 2"], weight: float, rows: slice) -> Float[np.ndarray, "a b"]:
+        of_x, of_y = (distances[rows, side] for distances, side in zip(to_ends, pairing.T, strict=True))
+        return weight * shot[rows, rows] + _TO_EXTREMITIES * _squares(of_x, of_y)
+
+    def residual(pairing: Int64[np.ndarray, "l 2"]) -> float:
+        rows = slice(None, None, 3)  # a third of the samples is enough for a comparison
+        cost = costs(pairing, 0.3, rows)
+        sides = zip((cost.min(axis=1), cost.min(axis=0)), both, strict=True)
+        return sum(float(np.average(least, weights=side.areas[rows])) for least, side in sides)
+
+    pairings = plausible_pairings(*ends, _PLAUSIBLE)
+    for pairing in sorted(pairings, key=residual)[:_PAIRINGS]:
+        yield costs(pairing, 1.0, slice(None)).argmin(axis=1)
+
+
+HYPOTHESES: tuple[Callable[[Reading], Iterator[SampleMap]], ...] = (
+    by_descriptors,
+    by_alignment,
+    by_given_positions,
+    by_principal_axes,
+    by_extremities,
+)
+"""All kinds of hypothesis."""
+
+
+def _shot_squares(reading: Reading) -> Float[np.ndarray, "s t"]:
+    """Return the squared differences of SHOT (s, t) between all samples of X and Y."""
+    return _squares(reading.x.shot(1), reading.y.shot(1))
+
+
+def _squares(x: Float[np.ndarray, "s d"], y: Float[np.ndarray, "t d"]) -> Float[np.ndarray, "s t"]:
+    """Return the squared distance between each row of `x` and each row of `y`."""
+    # A matrix product takes a fraction of the time of `cdist`.
+    return np.sum(x**2, axis=1)[:, None] + np.sum(y**2, axis=1) - 2 * x @ y.T
+
+
+def _principal_frame(proxy: Proxy) -> Float[np.ndarray, "s 3"]:
+    """Return the positions along the principal axes of inertia, in units of the radius of gyration."""
+    centered = proxy.positions - proxy.areas @ proxy.positions
+    variances, axes = np.linalg.eigh((proxy.areas * centered.T) @ centered)
+    axes = axes[:, ::-1] * [1, 1, np.sign(np.linalg.det(axes[:, ::-1]))]
+    return centered @ axes / np.sqrt(variances.sum())
+
+
+class Extremities(NamedTuple):
+    """The extremities of a body, in descending order of their remoteness.
+
+    The remoteness of a sample is the root mean square of its distances to all points of the surface.
+
+    **Attributes:**
+
+    - `samples`: the samples at the extremities (e,), as 0-based indices of the samples of a `Proxy`.
+    - `distances`: the distances between extremities (e, e) along the surface, divided by the mean remoteness
+      of all e extremities.
+    - `remoteness`: the remoteness of each extremity (e,), divided by the same mean.
+    """
+
+    samples: Int64[np.ndarray, " e"]
+    distances: Float[np.ndarray, "e e"]
+    remoteness: Float[np.ndarray, " e"]
+
+
+# The smallest distance between two extremities, in units of the square root of the area.
+_DISTANCE = 0.35
+# The largest number of extremities. The number of pairings grows very fast with it.
+_MOST = 6
+
+
+def extremities(proxy: Proxy) -> Extremities:
+    """Find the extremities of a body, such as the ends of its limbs, at most six.
+
+    Extremities are the local maxima of the mean squared distance to the whole surface (Hilaga et al. 2001,
+    "Topology matching for fully automatic similarity estimation of 3D shapes").
+    """
+    distances = proxy.distances
+    remoteness = np.sqrt(proxy.areas @ distances**2)
+    around = np.where(distances < _DISTANCE, remoteness, 0).max(axis=1)
+    ends = np.flatnonzero(remoteness >= around)
+    ends = ends[np.argsort(-remoteness[ends], kind="stable")][:_MOST]
+    unit = max(remoteness[ends].mean(), np.finfo(np.float64).tiny)
+    return Extremities(ends, distances[np.ix_(ends, ends)] / unit, remoteness[ends] / unit)
+
+
+def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:
+    """Return pairings of the extremities of two bodies, the most plausible pairing first.
+
+    A pairing matches each extremity of the body with fewer extremities to a different extremity of the other
+    body. A pairing is plausible if the distances between extremities, and the remoteness of extremities, are
+    similar on both bodies. The cost of a pairing is the sum of the squared differences of distances and of
+    remoteness. The cost does not distinguish left from right.
+
+    **Arguments:**
+
+    - `x`, `y`: the extremities of X and of Y.
+    - `number`: the largest number of pairings to return.
+
+    **Returns:** A list of arrays (l, 2), where l is the number of extremities of the body with fewer
+    extremities. Each row pairs the index of an extremity of X with the index of an extremity of Y.
+    """
+    fewer, more = (x, y) if len(x.samples) <= len(y.samples) else (y, x)
+    partners = np.array(list(permutations(range(len(more.samples)), len(fewer.samples))))
+    between = more.distances[partners[:, :, None], partners[:, None, :]] - fewer.distances
+    cost = np.sum(between**2, axis=(1, 2)) / 2
+    cost += np.sum((more.remoteness[partners] - fewer.remoteness) ** 2, axis=1)
+    best = partners[np.argsort(cost, kind="stable")[:number]]
+    pairings = [np.stack([np.arange(len(partner)), partner], axis=1) for partner in best]
+    return pairings if fewer is x else [pairing[:, ::-1] for pairing in pairings]

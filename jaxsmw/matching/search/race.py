@@ -1,0 +1,133 @@
+"""The race: candidate maps of a pair are refined together on proxies, coarse to fine, and the best go on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.errors import InputError
+from jaxsmw.matching.executor import run_all
+from jaxsmw.matching.judge import discontinuous_parts, orientation_reversal
+from jaxsmw.matching.outcome import Start
+from jaxsmw.matching.search.evidence import MIRRORED, Evidence
+from jaxsmw.matching.search.hypotheses import HYPOTHESES
+from jaxsmw.matching.search.proxies import SampleMap
+from jaxsmw.matching.search.reading import NUMBER_OF_DESCRIPTORS, Reading
+from jaxsmw.matching.stages import Stage
+
+# The levels of the regression in the two rounds of the race.
+_COARSE, _FINE = (
+    Stage(FeatureRegression(levels), number_of_descriptors=NUMBER_OF_DESCRIPTORS)
+    for levels in ((8, 8, 11, 11, 15, 15, 20, 20), (20, 20, 26, 26, 35, 35))
+)
+# The number of candidates that are mended, and of those that go on to the second round.
+_MENDED, _KEPT = 4, 8
+# Two maps are different if they differ on at least this share of the area.
+DIFFERENT_AREA = 0.05
+# Faults on less than the first share or more than the second share of the area are not mended. From the third
+# share of reversed area on, a map is tried for the other hand.
+_SMALL, _LARGE, _MOSTLY = 0.002, 0.5, 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A map of the samples of a reading, and its `Evidence`."""
+
+    reading: Reading
+    matches: SampleMap
+    evidence: Evidence
+
+    @property
+    def log_odds(self) -> float:
+        """The log-odds that the map is right."""
+        return self.evidence.log_odds
+
+
+def race(
+    readings: Sequence[Reading], known: Iterable[tuple[Reading, SampleMap]], hypotheses: bool = True
+) -> list[Candidate]:
+    """Refine maps of samples together, and return different maps, the best first.
+
+    **Arguments:**
+
+    - `readings`: the readings of the pair.
+    - `known`: known maps of samples, each with its reading.
+    - `hypotheses`: whether all hypotheses of all readings are refined as well.
+    """
+    starts = [task for reading in readings if hypotheses for task in _hypotheses(reading)]
+    coarse = _refined([*starts, *(_Task(*one) for one in known)], _COARSE)
+    moves = [move for best in islice(different(coarse), _MENDED) for move in _moves(best, readings)]
+    kept = islice(different(coarse + _refined(moves, _COARSE)), _KEPT)
+    return list(different(_refined([_Task(one.reading, one.matches) for one in kept], _FINE)))
+
+
+def hand_evidence(reading: Reading) -> float:
+    """Return the log-odds that X and Y have opposite hands, from the best coarse map of each hand."""
+    direct, mirrored = (
+        max((one.log_odds for one in _refined(list(_hypotheses(hand)), _COARSE)), default=-np.inf)
+        for hand in (reading, reading.mirror())
+    )
+    return mirrored - direct if np.isfinite(direct + mirrored) else MIRRORED
+
+
+def different(candidates: Sequence[Candidate]) -> Iterator[Candidate]:
+    """Yield candidates that differ from all better ones, the best first."""
+    yielded: list[Candidate] = []
+    for candidate in sorted(candidates, key=lambda candidate: -candidate.log_odds):
+        twins = (
+            candidate.reading.difference(candidate.matches, other.matches) < DIFFERENT_AREA
+            for other in yielded
+        )
+        if not any(twins):
+            yielded.append(candidate)
+            yield candidate
+
+
+class _Task(NamedTuple):
+    """A map of samples to be refined, perhaps without some samples of X in its first functional map."""
+
+    reading: Reading
+    matches: SampleMap
+    excluded: Bool[np.ndarray, " s"] | None = None
+
+
+def _hypotheses(reading: Reading) -> Iterator[_Task]:
+    for hypothesis in HYPOTHESES:
+        with suppress(InputError):  # the samples can be too sparse for SHOT of this radius
+            for matches in hypothesis(reading):
+                yield _Task(reading, matches)
+
+
+def _refined(tasks: Sequence[_Task], stage: Stage) -> list[Candidate]:
+    """Refine maps of samples by a stage, and judge those whose refinement succeeds."""
+    if not tasks:
+        return []
+    fitted = stage.fitted(min(len(side.areas) for task in tasks for side in (task.reading.x, task.reading.y)))
+    starts = [(task.reading.spectra, Start(task.matches, excluded=task.excluded)) for task in tasks]
+    return [
+        Candidate(task.reading, outcome.pointwise_map, Evidence.of(task.reading, outcome.pointwise_map))
+        for task, outcome in zip(tasks, run_all([fitted], starts), strict=True)
+        if outcome.successful
+    ]
+
+
+def _moves(candidate: Candidate, readings: Sequence[Reading]) -> Iterator[_Task]:
+    """Yield what may mend a map: to leave out its faults, or the other hand if most of it is reversed."""
+    reading, matches = candidate.reading, candidate.matches
+    pair, spectrum = reading.prepared.pair, reading.prepared.x.spectrum.truncate(50)
+    everywhere = reading.extended(matches)
+    reversed_ = orientation_reversal(pair, everywhere, spectrum)
+    for fault in (reversed_, discontinuous_parts(pair, everywhere)):
+        if _SMALL < pair.mesh_x.average(fault) < _LARGE:
+            yield _Task(reading, matches, fault[reading.x.samples.vertices])
+    if pair.mesh_x.average(reversed_) > _MOSTLY:
+        for other in readings:
+            if other.x.distances is reading.x.distances and other.x.mirrored != reading.x.mirrored:
+                yield _Task(other, matches)

@@ -1,0 +1,100 @@
+"""A reading of a pair: which hand the source has, and whether one shape is a part of the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from jaxsmw.geometry.mesh import extend_to_unreferenced
+from jaxsmw.matching.descriptors import PrincipalAxes
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.search.proxies import Proxy, SampleMap
+from jaxsmw.matching.spectral_pair import SpectralPair
+from jaxsmw.matching.stages import Preset
+from jaxsmw.runtime.threads import side_by_side
+
+# The radii of the SHOT descriptors by which candidate maps are refined, in units of 0.06, and the number of
+# their principal components.
+_RADII, NUMBER_OF_DESCRIPTORS = (1, 2, 4), 30
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """One way to read a pair, with the proxies on which its candidate maps are refined and judged.
+
+    **Attributes:**
+
+    - `prepared`: the `PreparedPair`. Its attributes `mirrored` and `pair.partial` tell how the pair is read.
+    - `x`, `y`: the proxies of X (s samples) and of Y (t samples), in `Pair.units_of_length`.
+    """
+
+    prepared: PreparedPair
+    x: Proxy
+    y: Proxy
+
+    @classmethod
+    def of(cls, prepared: PreparedPair) -> Reading:
+        """Return the reading of a prepared pair."""
+
+        def proxy(side: tuple[int, float]) -> Proxy:
+            number, unit = side
+            made = Proxy(prepared.shapes[number], unit)
+            made.distances  # noqa: B018 (both shapes side by side)
+            return made
+
+        return cls(prepared, *side_by_side(proxy, *enumerate(prepared.pair.units_of_length)))
+
+    def mirror(self) -> Reading:
+        """Return the reading in which X has the other hand."""
+        return Reading(self.prepared.mirror(), self.x.mirror(), self.y)
+
+    def described(self, preset: Preset) -> Reading:
+        """Return the reading whose prepared pair has the descriptors that a preset uses."""
+        prepared, number = self.prepared, preset.number_of_descriptors
+        if not number or prepared.x.spectrum.descriptors is not None:
+            return self
+        return replace(self, prepared=prepared.describe(number))
+
+    @cached_property
+    def spectra(self) -> SpectralPair:
+        """The spectra at the samples, with principal components of SHOT.
+
+        The axes are the same for both hands of X, because they are fitted to both hands of both shapes.
+
+        **Raises:** `InputError` if the samples are too sparse for SHOT.
+        """
+        both = self.x, self.y
+        shot = [np.hstack([proxy.shot(radius) for radius in _RADII]) for proxy in both]
+        twins = [np.hstack([proxy.mirror().shot(radius) for radius in _RADII]) for proxy in both]
+        weights = [proxy.areas / 4 for proxy in both]
+        axes = PrincipalAxes.of(zip(shot + twins, weights + weights, strict=True), NUMBER_OF_DESCRIPTORS)
+        x, y = (proxy.sampled_spectrum(axes.components(rows)) for proxy, rows in zip(both, shot, strict=True))
+        partial = self.prepared.pair.partial
+        return SpectralPair(x, y, partial=partial, common_limit=partial)
+
+    def reduced(self, pointwise_map: Int64[np.ndarray, " m"]) -> SampleMap:
+        """Return the map of the samples of a map X -> Y (m,)."""
+        return self.y.samples.nearest[pointwise_map[self.x.samples.vertices]]
+
+    def extended(self, matches: SampleMap) -> Int64[np.ndarray, " m"]:
+        """Return a map X -> Y (m,) in which every vertex has the match of its sample."""
+        everywhere = self.y.samples.vertices[matches][self.x.samples.nearest]
+        return extend_to_unreferenced(self.prepared.pair.mesh_x, everywhere)
+
+    def difference(self, first: SampleMap, second: SampleMap) -> float:
+        """Return the share of X's area, from 0 to 1, on which two maps of samples differ."""
+        return float(self.x.areas @ (self.y.distances[first, second] > _DIFFERENT))
+
+    @cached_property
+    def patches(self) -> Float[np.ndarray, "s s"]:
+        """The weights of the samples in the patch around each sample of X. Each row has the sum 1."""
+        weights = (self.x.distances < _PATCH) * self.x.areas
+        return weights / weights.sum(axis=1, keepdims=True)
+
+
+# Two maps differ at a sample if its two matches are at least so far apart along the surface, and the radius
+# of the patches that a right map moves nearly rigidly; both in units of the square root of the area.
+_DIFFERENT, _PATCH = 0.2, 0.2

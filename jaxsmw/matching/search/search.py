@@ -1,0 +1,209 @@
+"""The search for the right map: one start, a race of hypotheses if that is not certain, and one judge."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Int64
+
+from jaxsmw.choices import Mirror
+from jaxsmw.core.arrays import namespace
+from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.errors import InputError
+from jaxsmw.geometry.scale import relative_boundary
+from jaxsmw.matching.executor import run
+from jaxsmw.matching.judge import area_shape_difference
+from jaxsmw.matching.outcome import Outcome, Start
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.search.evidence import Evidence, probabilities
+from jaxsmw.matching.search.race import DIFFERENT_AREA, race
+from jaxsmw.matching.search.reading import Reading
+from jaxsmw.matching.spectral_pair import SpectralPair
+from jaxsmw.matching.stages import Preset
+
+logger = logging.getLogger("jaxsmw")
+
+# If the relative boundary of one mesh is longer than that of the other by this factor, one mesh can be a part
+# of the other.
+_LONGER = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A refined map and the evidence for it.
+
+    **Attributes:**
+
+    - `reading`: the `Reading` of the pair in which the map was refined.
+    - `outcome`: the `Outcome` of the stages.
+    - `evidence`: the `Evidence` that the map is right; None if a stage failed.
+    """
+
+    reading: Reading
+    outcome: Outcome
+    evidence: Evidence | None
+
+    @classmethod
+    def of(cls, reading: Reading, outcome: Outcome) -> Judged:
+        """Judge the outcome of stages."""
+        if not outcome.successful:
+            return cls(reading, outcome, None)
+        return cls(reading, outcome, Evidence.of(reading, reading.reduced(outcome.pointwise_map)))
+
+    @property
+    def log_odds(self) -> float:
+        """The log-odds that the map is right; minus infinity after a failure."""
+        return -np.inf if self.evidence is None else self.evidence.log_odds
+
+    @property
+    def pointwise_map(self) -> Int64[np.ndarray, " m"]:
+        """The map of the last stage (m,), 0-based vertices of Y."""
+        return self.outcome.pointwise_map
+
+    def differs(self, other: Judged) -> bool:
+        """Return whether two maps differ on a relevant share of X's area."""
+        first, second = (self.reading.reduced(one.pointwise_map) for one in (self, other))
+        return self.reading.difference(first, second) >= DIFFERENT_AREA
+
+
+def search(
+    prepared: PreparedPair,
+    start: Start,
+    preset: Preset,
+    *,
+    mirror: Mirror = "no",
+    hypotheses: bool = True,
+    outcome: Outcome | None = None,
+) -> list[Judged]:
+    """Find the right map, and other maps that could be right.
+
+    docs/how_it_works.md explains the search.
+
+    **Arguments:**
+
+    - `prepared`: the prepared pair.
+    - `start`: the first initial map.
+    - `preset`: the stages, and the settings of the search. Without settings, only the first map is returned.
+    - `mirror`: `"auto"` to consider mirror images of X as well.
+    - `hypotheses`: whether other initial maps are tried if the map of the first start is uncertain.
+    - `outcome`: the outcome of the stages before the final ones, if they have already run.
+
+    **Returns:** Maps that differ from each other, the most probable first.
+    """
+    reading = Reading.of(prepared)
+    first = Judged.of(reading, outcome or run(preset.before_final, prepared.spectra, start))
+    settings = preset.search
+    if settings is None:
+        return [first]
+    judged = [_finished(first, preset)] if first.evidence else [first]
+    if probabilities([first.log_odds])[0] < settings.certain:
+        logger.info("the map is uncertain, so other maps are tried ...")
+        known = [(reading, reading.reduced(first.pointwise_map))] if first.evidence else []
+        candidates = race(list(_readings(reading, mirror)) if hypotheses else [reading], known, hypotheses)
+        shares = probabilities([candidate.log_odds for candidate in candidates])
+        likely = [
+            c for c, share in zip(candidates, shares, strict=True) if share >= settings.likely * shares[0]
+        ]
+        for number, candidate in enumerate(likely[: settings.finalists], 1):
+            logger.info("map %d ...", number)
+            of_candidate = _refined(candidate.reading, candidate.reading.extended(candidate.matches), preset)
+            judged.append(_finished(of_candidate, preset))
+    return _different(judged)
+
+
+def _readings(reading: Reading, mirror: Mirror) -> Iterator[Reading]:
+    """Yield the readings of a pair: as it was called, with the other hand, and as a part."""
+    for one in (reading, *_as_parts(reading)):
+        yield one
+        if mirror == "auto":
+            yield one.mirror()
+
+
+def _as_parts(reading: Reading) -> Iterator[Reading]:
+    """Yield the readings in which one of two shapes that were called full is a part of the other.
+
+    The meshes have the same unit of length in the first reading, and different units in the second.
+    """
+    prepared, pair = reading.prepared, reading.prepared.pair
+    shorter, longer = sorted(map(relative_boundary, pair.meshes))
+    if pair.partial or longer <= _LONGER * shorter:
+        return
+    known: list[float] = []
+    for scale in (1.0, "unknown"):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # an uncertain scale gives a poor map, which loses
+                part = Pair.make(*pair.meshes, partial=True, scale=scale)
+            if all(abs(np.log(part.scale / other)) > _SAME_SCALE for other in known):
+                known.append(part.scale)
+                yield Reading.of(prepared.as_part(part))
+        except InputError:  # no scale can be estimated, or the closed mesh is the smaller one
+            continue
+
+
+# Two scales are the same if their logarithms differ by less.
+_SAME_SCALE = 0.05
+
+
+def _different(judged: Sequence[Judged]) -> list[Judged]:
+    """Return the maps that differ from all better ones, the best first."""
+    kept: list[Judged] = []
+    for one in sorted(judged, key=lambda judged: -judged.log_odds):
+        if not kept or (one.evidence and all(one.differs(other) for other in kept)):
+            kept.append(one)
+    return kept
+
+
+def _refined(reading: Reading, pointwise_map: Int64[np.ndarray, " m"], preset: Preset) -> Judged:
+    """Run the repeated stages of a preset from a map in a reading."""
+    reading = reading.described(preset)
+    return Judged.of(reading, run(preset.repeated, reading.prepared.spectra, Start(pointwise_map)))
+
+
+def _finished(judged: Judged, preset: Preset) -> Judged:
+    """Run further passes for shapes that differ in form, because their maps converge slowly.
+
+    **Returns:** The map after the last pass, or the given map if no pass runs, if a pass fails, or if the
+    passes make the map less probable.
+    """
+    settings, prepared = preset.search, judged.reading.prepared
+    if settings is None or judged.evidence is None or prepared.pair.partial:
+        return judged
+    spectra = prepared.spectra
+    change = area_shape_difference(prepared.pair, judged.pointwise_map, *spectra.both)
+    if change < settings.non_isometric:
+        return judged
+    if change >= settings.without_creases_from:
+        spectra = _without_creases(spectra)
+    passes = [preset.repeated] * settings.passes
+    if change >= settings.coarse_from:
+        *before, last = preset.repeated
+        passes = [(*before, last.coarsened(levels)) for levels in settings.coarse_levels]
+        passes.append(preset.repeated)
+    outcome = judged.outcome
+    for stages in passes:
+        again = run(stages, spectra, Start(outcome.pointwise_map))
+        if not again.successful:
+            return judged
+        first = max(0, len(outcome.runs) - len(stages))
+        outcome = Outcome(outcome.initial_map, outcome.runs[:first]).followed_by(again)
+    # Coarse passes worsen some maps of shapes with topological noise.
+    after = Judged.of(judged.reading, outcome)
+    return after if after.log_odds >= judged.log_odds - settings.pass_tolerance else judged
+
+
+def _without_creases(spectra: SpectralPair) -> SpectralPair:
+    """Return the spectra with crease eigenvectors of zero, which need no further program."""
+
+    def zeroed(spectrum: Spectrum) -> Spectrum:
+        creases = spectrum.crease_eigenvectors
+        return spectrum.with_crease_eigenvectors(
+            None if creases is None else namespace(creases).zeros_like(creases)
+        )
+
+    return replace(spectra, x=zeroed(spectra.x), y=zeroed(spectra.y))

@@ -1,0 +1,379 @@
+"""The search for the right map: proxies, evidence, the race of hypotheses, and its results."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sampled_cases import first_always
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+from synthetic import body_with_arms, bumpy_mesh, mean_error
+
+import jaxsmw
+from jaxsmw import Mesh, creature_pair, make_mesh, match
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.geometry.sampling import SurfaceSamples
+from jaxsmw.geometry.shot import mirrored_descriptors, shot_descriptors
+from jaxsmw.matching.outcome import Outcome, Start
+from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.search.alternatives import alternatives
+from jaxsmw.matching.search.evidence import MIRRORED, Evidence, deformation, probabilities
+from jaxsmw.matching.search.hypotheses import HYPOTHESES
+from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, race
+from jaxsmw.matching.search.reading import Reading
+from jaxsmw.matching.search.search import Judged, search
+from jaxsmw.matching.settings import SearchSettings
+from jaxsmw.matching.stages import Preset, Sizes, Stage
+
+SHORT = Stage(FeatureRegression((20, 40)), number_of_descriptors=30)
+SEARCH = Preset(repeated=(SHORT,), search=SearchSettings(non_isometric=10.0))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """Two poses of a body with different triangulations."""
+    found = creature_pair(vertices=900)
+    return found.source, found.target, found.truth.nearest_corners(found.target)
+
+
+@pytest.fixture(scope="module")
+def lump() -> Mesh:
+    """A lump without symmetry."""
+    return bumpy_mesh(4)
+
+
+def turned(mesh: Mesh, seed: int = 0) -> Mesh:
+    """The mesh in another place and size, with other numbers of the vertices: vertex i becomes `order[i]`."""
+    order = order_of(mesh, seed)
+    vertices = np.empty_like(mesh.vertices)
+    vertices[order] = Rotation.random(random_state=seed).apply(mesh.vertices) * 3 + 1
+    return make_mesh(vertices, order[mesh.faces], name="turned")
+
+
+def order_of(mesh: Mesh, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).permutation(len(mesh.vertices))
+
+
+def read(mesh_x: Mesh, mesh_y: Mesh, **options) -> Reading:
+    return Reading.of(prepare(Pair.make(mesh_x, mesh_y, **options), Sizes(40)))
+
+
+def upside_down(mesh: Mesh, truth: np.ndarray) -> np.ndarray:
+    """A wrong map: the vertices in the opposite order of height."""
+    order = np.argsort(mesh.vertices[:, 1])
+    wrong = np.empty_like(truth)
+    wrong[order] = truth[order[::-1]]
+    return wrong
+
+
+def test_samples_belong_to_the_nearest_along_the_surface():
+    """Two parallel sheets that nearly touch share no samples."""
+    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 2, indexing="ij"), -1).reshape(-1, 2)
+    corners = np.arange(64).reshape(8, 8)
+    a, b, c, d = (
+        part.ravel() for part in (corners[:-1, :-1], corners[1:, :-1], corners[1:, 1:], corners[:-1, 1:])
+    )
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    sheets = [np.column_stack([grid, np.full(64, height)]) for height in (0.0, 0.01)]
+    mesh = Mesh(np.concatenate(sheets), np.concatenate([faces, faces + 64]))
+    samples = SurfaceSamples.along_surface(mesh, np.array([0, 64 + 63]))
+    assert (samples.nearest == np.repeat([0, 1], 64)).all()
+    alone = SurfaceSamples.along_surface(mesh, np.array([3, 0]))  # no sample on the second sheet
+    assert alone.vertices.tolist() == [0, 3]
+    assert (alone.nearest[:64] == alone.nearest[64:]).mean() > 0.9
+
+
+def test_rigid_motions_have_no_deformation_and_reflections_have(pair):
+    mesh, _, _ = pair
+    rotation = Rotation.random(random_state=0)
+    reading = read(mesh, Mesh(rotation.apply(mesh.vertices) + 2, mesh.faces))
+    identity = np.arange(len(reading.x.areas))
+    assert deformation(reading, identity).max() < 1e-12
+    evidence = Evidence.of(reading, identity)
+    assert evidence.deformation < 1e-12 and evidence.dissimilarity < 1e-6 and not evidence.mirrored
+    other = reading.mirror()
+    assert other.x.distances is reading.x.distances and other.prepared.mirrored
+    assert deformation(other, identity).mean() > 0.01
+    assert Evidence.of(other, identity).log_odds < evidence.log_odds + MIRRORED
+
+
+def test_deformation_is_the_residual_of_procrustes_alignment(pair):
+    mesh_x, mesh_y, truth = pair
+    reading = read(mesh_x, mesh_y)
+    x, y, matches = reading.x, reading.y, reading.reduced(truth)
+    found = deformation(reading, matches)
+    for sample in range(0, len(x.areas), 50):
+        patch = x.distances[sample] < 0.2
+        weights = x.areas[patch] / x.areas[patch].sum()
+        source, target = (p - weights @ p for p in (x.positions[patch], y.positions[matches[patch]]))
+        rotation, _ = Rotation.align_vectors(target, source, weights=weights)
+        residual = weights @ np.sum((rotation.apply(source) - target) ** 2, axis=1)
+        size = weights @ np.sum(source**2 + target**2, axis=1)
+        assert found[sample] == pytest.approx(residual / size, rel=1e-6)
+
+
+def test_the_true_map_has_better_evidence_than_wrong_maps(pair):
+    mesh_x, mesh_y, truth = pair
+    reading = read(mesh_x, mesh_y)
+    wrong = upside_down(mesh_x, truth)
+    right, other = (Evidence.of(reading, reading.reduced(one)) for one in (truth, wrong))
+    assert right.deformation < 0.5 * other.deformation and right.dissimilarity < other.dissimilarity
+    assert right.log_odds > 0 > other.log_odds
+
+
+def test_probabilities_share_what_no_map_has():
+    assert probabilities([0.0]) == pytest.approx(0.5)
+    assert probabilities([-np.inf]) == 0
+    np.testing.assert_allclose(probabilities([0.0, 0.0]), 1 / 3)
+    np.testing.assert_allclose(probabilities([2000.0, 1990.0]), [1 / (1 + np.exp(-10)), 1 / (1 + np.exp(10))])
+    assert probabilities([3.0, 1.0]).sum() < 1
+
+
+def test_descriptors_of_a_mirror_image_are_those_of_the_surface_in_another_order(lump):
+    of_image = shot_descriptors(lump.mirrored(), radius=0.2)
+    of_itself = shot_descriptors(lump, radius=0.2)
+    np.testing.assert_allclose(mirrored_descriptors(of_itself), of_image, atol=1e-5)
+    assert np.abs(of_itself - of_image).max() > 0.1
+
+
+def test_a_mirror_image_keeps_numbers_and_normals_point_outward(lump):
+    image = lump.mirrored()
+    np.testing.assert_array_equal(image.vertices, lump.vertices * [-1, 1, 1])
+    assert not image.is_inside_out
+    np.testing.assert_allclose(image.vertex_normals, lump.vertex_normals * [-1, 1, 1], atol=1e-12)
+    np.testing.assert_array_equal(image.mirrored().faces, lump.faces)
+    np.testing.assert_array_equal(image.mirrored().vertices, lump.vertices)
+
+
+@pytest.mark.parametrize("hypothesis", HYPOTHESES, ids=lambda hypothesis: hypothesis.__name__)
+def test_hypotheses_are_maps_of_samples(pair, hypothesis):
+    reading = read(*pair[:2])
+    for hand in (reading, reading.mirror()):
+        for matches in hypothesis(hand):
+            assert matches.shape == hand.x.areas.shape and np.issubdtype(matches.dtype, np.integer)
+            assert matches.min() >= 0 and matches.max() < len(hand.y.areas)
+
+
+def test_the_best_map_of_the_race_is_right_in_any_position(pair):
+    mesh_x, mesh_y, truth = pair
+    maps = []
+    for seeds in ((None, None), (1, 2)):
+        shapes = [
+            mesh
+            if seed is None
+            else Mesh(Rotation.random(random_state=seed).apply(mesh.vertices) * 7 - 3, mesh.faces)
+            for mesh, seed in zip((mesh_x, mesh_y), seeds, strict=True)
+        ]
+        reading = read(*shapes)
+        best, *others = race([reading], [])
+        assert all(other.log_odds <= best.log_odds for other in others)
+        maps.append(reading.extended(best.matches))
+        assert mean_error(mesh_y, maps[-1], truth) < 0.08
+    assert mean_error(mesh_y, *maps) < 0.02
+
+
+def test_known_maps_take_part_in_the_race(pair):
+    mesh_x, mesh_y, truth = pair
+    reading = read(mesh_x, mesh_y)
+    (best, *_) = race([reading], [(reading, reading.reduced(truth))], hypotheses=False)
+    assert mean_error(mesh_y, reading.extended(best.matches), truth) < 0.05
+    assert race([reading], [], hypotheses=False) == []
+
+
+def test_swapped_limbs_are_mended():
+    mesh = body_with_arms(3)
+    mirrored = KDTree(mesh.vertices).query(mesh.vertices * [-1, 1, 1])[1]
+    identity = np.arange(len(mesh.vertices))
+    swapped = np.where(np.abs(mesh.vertices[:, 0]) > 1, mirrored, identity)
+    reading = read(mesh, mesh)
+    (best, *_) = race([reading], [(reading, reading.reduced(swapped))], hypotheses=False)
+    assert mean_error(mesh, reading.extended(best.matches), identity) < 0.02
+
+
+def test_a_mostly_reversed_map_is_tried_for_the_other_hand(lump):
+    image = turned(lump.mirrored())
+    reading = read(lump, image)
+    (best, *_) = race(
+        [reading, reading.mirror()], [(reading, reading.reduced(order_of(lump)))], hypotheses=False
+    )
+    assert best.reading.x.mirrored and best.evidence.deformation < 1e-3
+
+
+def test_twins_are_merged_and_the_better_one_is_kept(pair):
+    mesh_x, mesh_y, truth = pair
+    reading = read(mesh_x, mesh_y)
+    matches, wrong = reading.reduced(truth), reading.reduced(upside_down(mesh_x, truth))
+    slightly = matches.copy()
+    few = np.cumsum(reading.x.areas) < 0.5 * DIFFERENT_AREA
+    slightly[few] = wrong[few]
+
+    def candidate(matches, score):
+        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, False))
+
+    candidates = [candidate(matches, 1.0), candidate(slightly, 2.0), candidate(wrong, 0.5)]
+    assert list(different(candidates)) == [candidates[1], candidates[2]]
+
+
+def test_the_difference_of_two_maps_is_a_share_of_the_area(pair):
+    """Matches that are close in space but not along the surface are different."""
+    reading = read(pair[0], pair[0])
+    proxy, identity = reading.x, np.arange(len(reading.x.areas))
+    assert reading.difference(identity, identity) == 0
+    apart = proxy.distances / np.linalg.norm(proxy.positions[:, None] - proxy.positions, axis=2).clip(1e-9)
+    moved = identity.copy()
+    moved[:50] = np.argmax(apart[:50], axis=1)
+    far = proxy.distances[identity, moved] > 0.2
+    assert far.any()
+    assert reading.difference(identity, moved) == pytest.approx(proxy.areas[far].sum())
+
+
+def test_a_certain_map_ends_the_search(pair, monkeypatch):
+    mesh_x, mesh_y, truth = pair
+    prepared = prepare(Pair.make(mesh_x, mesh_y), Sizes(60)).describe(30)
+    raced = []
+    monkeypatch.setattr("jaxsmw.matching.search.search.race", lambda *a: raced.append(a) or [])
+    for start, certain, races in ((truth, 0.5, 0), (truth, 1.0, 1), (upside_down(mesh_x, truth), 0.5, 1)):
+        raced.clear()
+        preset = replace(SEARCH, search=replace(SEARCH.search, certain=certain))
+        (found,) = search(prepared, Start(start), preset)
+        assert len(raced) == races and found.outcome.successful
+    (found,) = search(prepared, Start(upside_down(mesh_x, truth)), replace(SEARCH, search=None))
+    assert found.log_odds < 0 and len(raced) == 1
+
+
+def test_readings_as_a_part_are_tried_only_for_different_boundaries(pair, monkeypatch):
+    mesh_x, mesh_y, _ = pair
+    height = mesh_x.vertices[:, 1]
+    part = make_mesh(
+        mesh_x.vertices, mesh_x.faces[(height > np.quantile(height, 0.5))[mesh_x.faces].all(axis=1)]
+    )
+    seen = []
+
+    def watched(readings, *_):
+        seen.extend((one.prepared.mirrored, one.prepared.pair.partial) for one in readings)
+        return []
+
+    monkeypatch.setattr("jaxsmw.matching.search.search.race", watched)
+    never = replace(SEARCH, search=replace(SEARCH.search, certain=1.0))
+    for shapes, mirror, expected in (
+        ((mesh_x, mesh_y), "no", {(False, False)}),
+        ((mesh_x, mesh_y), "auto", {(False, False), (True, False)}),
+        ((part, mesh_y), "no", {(False, False), (False, True)}),
+        ((part, part), "no", {(False, False)}),
+    ):
+        seen.clear()
+        prepared = prepare(Pair.make(*shapes), Sizes(40)).describe(30)
+        start = Start(np.zeros(len(shapes[0].vertices), np.int64))
+        search(prepared, start, never, mirror=mirror)
+        assert set(seen) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("opposite", first_always([True, False]))
+def test_match_finds_the_hand_of_a_lump(lump, opposite):
+    target = turned(lump.mirrored() if opposite else lump)
+    found = match(lump, target)
+    assert found.mirrored is opposite and not found.suspicious
+    assert mean_error(target, found.pointwise_map, order_of(lump)) < 0.01
+    assert (", mirrored" in repr(found)) is opposite
+
+
+def test_a_wrong_map_is_reported_with_what_could_be_done(pair):
+    mesh_x, mesh_y, truth = pair
+    with pytest.warns(UserWarning, match=r"wrong as a whole with a probability of .* use preset=\"accurate\""):
+        found = match(mesh_x, mesh_y, preset="paper", init=upside_down(mesh_x, truth))
+    assert found.suspicious and found.wrong_probability() == 1 - found.probability > 0.5
+
+
+def test_the_given_hand_is_used(lump):
+    target = turned(lump)
+    given = match(lump, target, preset="fast", mirror="yes")
+    alone = match(lump.mirrored(), target, preset="fast", mirror="no")
+    assert (given.mirrored, alone.mirrored) == (True, False)
+    np.testing.assert_array_equal(given.pointwise_map, alone.pointwise_map)
+
+
+@pytest.mark.slow
+def test_a_mirrored_result_is_in_terms_of_the_source():
+    lump = bumpy_mesh(3)
+    target = turned(lump.mirrored())
+    found = match(lump, target, mirror="yes")
+    assert found.mesh_x is lump
+    points = found.surface_points()
+    places = np.einsum("pc,pcd->pd", points.weights, target.vertices[target.faces[points.faces]])
+    right = target.vertices[order_of(lump)]
+    assert np.median(np.linalg.norm(places - right, axis=1)) < 0.02 * target.area**0.5
+    assert np.median(found.expected_error()) < 0.02
+    assert found.distortion < 1.1
+
+
+def test_evidence_of_hands_has_opposite_signs_for_opposite_hands(lump):
+    assert hand_evidence(read(lump, turned(lump.mirrored()))) > 0 > hand_evidence(read(lump, turned(lump)))
+
+
+@pytest.mark.slow
+def test_a_part_given_as_a_whole_is_recognised(pair):
+    mesh_x, mesh_y, truth = pair
+    height = mesh_x.vertices[:, 1]
+    kept = (height > np.quantile(height, 0.4))[mesh_x.faces].all(axis=1)
+    part = make_mesh(mesh_x.vertices, mesh_x.faces[kept], name="bust")
+    with pytest.warns(UserWarning, match="bust looks like a part of"):
+        found = match(part, mesh_y)
+    assert found.pair.partial
+    used = part.referenced_vertices
+    assert mean_error(mesh_y, found.pointwise_map[used], truth[used]) < 0.08
+
+
+@pytest.mark.slow
+def test_symmetric_shapes_have_several_maps_of_similar_probability():
+    """A ball with three equal bumps can be turned in three ways."""
+    ball = bumpy_mesh(3)
+    directions = ball.vertices / np.linalg.norm(ball.vertices, axis=1, keepdims=True)
+    angles = 2 * np.pi * np.arange(3) / 3
+    centers = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
+    radius = 1 + 0.6 * np.exp(-8 * (1 - directions @ centers.T)).sum(axis=1)
+    mesh = make_mesh(directions * radius[:, None] * [1, 1, 0.8], ball.faces)
+    found = match(mesh, turned(mesh))
+    assert found.alternatives and found.probability < 0.75
+    assert found.alternatives[0].probability > 0.15
+    assert any("turned" in other.difference or "mirrored" in other.difference for other in found.alternatives)
+
+
+def test_alternatives_tell_in_what_they_differ(lump):
+    target = turned(lump)
+    reading = read(lump, target)
+
+    def judged(reading, pointwise_map):
+        return Judged.of(reading, Outcome(pointwise_map))
+
+    right = order_of(lump)
+    half = Rotation.from_rotvec([0, 0, np.pi]).apply(lump.vertices)
+    around = right[KDTree(lump.vertices).query(half)[1]]
+    swapped = np.where(lump.vertices[:, 2] > 0.7, around, right)
+    others = [judged(reading.mirror(), around), judged(reading, around), judged(reading, swapped)]
+    probability, described = alternatives(judged(reading, right), others)
+    assert probability > 0.9
+    mirrored, rotated, partly = described
+    assert mirrored.difference == "mirrored" and rotated.difference == "turned by 180°"
+    assert partly.difference.startswith("different on ") and partly.difference.endswith("% of the source")
+    np.testing.assert_array_equal(rotated.pointwise_map, around)
+    assert probability + sum(other.probability for other in described) <= 1
+
+
+@pytest.mark.sampled
+@pytest.mark.parametrize(("names", "opposite"), [(("T04", "J12"), True), (("T04", "Q28"), False)])
+def test_hands_of_teeth(shared, names, opposite):
+    directory = shared / "data" / "primate_molars"
+    found = match(*(jaxsmw.read_mesh(directory / f"{name}_sas.off") for name in names))
+    assert found.mirrored is opposite and not found.suspicious
+
+
+@pytest.mark.sampled
+def test_halves_of_a_brain_are_matched(shared):
+    left, right = (
+        jaxsmw.read_mesh(shared / "data" / "brain_halves" / f"{side}.off") for side in ("left", "right")
+    )
+    found = match(left, right)
+    assert found.mirrored and not found.suspicious
+    assert mean_error(right, found.pointwise_map, np.arange(len(left.vertices))) < 0.01
