@@ -242,6 +242,7 @@ def test_a_certain_map_ends_the_search(pair, monkeypatch):
     assert found.log_odds < 0 and len(raced) == 1
 
 
+@pytest.mark.filterwarnings("ignore:.*neighbours within the SHOT radius:UserWarning")
 def test_readings_as_a_part_are_tried_only_for_different_boundaries(pair, monkeypatch):
     mesh_x, mesh_y, _ = pair
     height = mesh_x.vertices[:, 1]
@@ -281,7 +282,9 @@ def test_match_finds_the_hand_of_a_lump(lump, opposite):
 
 def test_a_wrong_map_is_reported_with_what_could_be_done(pair):
     mesh_x, mesh_y, truth = pair
-    with pytest.warns(UserWarning, match=r"wrong as a whole with a probability of .* use preset=\"accurate\""):
+    with pytest.warns(
+        UserWarning, match=r"wrong as a whole with a probability of .* use preset=\"accurate\""
+    ):
         found = match(mesh_x, mesh_y, preset="paper", init=upside_down(mesh_x, truth))
     assert found.suspicious and found.wrong_probability() == 1 - found.probability > 0.5
 

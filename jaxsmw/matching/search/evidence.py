@@ -37,13 +37,13 @@ class Evidence(NamedTuple):
     @classmethod
     def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
         """Measure a map of samples (s,)."""
-        x, y = (np.asarray(spectrum.descriptors) for spectrum in reading.spectra.both)
-        # The descriptors are principal components of variance 1.
-        differences = ((x - y[matches]) ** 2).mean(axis=1) / 2
-        areas = reading.x.areas
-        return cls(
-            float(areas @ deformation(reading, matches)), float(areas @ differences), reading.x.mirrored
-        )
+        areas, (x, y) = reading.x.areas, (spectrum.descriptors for spectrum in reading.spectra.both)
+        dissimilarity = 1.0  # as for random matches
+        if x is not None and y is not None:
+            # The descriptors are principal components of variance 1.
+            differences = ((np.asarray(x) - np.asarray(y)[matches]) ** 2).mean(axis=1) / 2
+            dissimilarity = float(areas @ differences)
+        return cls(float(areas @ deformation(reading, matches)), dissimilarity, reading.x.mirrored)
 
     @property
     def log_odds(self) -> float:

@@ -80,14 +80,14 @@ class Proxy:
                 )
         return mirrored_descriptors(known[radius]) if self.mirrored else known[radius]
 
-    def sampled_spectrum(self, descriptors: Float[np.ndarray, "s d"]) -> Spectrum:
-        """Return the spectrum at the samples, with the areas of the samples and the given descriptors."""
+    def sampled_spectrum(self, descriptors: Float[np.ndarray, "s d"] | None) -> Spectrum:
+        """Return the spectrum at the samples, with the areas of the samples and perhaps with descriptors."""
         at_samples = self.spectrum.sample(self.samples.vertices)
         xp, dtype = namespace(at_samples.eigenvectors), at_samples.eigenvectors.dtype
         areas = self.areas * float(np.sum(self.spectrum.vertex_areas))
         sampled = replace(at_samples, vertex_areas=xp.asarray(areas, dtype), positions=None, normals=None)
-        described = sampled.with_descriptors(xp.asarray(descriptors, dtype))
-        return described.with_crease_eigenvectors(None)
+        columns = None if descriptors is None else xp.asarray(descriptors, dtype)
+        return sampled.with_descriptors(columns).with_crease_eigenvectors(None)
 
     @functools.cached_property
     def distances(self) -> Float[np.ndarray, "s s"]:

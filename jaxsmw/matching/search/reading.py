@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int64
 
+from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.matching.descriptors import PrincipalAxes
 from jaxsmw.matching.preparation import PreparedPair
@@ -64,14 +66,18 @@ class Reading:
 
         The axes are the same for both hands of X, because they are fitted to both hands of both shapes.
 
-        **Raises:** `InputError` if the samples are too sparse for SHOT.
+        If the samples are too sparse for SHOT, the spectra have no descriptors.
         """
-        both = self.x, self.y
-        shot = [np.hstack([proxy.shot(radius) for radius in _RADII]) for proxy in both]
-        twins = [np.hstack([proxy.mirror().shot(radius) for radius in _RADII]) for proxy in both]
-        weights = [proxy.areas / 4 for proxy in both]
-        axes = PrincipalAxes.of(zip(shot + twins, weights + weights, strict=True), NUMBER_OF_DESCRIPTORS)
-        x, y = (proxy.sampled_spectrum(axes.components(rows)) for proxy, rows in zip(both, shot, strict=True))
+        both, twins = (self.x, self.y), (self.x.mirror(), self.y.mirror())
+        rows: list[Float[np.ndarray, "s c"]] = []
+        with suppress(InputError):
+            rows = [np.hstack([side.shot(radius) for radius in _RADII]) for side in both + twins]
+        components: list[Float[np.ndarray, "s d"] | None] = [None, None]
+        if rows:
+            weights = (side.areas / len(rows) for side in both + twins)
+            axes = PrincipalAxes.of(zip(rows, weights, strict=True), NUMBER_OF_DESCRIPTORS)
+            components = [axes.components(of_side) for of_side in rows[:2]]
+        x, y = (side.sampled_spectrum(of_side) for side, of_side in zip(both, components, strict=True))
         partial = self.prepared.pair.partial
         return SpectralPair(x, y, partial=partial, common_limit=partial)
 
