@@ -1,4 +1,4 @@
-"""The race: candidate maps of a pair are refined together on proxies, coarse to fine, and the best go on."""
+"""The race: maps of a pair are refined together on proxies, and the best go on."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError
 from jaxsmw.matching.executor import run_all
 from jaxsmw.matching.judge import discontinuous_parts, orientation_reversal
@@ -22,13 +23,13 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
 
-# The levels of the regression in the two rounds of the race.
-_COARSE, _FINE = (
-    Stage(FeatureRegression(levels), number_of_descriptors=NUMBER_OF_DESCRIPTORS)
-    for levels in ((8, 8, 11, 11, 15, 15, 20, 20), (20, 20, 26, 26, 35, 35))
+# The stages of the race: those of the preset `accurate` with fewer eigenvectors.
+_STAGES = (
+    Stage(WaveletPreservation(), number_of_eigenvectors=50),
+    Stage(FeatureRegression((20, 20, 26, 35)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),
 )
-# The number of candidates that are mended, and of those that go on to the second round.
-_MENDED, _KEPT = 4, 8
+# The number of maps that are mended.
+_MENDED = 4
 # Two maps are different if they differ on at least this share of the area.
 DIFFERENT_AREA = 0.05
 # Faults on less than the first share or more than the second share of the area are not mended. From the third
@@ -62,16 +63,15 @@ def race(
     - `hypotheses`: whether all hypotheses of all readings are refined as well.
     """
     starts = [task for reading in readings if hypotheses for task in _hypotheses(reading)]
-    coarse = _refined([*starts, *(_Task(*one) for one in known)], _COARSE)
-    moves = [move for best in islice(different(coarse), _MENDED) for move in _moves(best, readings)]
-    kept = islice(different(coarse + _refined(moves, _COARSE)), _KEPT)
-    return list(different(_refined([_Task(one.reading, one.matches) for one in kept], _FINE)))
+    refined = _refined([*starts, *(_Task(*one) for one in known)])
+    moves = [move for best in islice(different(refined), _MENDED) for move in _moves(best, readings)]
+    return list(different(refined + _refined(moves)))
 
 
 def hand_evidence(reading: Reading) -> float:
-    """Return the log-odds that X and Y have opposite hands, from the best coarse map of each hand."""
+    """Return the log-odds that X and Y have opposite hands, from the best map of each hand."""
     direct, mirrored = (
-        max((one.log_odds for one in _refined(list(_hypotheses(hand)), _COARSE)), default=-np.inf)
+        max((one.log_odds for one in _refined(list(_hypotheses(hand)))), default=-np.inf)
         for hand in (reading, reading.mirror())
     )
     return mirrored - direct if np.isfinite(direct + mirrored) else MIRRORED
@@ -105,15 +105,16 @@ def _hypotheses(reading: Reading) -> Iterator[_Task]:
                 yield _Task(reading, matches)
 
 
-def _refined(tasks: Sequence[_Task], stage: Stage) -> list[Candidate]:
-    """Refine maps of samples by a stage, and judge those whose refinement succeeds."""
+def _refined(tasks: Sequence[_Task]) -> list[Candidate]:
+    """Refine maps of samples, and judge those whose refinement succeeds."""
     if not tasks:
         return []
-    fitted = stage.fitted(min(len(side.areas) for task in tasks for side in (task.reading.x, task.reading.y)))
+    fewest = min(len(side.areas) for task in tasks for side in (task.reading.x, task.reading.y))
+    stages = [stage.fitted(fewest) for stage in _STAGES]
     starts = [(task.reading.spectra, Start(task.matches, excluded=task.excluded)) for task in tasks]
     return [
         Candidate(task.reading, outcome.pointwise_map, Evidence.of(task.reading, outcome.pointwise_map))
-        for task, outcome in zip(tasks, run_all([fitted], starts), strict=True)
+        for task, outcome in zip(tasks, run_all(stages, starts), strict=True)
         if outcome.successful
     ]
 

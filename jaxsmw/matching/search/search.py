@@ -6,6 +6,7 @@ import logging
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Int64
@@ -21,16 +22,17 @@ from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.evidence import Evidence, probabilities
-from jaxsmw.matching.search.race import DIFFERENT_AREA, race
+from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, race
 from jaxsmw.matching.search.reading import Reading
+from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset
 
 logger = logging.getLogger("jaxsmw")
 
-# If the relative boundary of one mesh is longer than that of the other by this factor, one mesh can be a part
-# of the other.
-_LONGER = 1.5
+# One mesh can be a part of the other if its boundary is so long, relative to the square root of its area, and
+# longer than that of the other by this factor.
+_LONG, _LONGER = 0.4, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,20 +102,27 @@ def search(
     settings = preset.search
     if settings is None:
         return [first]
-    judged = [_finished(first, preset)] if first.evidence else [first]
+    judged = [first]
     if probabilities([first.log_odds])[0] < settings.certain:
         logger.info("the map is uncertain, so other maps are tried ...")
         known = [(reading, reading.reduced(first.pointwise_map))] if first.evidence else []
         candidates = race(list(_readings(reading, mirror)) if hypotheses else [reading], known, hypotheses)
-        shares = probabilities([candidate.log_odds for candidate in candidates])
-        likely = [
-            c for c, share in zip(candidates, shares, strict=True) if share >= settings.likely * shares[0]
-        ]
-        for number, candidate in enumerate(likely[: settings.finalists], 1):
+        for number, candidate in enumerate(_likely(candidates, settings), 1):
             logger.info("map %d ...", number)
-            of_candidate = _refined(candidate.reading, candidate.reading.extended(candidate.matches), preset)
-            judged.append(_finished(of_candidate, preset))
-    return _different(judged)
+            judged.append(_refined(candidate.reading, candidate.reading.extended(candidate.matches), preset))
+    judged = _different(judged)
+    likely = _likely(judged, settings)
+    return _different([_finished(one, preset) if one in likely else one for one in judged])
+
+
+_Map = TypeVar("_Map", Candidate, Judged)
+
+
+def _likely(maps: Sequence[_Map], settings: SearchSettings) -> list[_Map]:
+    """Return the most probable maps, the best first, if they are not much less probable than the best."""
+    shares = probabilities([one.log_odds for one in maps])
+    order = np.argsort(-shares, kind="stable")[: settings.finalists]
+    return [maps[number] for number in order if shares[number] >= settings.likely * shares[order[0]]]
 
 
 def _readings(reading: Reading, mirror: Mirror) -> Iterator[Reading]:
@@ -131,7 +140,7 @@ def _as_parts(reading: Reading) -> Iterator[Reading]:
     """
     prepared, pair = reading.prepared, reading.prepared.pair
     shorter, longer = sorted(map(relative_boundary, pair.meshes))
-    if pair.partial or longer <= _LONGER * shorter:
+    if pair.partial or longer < max(_LONG, _LONGER * shorter):
         return
     known: list[float] = []
     for scale in (1.0, "unknown"):
@@ -172,7 +181,7 @@ def _finished(judged: Judged, preset: Preset) -> Judged:
     passes make the map less probable.
     """
     settings, prepared = preset.search, judged.reading.prepared
-    if settings is None or judged.evidence is None or prepared.pair.partial:
+    if settings is None or not judged.outcome.successful or prepared.pair.partial:
         return judged
     spectra = prepared.spectra
     change = area_shape_difference(prepared.pair, judged.pointwise_map, *spectra.both)
