@@ -15,7 +15,7 @@ InitialMap = Literal["shot", "wks", "hks", "wavelet", "functional", "aligned"]
 """The names of the initial maps; see `jaxsmw.initial_map`."""
 DEFAULT_INITIAL_MAP: InitialMap = "shot"
 MatchInit = Literal["auto", InitialMap]
-"""The names that `jaxsmw.match` accepts; `"auto"` chooses `"shot"` or `"aligned"`."""
+"""The names that `jaxsmw.match` accepts; `"auto"` begins with `"shot"` and may try others."""
 DEFAULT_MATCH_INIT: MatchInit = "auto"
 
 Mirror = Literal["auto", "no", "yes"]

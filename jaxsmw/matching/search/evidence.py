@@ -13,9 +13,13 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py). The
-# number `_LEAST` is added to the deformation, because even right maps of samples have such a deformation.
-_INTERCEPT, _DEFORMATION, _DISSIMILARITY, MIRRORED = -3.7, -3.9, -5.5, -5.1
+# weight of mirror images is not fitted: it is the logarithm of their odds among all pairs that people match.
+_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _UNCOVERED, _IN_PLACE, MIRRORED = -6.0, -4.0, -3.0, -4.0, 1.5, -4.0
+# This number is added to the deformation, because even right maps of samples have such a deformation.
 _LEAST = 0.01
+# A sample of Y is covered if a match is nearer than the first distance. A map is in place if the mean
+# distance between the given positions of samples and of their matches is below the second one.
+_COVERED, _NEAR = 0.08, 0.1
 
 
 class Evidence(NamedTuple):
@@ -27,23 +31,35 @@ class Evidence(NamedTuple):
       `deformation`.
     - `dissimilarity`: the mean squared difference between the SHOT descriptors of samples and of their
       matches, divided by its mean for random matches. It is 0 for congruent shapes.
+    - `uncovered`: the square root of the share of Y's area without matches, from 0 to 1; 0 for partial pairs.
+    - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
     - `mirrored`: whether X is mirrored. Most pairs are of the same hand, or their own mirror images.
     """
 
     deformation: float
     dissimilarity: float
+    uncovered: float
+    in_place: bool
     mirrored: bool
 
     @classmethod
     def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
         """Measure a map of samples (s,)."""
-        areas, (x, y) = reading.x.areas, (spectrum.descriptors for spectrum in reading.spectra.both)
+        x, y, areas = reading.x, reading.y, reading.x.areas
+        of_x, of_y = (spectrum.descriptors for spectrum in reading.spectra.both)
         dissimilarity = 1.0  # as for random matches
-        if x is not None and y is not None:
+        if of_x is not None and of_y is not None:
             # The descriptors are principal components of variance 1.
-            differences = ((np.asarray(x) - np.asarray(y)[matches]) ** 2).mean(axis=1) / 2
+            differences = ((np.asarray(of_x) - np.asarray(of_y)[matches]) ** 2).mean(axis=1) / 2
             dissimilarity = float(areas @ differences)
-        return cls(float(areas @ deformation(reading, matches)), dissimilarity, reading.x.mirrored)
+        uncovered = 0.0
+        if not reading.prepared.pair.partial:
+            uncovered = float(y.areas @ (y.distances[:, np.unique(matches)].min(axis=1) > _COVERED)) ** 0.5
+        offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
+        in_place = bool(areas @ offsets < _NEAR * y.unit) and not x.mirrored
+        return cls(
+            float(areas @ deformation(reading, matches)), dissimilarity, uncovered, in_place, x.mirrored
+        )
 
     @property
     def log_odds(self) -> float:
@@ -52,6 +68,8 @@ class Evidence(NamedTuple):
             _INTERCEPT
             + _DEFORMATION * np.log(self.deformation + _LEAST)
             + _DISSIMILARITY * self.dissimilarity
+            + _UNCOVERED * self.uncovered
+            + _IN_PLACE * self.in_place
             + MIRRORED * self.mirrored
         )
 
