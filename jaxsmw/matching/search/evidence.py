@@ -14,7 +14,7 @@ from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py). The
 # weight of mirror images is not fitted: it is the logarithm of their odds among all pairs that people match.
-_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _UNCOVERED, _IN_PLACE, MIRRORED = -6.0, -4.0, -3.0, -4.0, 1.5, -4.0
+_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _UNCOVERED, _IN_PLACE, MIRRORED = -1.5, -3.0, -5.5, -3.0, 0.0, -2.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
 _LEAST = 0.01
 # A sample of Y is covered if a match is nearer than the first distance. A map is in place if the mean

@@ -120,7 +120,7 @@ def _refined(tasks: Sequence[_Task]) -> list[Candidate]:
 
 
 def _moves(candidate: Candidate, readings: Sequence[Reading]) -> Iterator[_Task]:
-    """Yield what may mend a map: to leave out its faults, or the other hand if most of it is reversed."""
+    """Yield what may mend a map: to leave out its faults, or the same map and its twin for the other hand."""
     reading, matches = candidate.reading, candidate.matches
     pair, spectrum = reading.prepared.pair, reading.prepared.x.spectrum.truncate(50)
     everywhere = reading.extended(matches)
@@ -128,7 +128,9 @@ def _moves(candidate: Candidate, readings: Sequence[Reading]) -> Iterator[_Task]
     for fault in (reversed_, discontinuous_parts(pair, everywhere)):
         if _SMALL < pair.mesh_x.average(fault) < _LARGE:
             yield _Task(reading, matches, fault[reading.x.samples.vertices])
-    if pair.mesh_x.average(reversed_) > _MOSTLY:
-        for other in readings:
-            if other.x.distances is reading.x.distances and other.x.mirrored != reading.x.mirrored:
+    for other in readings:
+        if other.x.distances is reading.x.distances and other.x.mirrored != reading.x.mirrored:
+            if pair.mesh_x.average(reversed_) > _MOSTLY:
                 yield _Task(other, matches)
+            # If X is its own mirror image, both hands then have equally good maps.
+            yield _Task(other, matches[reading.self_symmetry])

@@ -81,6 +81,14 @@ class Reading:
         partial = self.prepared.pair.partial
         return SpectralPair(x, y, partial=partial, common_limit=partial)
 
+    @cached_property
+    def self_symmetry(self) -> SampleMap:
+        """For each sample of X the sample of X with the most similar mirror image, which may be itself."""
+        mirrored, own = (
+            np.hstack([side.shot(radius) for radius in _RADII]) for side in (self.x.mirror(), self.x)
+        )
+        return np.argmax(mirrored @ own.T, axis=1)  # all descriptors have the same norm
+
     def reduced(self, pointwise_map: Int64[np.ndarray, " m"]) -> SampleMap:
         """Return the map of the samples of a map X -> Y (m,)."""
         return self.y.samples.nearest[pointwise_map[self.x.samples.vertices]]
