@@ -7,8 +7,8 @@
 of each kind of made shapes: people, animals, an ape and people, bodies with topological noise, teeth of both
 sides, jaws, halves of a brain, parts called partial and parts called full, creatures, and bumpy bodies with
 their mirror images. `search` always runs all hypotheses, and returns maps that differ from each other. A map
-is right if its mean error is below 0.1 and at most 10 % of its errors exceed 0.25 times the square root of the
-area.
+is right if its mean error is below 0.1 and at most 10 % of its errors exceed 0.25, in units of the square root
+of the area.
 
 The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence.probabilities`, and the
 script maximises their likelihood. It prints the weights of all kinds together. For the tables of results, the
