@@ -139,7 +139,7 @@ def described(*found: Any) -> Row:
         "functional_map": digest(*(one.functional_map for one in found)),
         "distortion": " ".join(repr(one.distortion) for one in found),
         "suspicious": " ".join(repr(bool(one.suspicious)) for one in found),
-        "mirrored": " ".join(f"{one.mirrored} {one.mirror_evidence!r}" for one in found),
+        "mirrored": " ".join(repr(one.mirrored) for one in found),
         **expected(one.expected_error() for one in found),
         "other": digest(*other),
     }
@@ -261,12 +261,12 @@ def without_times(file: Path) -> bytes | list[Row]:
 
 def programs() -> dict[str, Callable[[Path], Row]]:
     """Return the function that traces each program of a stage."""
-    repair, last = ACCURATE.repair, ACCURATE.stages[-1]
+    search, last = ACCURATE.search, ACCURATE.stages[-1]
     stages = {
         **{f"{name} {i}": s for name, preset in jaxsmw.PRESETS.items() for i, s in enumerate(preset.stages)},
         **{f"accurate large {i}": stage for i, stage in enumerate(ACCURATE.large.stages)},
-        "accurate trimmed": last.with_levels(repair.trimmed_levels),
-        **{f"accurate coarse {i}": last.with_levels(levels) for i, levels in enumerate(repair.coarse_levels)},
+        "accurate trimmed": last.with_levels(search.trimmed_levels),
+        **{f"accurate coarse {i}": last.with_levels(levels) for i, levels in enumerate(search.coarse_levels)},
     }
     names = "{}, {}{}{}".format
     return {

@@ -29,7 +29,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "stage": {"preset": Stage(WaveletPreservation(bank=jaxsmw.Meyer(8)), number_of_eigenvectors=60)},
     "least-squares": {"preset": Stage(LEAST_SQUARES, number_of_eigenvectors=30, stop_when_unchanged=True)},
     "stages": {"preset": STAGES},
-    "repaired-stages": {"preset": jaxsmw.Preset(STAGES[:1], STAGES[1:], repair=jaxsmw.RepairSettings())},
+    "searched-stages": {"preset": jaxsmw.Preset(STAGES[:1], STAGES[1:], search=jaxsmw.SearchSettings())},
     "large-stages": {"preset": ACCURATE.large},
     "cotangent": {"laplacian": "cotangent"},
     "robust": {"laplacian": "robust", "preset": "paper"},
@@ -61,7 +61,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 # meshes have about 700, 1500 or 5000 vertices.
 MATCHES = """
 quadruped: quadruped 700 0 source -> quadruped 700 0 target: accurate paper fast stage least-squares stages
-    repaired-stages large-stages cotangent robust approximate history paper-history mirrored not-mirrored
+    searched-stages large-stages cotangent robust approximate history paper-history mirrored not-mirrored
     paper-mirrored shot aligned wks hks wavelet functional paper-aligned paper-wks paper-functional
     given-map given-points given-landmarks paper-landmarks fast-points
 biped: biped 760 1 source -> biped 760 1 target: accurate paper fast stages aligned

@@ -41,8 +41,10 @@ from jaxsmw.evaluation.ground_truth import read_ground_truth
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import make_mesh
+from jaxsmw.io.maps import read_pointwise_map
 from jaxsmw.io.meshes import read_mesh, write_mesh
 from jaxsmw.matching.match import match
+from jaxsmw.matching.search.alternatives import Alternative
 from jaxsmw.matching.stages import PRESETS, Stage, choose_preset
 from jaxsmw.report.texture import TEXTURE_FILES
 from jaxsmw.wording import percentage
@@ -238,9 +240,7 @@ def usual_settings(pair, tmp_path_factory) -> dict:
         ("--stop-when-unchanged", lambda: {"stop_when_unchanged": True}),
     ],
 )
-@pytest.mark.filterwarnings(
-    "ignore:.*limbs may be swapped"
-)  # with some options, the map of the pair is wrong
+@pytest.mark.filterwarnings("ignore:.*wrong as a whole")  # with some options, the map of the pair is wrong
 def test_an_option_changes_the_setting_that_it_names_and_no_other(
     run, pair, tmp_path, calls, usual_settings, options, changed
 ):
@@ -372,7 +372,7 @@ def test_a_page_of_a_partial_shape_uses_a_common_range_of_eigenvalues(run, pair,
     assert shown_maps(tmp_path / "p.html")[0]["functional"] is None
 
 
-@pytest.mark.filterwarnings("default:.*limbs may be swapped")
+@pytest.mark.filterwarnings("default:.*wrong as a whole")
 def test_the_overlap_of_partial_shapes_is_written(run, pair, tmp_path):
     mesh = read_mesh(pair / "x.off")
     high = mesh.vertices[:, 1] > np.quantile(mesh.vertices[:, 1], 0.4)
@@ -492,7 +492,7 @@ def test_seams_are_reported_and_welded(run, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*wrong as a whole:UserWarning")
 def test_demo_writes_a_pair_and_a_better_map(run, tmp_path):
     small = ["--vertices", "1000", "--preset", "paper", "--eigenvectors", "40"]
     outcome = run("demo", "--output", tmp_path / "demo", *small)
@@ -562,25 +562,49 @@ def test_the_quality_of_the_map_is_printed(run, pair, tmp_path, monkeypatch):
     source = read_mesh(pair / "x.off")
     mean = f"area-weighted mean expected error {1e3 * source.average(computed[0]):.2f} x 10^-3 sqrt(area)"
     summary = json.loads((tmp_path / "r" / "summary.json").read_text())
-    wrong = f"wrong on a part of the body with probability {percentage(summary['wrong_probability'])}"
+    wrong = f"wrong as a whole with probability {percentage(summary['wrong_probability'])}"
     assert QUALITY.search(output)[1] == quality and quality.endswith(f", {mean}, {wrong}")
     assert len(computed) == 2
     written = source.average(np.loadtxt(tmp_path / "e.txt"))
     assert summary["result"]["expected error, mean"] == f"{written:.4f} √area"
 
     match = jaxsmw.matching.match.match
-    for distortion, suspicious, begin, end in (
-        (1.2345, False, f"distortion 1.234 (1 for isometries), {mean}, wrong on a part", " %"),
-        (2.5, True, f"distortion 2.500 (1 for isometries), {mean}, wrong on a part", " %, the map is suspicious"),
-    ):  # fmt: skip
-        judged = {"distortion": distortion, "suspicious": suspicious}
-        monkeypatch.setattr(
-            jaxsmw.matching.match, "match", lambda *a, j=judged, **k: replace(match(*a, **k), **j)
+    others = tuple(Alternative(np.arange(642), share, "mirrored") for share in (0.2, 0.001))
+    judged = {"distortion": 1.2345, "probability": 0.75, "alternatives": others}
+    monkeypatch.setattr(jaxsmw.matching.match, "match", lambda *a, **k: replace(match(*a, **k), **judged))
+    for command in (call, ["transfer", *call[1:3], "--registered", tmp_path / "r.off", *call[5:]]):
+        lines = iter(run(*command, *SMALL).output.splitlines())
+        quality = next(line for line in lines if line.startswith("quality:"))
+        assert quality.endswith(
+            f"distortion 1.234 (1 for isometries), {mean}, wrong as a whole with probability 25 %"
         )
-        for command in (call, ["transfer", *call[1:3], "--registered", tmp_path / "r.off", *call[5:]]):
-            quality = QUALITY.search(run(*command, *SMALL).output)[1]
-            assert quality.startswith(begin) and quality.endswith(end)
-            assert "probability" in quality
+        assert next(lines) == "other maps:  1. mirrored, right with probability 20 %"
+        assert next(lines) == "             2. mirrored, right with probability below 1 %"
+
+
+@pytest.mark.parametrize("name", ["map.txt", "map", "a.b.npy"])
+def test_other_maps_are_written_beside_the_map(run, pair, tmp_path, monkeypatch, name):
+    """The most probable ones are written, if there are as many."""
+    others = tuple(Alternative(np.full(642, number), 0.1, "mirrored") for number in (7, 8))
+    monkeypatch.setattr(
+        jaxsmw.matching.match,
+        "match",
+        lambda *meshes, **_: replace(match(*meshes, preset="fast", mirror="no"), alternatives=others),
+    )
+    meshes = [read_mesh(pair / file) for file in ("x.off", "y.ply")]
+    call = ["match", pair / "x.off", pair / "y.ply"]
+    root, suffix = os.path.splitext(name)
+    for most in (None, 1, 3):
+        directory = tmp_path / str(most)
+        directory.mkdir()
+        asked = [] if most is None else ["--alternatives", most]
+        outcome = run(*call, "--output", directory / name, *asked)
+        written = {f"{root}_alternative_{k + 1}{suffix}" for k in range(min(2, most or 0))}
+        assert {path.name for path in directory.iterdir()} == {name} | written
+        assert_written_files_are_named(outcome, files_in(directory))
+    for number, other in enumerate(others, 1):
+        file = directory / f"{root}_alternative_{number}{suffix}"
+        np.testing.assert_array_equal(read_pointwise_map(file, *meshes), other.pointwise_map)
 
 
 def test_the_expected_error_is_written(run, pair, tmp_path):
@@ -720,7 +744,7 @@ def test_the_times_account_for_the_whole_run_and_all_files_are_named(run, pair, 
     total = float(re.match(r"time: +([\d.]+) s: ", line)[1])
     steps = {name: float(seconds) for name, seconds in re.findall(r"([a-z-][a-z -]+) ([\d.]+) s\b", line)}
     assert list(steps) == [
-        "loading", "reading", "eigenbases", "mirror test", "initial map", "refinement", "writing", "one-to-one map",
+        "loading", "reading", "eigenbases", "initial map", "refinement", "writing", "one-to-one map",
         "surface points", "expected error", "geodesic errors", "report", "other",
     ]  # fmt: skip
     assert sum(steps.values()) == pytest.approx(total, abs=0.01 * len(steps))

@@ -146,6 +146,9 @@ def test_an_impossible_one_to_one_map_is_refused_before_the_work(run, pair, tmp_
 def test_outputs_with_the_same_name_are_refused(run, pair, tmp_path):
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL]
     assert_refused(run(*call, "--one-to-one", tmp_path / "map.txt"), naming="two outputs have this name")
+    search = [*call[:5], "--alternatives", "2"]
+    clash = run(*search, "--one-to-one", tmp_path / "map_alternative_2.txt")
+    assert_refused(clash, naming="map_alternative_2.txt: two outputs have this name")
     call += ["--expected-error", tmp_path / "source.obj"]
     assert_refused(run(*call, "--texture", tmp_path), naming="two outputs have this name")
     (tmp_path / "target.obj").write_text("v 0 0 0\n")
@@ -309,6 +312,10 @@ def test_hostile_map_files_are_refused(run, pair, tmp_path, name, use):
             "overwritten",
         ),
         ("match {x} {y} --out {t}/m", "--output"),
+        ("match {x} {y} --output . --alternatives 1", "not a file"),
+        ("match {x} {y} --output {t}/m --alternatives 0", "at least 1"),
+        ("match {x} {y} --output {t}/m --preset paper --alternatives 1", "--preset accurate"),
+        ("match {x} {y} --output {t}/m --eigenvectors 20 --alternatives 1", "--preset accurate"),
         ("evaluate {x} {y} {p}/truth.txt", "--ground-truth"),
         ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --output {t}/no/e.json", "no/e.json"),
         ("evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --output {t}/e.csv", "ends in .json"),
@@ -465,6 +472,7 @@ def test_names_that_no_file_can_have_are_refused(run, pair, tmp_path, name, kind
         "match {x} {y} --output {t}/m --eigenvectors",
         "match {x} {y} --output {t}/m --samples",
         "match {x} {y} --output {t}/m --filters",
+        "match {x} {y} --output {t}/m --alternatives",
         "evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --evaluation-samples",
         "evaluate {x} {y} {p}/truth.txt --ground-truth {p}/truth.txt --evaluation-samples 3 --seed",
         "spectrum {x} --eigenvectors",

@@ -7,7 +7,6 @@ from itertools import combinations, permutations
 import jax
 import numpy as np
 import pytest
-from jaxsmw.matching.search.chirality import Decision
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -18,10 +17,12 @@ from jaxsmw.collection import (
     choose_edges,
     choose_hands,
     edge_errors,
+    hands,
     match_pairs,
     synchronize,
 )
 from jaxsmw.collection.consistency import cycle_error, estimate_edge_errors, find_outliers, triangles
+from jaxsmw.collection.hands import compare_hands
 from jaxsmw.collection.pairs import prepare_task
 from jaxsmw.collection.shapes import prepare_collection, prepare_shape, preset_key
 from jaxsmw.collection.synchronization import carry, robust_mean, vertices_as_points
@@ -34,9 +35,12 @@ from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.executor import run, run_batches
 from jaxsmw.matching.outcome import Start
+from jaxsmw.matching.search.evidence import MIRRORED
 from jaxsmw.matching.shape import prepare_shapes
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
+from jaxsmw.runtime.cache import Store
+from jaxsmw.runtime.progress import no_progress
 
 
 def random_distances(number, seed=0):
@@ -173,19 +177,72 @@ def test_an_edge_in_no_cycle_keeps_its_prior():
 
 def test_hands_agree_with_noisy_evidence():
     rng = np.random.default_rng(0)
-    hands = rng.random(20) < 0.4
-    decisions = {}
+    true_hands = rng.random(20) < 0.4
+    evidence = {}
     for i, j in combinations(range(20), 2):
         if rng.random() < 0.3:
-            true = 1.0 if hands[i] != hands[j] else -1.0
-            evidence = 0.4 * true * (-0.3 if rng.random() < 0.1 else 1)
-            decisions[i, j] = Decision(evidence > 0.05, evidence, False, True)
-    np.testing.assert_array_equal(choose_hands(20, decisions), hands)
+            true = 1.0 if true_hands[i] != true_hands[j] else -1.0
+            evidence[i, j] = 4.0 * true * (-0.3 if rng.random() < 0.1 else 1)
+    np.testing.assert_array_equal(choose_hands(20, evidence), true_hands)
 
 
-def test_symmetric_shapes_have_one_hand():
-    decisions = {(0, 1): Decision(False, 0.3, True, False), (1, 2): Decision(False)}
-    assert not choose_hands(3, decisions).any()
+def test_at_most_half_of_the_shapes_are_mirrored():
+    """Of two equal halves, the half with the first shape is not mirrored."""
+    for given in map(np.array, ([0, 1, 1, 1], [1, 0, 0, 1], [0, 0, 1])):
+        number = len(given)
+        evidence = {(i, j): 2.0 * (given[i] != given[j]) - 1 for i, j in combinations(range(number), 2)}
+        found = choose_hands(number, evidence)
+        assert (found == given).all() or (found != given).all()
+        assert 2 * found.sum() < number or not found[0]
+    assert choose_hands(2, {(0, 1): 1.0}).tolist() == [False, True]
+
+
+def test_shapes_without_evidence_for_other_hands_have_one_hand():
+    """Of shapes that are their own mirror images, only a few unconnected pairs are compared."""
+    assert not choose_hands(3, {}).any()
+    evidence = {(0, 3): -5.1, (1, 2): -5.0, (4, 7): -5.0, (5, 8): -5.0, (6, 9): -5.0}
+    assert not choose_hands(10, evidence).any()
+
+
+@pytest.mark.filterwarnings("ignore:.*use a finer mesh:UserWarning")
+def test_a_few_pairs_tell_whether_shapes_are_their_own_mirror_images(monkeypatch):
+    """If they are not, the hands of all pairs of the graph are compared, and the store keeps the evidence."""
+    shapes, _ = prepare_collection([creature(vertices=500, seed=seed) for seed in range(6)], PRESETS["paper"])
+    compared, reports, store = [], [], Store(None)
+
+    def compare(store):
+        compared.clear()
+        return compare_hands(
+            shapes,
+            PRESETS["paper"],
+            "exact",
+            seed=0,
+            store=store,
+            progress=lambda step, done, total: reports.append((step, done, total)),
+        )
+
+    def evidence(value):
+        monkeypatch.setattr(hands, "hand_evidence", lambda reading: compared.append(reading) or value)
+
+    evidence(MIRRORED + 1)
+    assert len(compare(store)) == len(compared) == 5 and not reports
+    evidence(4.0)
+    found = compare(store)
+    assert len(found) == len(compared) == 9 and set(found.values()) == {4.0}
+    assert reports[-1] == ("hands", 9, 9)
+    assert all(reading.prepared.x is not reading.prepared.y for reading in compared)
+
+
+@pytest.mark.filterwarnings("ignore:.*use a finer mesh:UserWarning")
+def test_evidence_of_hands_is_kept_in_the_store(monkeypatch, tmp_path):
+    shapes, _ = prepare_collection([creature(vertices=500, seed=seed) for seed in range(2)], PRESETS["paper"])
+    compared = []
+    monkeypatch.setattr(hands, "hand_evidence", lambda reading: compared.append(reading) or 2.5)
+    for _ in range(2):
+        found = compare_hands(
+            shapes, PRESETS["paper"], "exact", seed=0, store=Store(tmp_path), progress=no_progress
+        )
+        assert found == {(0, 1): 2.5} and len(compared) == 1
 
 
 # ------------------------------------------------------------------------------------------- synchronisation

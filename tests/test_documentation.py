@@ -90,7 +90,7 @@ def pair():
         if code_blocks(page)
     ],
 )
-@pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*wrong as a whole:UserWarning")
 def test_code_blocks_run(page, pair, tmp_path, monkeypatch, small_pictures):
     write_mesh(tmp_path / "source.off", pair.source)
     write_mesh(tmp_path / "target.ply", pair.target)

@@ -28,7 +28,7 @@ from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching import descriptors, shape
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.match import match, refine_and_judge
+from jaxsmw.matching.match import match, match_prepared
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import describe, paired_spectra
 from jaxsmw.matching.stages import PRESETS, Preset, Stage, choose_preset
@@ -174,9 +174,9 @@ def test_no_program_of_a_stage_is_compiled_twice(pair, preset, programs, compila
 def test_coarse_passes_share_one_program(pair, compilations):
     """The levels are an argument of the program, so only their number and the largest level matter."""
     accurate = PRESETS["accurate"]
-    always = replace(accurate, repair=replace(accurate.repair, non_isometric=0.0, coarse_from=0.0))
+    always = replace(accurate, search=replace(accurate.search, non_isometric=0.0, coarse_from=0.0))
     found = match(*pair[:2], preset=always, init="shot", mirror="no", backend="jax")
-    assert len(accurate.repair.coarse_levels) == 2
+    assert len(accurate.search.coarse_levels) == 2
     assert compilations.count("jit(refine)") == len(found.preset.stages) + 1
 
 
@@ -327,10 +327,10 @@ def test_stages_leave_the_cores_to_xla(pair, monkeypatch):
 
     def watched(*arguments, **options):
         meanwhile.append(threads())
-        return refine_and_judge(*arguments, **options)
+        return match_prepared(*arguments, **options)
 
     meanwhile: list[list[int]] = []
-    monkeypatch.setattr("jaxsmw.matching.match.refine_and_judge", watched)
+    monkeypatch.setattr("jaxsmw.matching.match.match_prepared", watched)
     threads_module._libraries.cache_clear()  # other tests load libraries that bring their own BLAS
     with threadpool_limits(2, user_api="blas"):
         before = threads()
@@ -345,7 +345,7 @@ def test_stages_are_logged(pair, caplog, monkeypatch):
     monkeypatch.setattr(logging.getLogger("jaxsmw"), "propagate", False)
     with caplog.at_level(logging.INFO, "jaxsmw"):
         match(*pair[:2], preset=replace(STAGE, number_of_samples=100))
-    steps = ["eigenbases", "samples", "mirror test", "initial map", "refinement"]
+    steps = ["eigenbases", "samples", "initial map", "refinement"]
     assert caplog.messages == [f"{step} ..." for step in steps]
 
 
@@ -459,9 +459,8 @@ def test_presets_match_a_copy_accurately(pair, usual):
     assert accurate.iterations == 3 + 4 + 4 + 4 and accurate.functional_map.shape == (200, 200)
     assert len(accurate.preset.stages) == 4 != len(usual.preset.stages) and accurate.distortion < 1.05
     assert paper.functional_map.shape == (100, 100) != usual.functional_map.shape
-    steps = ["eigenbases", "samples", "crease eigenvectors", "mirror test", "initial map", "descriptors"]
-    # The body differs from its mirror image, so the better of two maps was chosen.
-    assert list(accurate.seconds) == [*steps, "refinement", "choice of start", "final stages"]
+    steps = ["eigenbases", "samples", "crease eigenvectors", "initial map", "descriptors", "refinement"]
+    assert list(accurate.seconds) == [*steps, "final stages"]
     assert accurate.expected_error().mean() < 0.002
     points = accurate.surface_points()
     distances = np.linalg.norm(points.positions(mesh_y) - mesh_y.vertices[truth], axis=1)
@@ -595,7 +594,7 @@ def test_a_partial_shape_in_another_unit_is_refused(part):
 def test_a_partial_shape_is_matched_to_the_full_shape(part):
     mesh_x, mesh_y, truth = part
     found = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40), partial=True)
-    with pytest.warns(UserWarning, match=r"if one mesh is a partial shape, set partial=True"):
+    with pytest.warns(UserWarning, match=r"set partial=True if one mesh is a part of the other"):
         as_wholes = match(mesh_x, mesh_y, preset=replace(STAGE, number_of_eigenvectors=40), mirror="no")
     k_x, k_y = found.functional_map.shape
     assert k_x < k_y == 40
@@ -693,7 +692,7 @@ def test_an_initial_map_to_surface_points_uses_their_nearest_corners(pair):
     weights = np.full((len(start), 3), 0.01)
     weights[:, 1] = 0.98
     points = SurfacePoints(np.arange(len(start)) % len(mesh_y.faces), weights)
-    with pytest.warns(UserWarning, match="limbs may be swapped"):  # the initial map is arbitrary
+    with pytest.warns(UserWarning, match="wrong as a whole"):  # the initial map is arbitrary
         found = match(mesh_x, mesh_y, **OPTIONS, init=points)
     np.testing.assert_array_equal(found.initial_map, start[:, 1])
 

@@ -14,9 +14,9 @@ from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import GeodesicError, geodesic_error
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.judge import wrong_probability
 from jaxsmw.matching.match import match
-from jaxsmw.matching.stages import PRESETS, Stage
+from jaxsmw.matching.search.alternatives import Alternative
+from jaxsmw.matching.stages import Stage
 from jaxsmw.report.summary import REPORT_FILES, summarize, write_comparison, write_report
 from jaxsmw.wording import percentage
 
@@ -81,8 +81,8 @@ def _check_results(
 ) -> None:
     """Check that the summary and the page state the results of the match."""
     assert list(summary) == [
-        "settings", "result", "backend", "distortion", "suspicious", "wrong_probability", "errors", "seconds",
-        "provenance",
+        "settings", "result", "backend", "distortion", "suspicious", "wrong_probability", "alternatives",
+        "errors", "seconds", "provenance",
     ]  # fmt: skip
     assert summary["settings"] == {"seed": 3}
     assert summary["distortion"] == pytest.approx(1, abs=1e-3) and summary["suspicious"] is False
@@ -96,20 +96,37 @@ def _check_results(
     assert facts["error at most 0.05, initial map"] == "100.0%"
     mean = np.average(expected, weights=found.mesh_x.vertex_areas)
     assert facts["expected error, mean"] == f"{mean:.4f} √area"
-    assert summary["wrong_probability"] == pytest.approx(wrong_probability(found.distortion, mean))
-    assert facts["probability of a wrong part"] == percentage(summary["wrong_probability"])
+    assert summary["wrong_probability"] == pytest.approx(1 - found.probability)
+    assert summary["alternatives"] == []
+    assert facts["probability of a wrong map"] == percentage(summary["wrong_probability"])
     assert facts["time, total"] == f"{sum(found.seconds.values()):.2f} s"
-    with pytest.MonkeyPatch.context() as patch:
-        # The expected error cannot be computed with another preset than that of the match.
-        patch.setattr(Correspondence, "expected_error", lambda _: expected)
-        patch.setattr(Correspondence, "wrong_probability", lambda _: 0.2)
-        judged = summarize(replace(found, preset=PRESETS["accurate"], distortion=1.3, suspicious=True), {})
-    assert judged["probability of a wrong part"] == "20 %"
-    assert judged["distortion (1 is none)"] == "1.30; above 1.12 limbs may be swapped"
+    judged = summarize(replace(found, distortion=1.3, probability=0.8), {})
+    assert judged["probability of a wrong map"] == "20 %" and judged["distortion (1 is none)"] == "1.30"
     # The page shows the refined and the initial map in the convention of the refiner.
     refined, initial = embedded(page)["maps"]
     assert (refined["name"], initial["name"]) == ("refined", "initial")
     assert refined["functional"]["pushforward"] and initial["functional"]["pushforward"]
+
+
+@pytest.mark.slow
+def test_the_report_shows_other_maps_that_could_be_right(found: Correspondence, tmp_path: Path) -> None:
+    others = (Alternative(NUMBER[::-1].copy(), 0.3, "turned by 180°"), Alternative(NUMBER, 0.004, "mirrored"))
+    write_report(tmp_path, replace(found, probability=0.6, alternatives=others))
+    summary, page = read(tmp_path)
+    assert summary["wrong_probability"] == pytest.approx(0.4) and summary["suspicious"] is False
+    assert summary["alternatives"] == [
+        {"difference": "turned by 180°", "probability": 0.3},
+        {"difference": "mirrored", "probability": 0.004},
+    ]
+    shown = embedded(page)["maps"]
+    assert [one["name"] for one in shown] == [
+        "refined",
+        "initial",
+        "other 1: turned by 180° (30 %)",
+        "other 2: mirrored (below 1 %)",
+    ]
+    # The second alternative is the initial map, and the first is neither map.
+    assert shown[3]["map"] == shown[1]["map"] != shown[2]["map"]
 
 
 def test_a_comparison_explains_its_errors(errors: dict[str, GeodesicError], tmp_path: Path) -> None:

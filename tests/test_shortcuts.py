@@ -23,7 +23,7 @@ from jaxsmw.geometry import SurfacePoints, cut_shortcuts, geodesic_distances
 from jaxsmw.geometry.mesh import Mesh, diagnose
 from jaxsmw.geometry.shortcuts import points_on_uncut
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.settings import JudgeSettings, RepairSettings
+from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.stages import PRESETS, Preset, Stage
 
 
@@ -173,13 +173,13 @@ def test_components_without_loops_do_no_harm(fused):
 
 
 SHORT = Stage(FeatureRegression((10, 15, 20)), number_of_descriptors=20)
-# Repair that changes no map.
-NEVER = RepairSettings(judge=JudgeSettings(suspicious=1e3), compared=1e3, non_isometric=1e3)
-REPAIRED = Preset(repeated=(SHORT,), repair=NEVER)
+# A search that always takes the first map.
+NEVER = SearchSettings(certain=0.0, non_isometric=1e3)
+SEARCHED = Preset(repeated=(SHORT,), search=NEVER)
 
 
 @pytest.mark.slow
-def test_match_cuts_both_meshes_if_the_preset_repairs(fused, separate):
+def test_match_cuts_both_meshes_if_the_preset_has_a_search(fused, separate):
     """Maps refer to the vertices of the given meshes, and vertices that a cut isolates have matches."""
     assert not PRESETS["paper"].cuts_shortcuts
     assert not PRESETS["fast"].cuts_shortcuts
@@ -191,7 +191,7 @@ def test_match_cuts_both_meshes_if_the_preset_repairs(fused, separate):
     assert Pair(separate, separate).without_shortcuts().mesh_x is separate
     found = {}
     for cuts in (True, False):
-        preset = replace(REPAIRED, repair=replace(NEVER, cut_shortcuts=cuts))
+        preset = replace(SEARCHED, search=replace(NEVER, cut_shortcuts=cuts))
         found[cuts] = match(fused, separate, preset=preset, init="shot", mirror="no")
         assert found[cuts].mesh_x is fused
         assert found[cuts].pointwise_map.shape == (len(fused.vertices),)
@@ -209,7 +209,7 @@ def test_isolated_vertices_receive_the_match_of_their_neighbor(fused, separate, 
     gone = 100
     holed = replace(fused, faces=fused.faces[(fused.faces != gone).all(axis=1)])
     monkeypatch.setattr("jaxsmw.matching.pair.cut_shortcuts", lambda mesh: holed if mesh is fused else mesh)
-    found = match(fused, separate, preset=REPAIRED, init="shot", mirror="no").pointwise_map
+    found = match(fused, separate, preset=SEARCHED, init="shot", mirror="no").pointwise_map
     distance = np.linalg.norm(fused.vertices - fused.vertices[gone], axis=1)
     distance[gone] = np.inf
     assert found[gone] == found[np.argmin(distance)]
@@ -220,23 +220,23 @@ def test_presets_fit_the_cut_meshes(fused, separate, monkeypatch):
     holed = replace(fused, faces=fused.faces[(fused.faces > 30).all(axis=1)])
     monkeypatch.setattr("jaxsmw.matching.pair.cut_shortcuts", lambda mesh: holed)
     stage = replace(SHORT, number_of_samples=len(fused.vertices) - 5)
-    found = match(fused, fused, preset=replace(REPAIRED, repeated=(stage,)), init="shot", mirror="no")
+    found = match(fused, fused, preset=replace(SEARCHED, repeated=(stage,)), init="shot", mirror="no")
     assert found.preset.stages[0].number_of_samples is None
 
 
 @pytest.mark.slow
 def test_surface_points_as_initial_map_refer_to_the_given_faces(fused, separate):
-    first = match(separate, fused, preset=REPAIRED, init="shot", mirror="no")
+    first = match(separate, fused, preset=SEARCHED, init="shot", mirror="no")
     points = first.surface_points()
-    again = match(separate, fused, preset=REPAIRED, init=points, mirror="no")
+    again = match(separate, fused, preset=SEARCHED, init=points, mirror="no")
     assert np.array_equal(again.initial_map, points.nearest_corners(fused))
 
 
 def test_pairs_of_a_collection_are_cut(fused, separate):
     """The results refer to the given meshes."""
-    (_, found), (_, backward) = match_pairs([fused, separate], [(0, 1), (1, 0)], preset=REPAIRED)
+    (_, found), (_, backward) = match_pairs([fused, separate], [(0, 1), (1, 0)], preset=SEARCHED)
     assert found.mesh_x is backward.mesh_y is fused
-    direct = match(fused, separate, preset=REPAIRED, init="shot", mirror="no")
+    direct = match(fused, separate, preset=SEARCHED, init="shot", mirror="no")
     assert np.allclose(found.spectrum_x.eigenvalues, direct.spectrum_x.eigenvalues, rtol=1e-4)
 
 
@@ -253,7 +253,7 @@ def test_points_on_a_cut_surface_keep_their_positions(fused):
 def test_collections_are_cut(fused, separate):
     """The points of the template lie on the given surfaces."""
     found = match_collection(
-        [separate, fused, fused.mirrored()], preset=REPAIRED, mirror=[False, False, True]
+        [separate, fused, fused.mirrored()], preset=SEARCHED, mirror=[False, False, True]
     )
     assert np.array_equal(found.meshes[1].faces, fused.faces)
     middle = [
@@ -267,14 +267,14 @@ def test_collections_are_cut(fused, separate):
 
 
 def test_the_setting_is_checked():
-    settings = RepairSettings()
+    settings = SearchSettings()
     object.__setattr__(settings, "cut_shortcuts", "no")
     with pytest.raises(InputError, match="cut_shortcuts is 'no': give True or False"):
         settings.__post_init__()  # without the run-time type checks of the tests
 
 
 @pytest.mark.sampled
-@pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*wrong as a whole:UserWarning")
 def test_real_contacts(shared):
     """With topological noise, the map becomes better if contacts are cut."""
     data = open_data_set(shared / "data" / "shrec16_topology")
@@ -285,7 +285,7 @@ def test_real_contacts(shared):
     truth, errors = pair.ground_truth(mesh_x, mesh_y), []
     preset = PRESETS["accurate"]
     for cuts in (True, False):
-        chosen = replace(preset, repair=replace(preset.repair, cut_shortcuts=cuts))
+        chosen = replace(preset, search=replace(preset.search, cut_shortcuts=cuts))
         found = match(mesh_x, mesh_y, preset=chosen)
         errors.append(geodesic_error(mesh_y, found.pointwise_map, truth, number_of_samples=300).mean)
     assert errors[0] < 0.9 * errors[1]

@@ -15,7 +15,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.search.trimming import trimmed, trimmed_stage
-from jaxsmw.matching.settings import JudgeSettings, RepairSettings
+from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.stages import Preset, Stage
 
 TRIMMED = Preset(
@@ -24,9 +24,9 @@ TRIMMED = Preset(
         Stage(Registration((30, 60))),
     ),
     final=(Stage(Registration((60, 60))),),
-    repair=RepairSettings(judge=JudgeSettings(suspicious=10.0, suspicious_area=1.0)),
+    search=SearchSettings(certain=0.0),
 )
-WHOLE = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=0))
+WHOLE = replace(TRIMMED, search=replace(TRIMMED.search, trims=0))
 
 
 @pytest.fixture(scope="module")
@@ -139,21 +139,21 @@ def test_all_vertices_have_matches_after_trimming(pose, part):
 
 
 def test_the_trimmed_stage_is_the_last_stage_with_lower_levels(pose, part):
-    pair, repair = Pair(part, pose[0], True), replace(TRIMMED.repair, trimmed_levels=(20, 40, 200))
-    stage = trimmed_stage(pair, replace(TRIMMED, repair=repair))
+    pair, search = Pair(part, pose[0], True), replace(TRIMMED.search, trimmed_levels=(20, 40, 200))
+    stage = trimmed_stage(pair, replace(TRIMMED, search=search))
     # No level exceeds the number of eigenvectors of the last stage.
     assert stage == TRIMMED.stages[-1].with_levels((20, 40, 60))
     without_levels = Stage(number_of_eigenvectors=40)
-    unchanged = trimmed_stage(pair, replace(TRIMMED, final=(without_levels,), repair=repair))
+    unchanged = trimmed_stage(pair, replace(TRIMMED, final=(without_levels,), search=search))
     assert unchanged == without_levels
     share = 1.001 * pose[0].area / part.area
     for other, settings in (
         (pair, None),
-        (pair, replace(repair, trims=0)),
-        (pair, replace(repair, trimmed_from=share)),
-        (replace(pair, partial=False), repair),
+        (pair, replace(search, trims=0)),
+        (pair, replace(search, trimmed_from=share)),
+        (replace(pair, partial=False), search),
     ):
-        assert trimmed_stage(other, replace(TRIMMED, repair=settings)) is None
+        assert trimmed_stage(other, replace(TRIMMED, search=settings)) is None
 
 
 @pytest.mark.slow
@@ -170,7 +170,7 @@ def test_full_shapes_and_parts_of_similar_area_are_not_trimmed(pose, part):
 @pytest.mark.usefixtures("no_programs")
 def test_all_trims_share_one_program(pose, part, compilations):
     _, target, truth = pose
-    twice = replace(TRIMMED, repair=replace(TRIMMED.repair, trims=2))
+    twice = replace(TRIMMED, search=replace(TRIMMED.search, trims=2))
     found = match(part, target, partial=True, preset=twice, init=rough(target, truth), backend="jax")
     assert len(found.preset.before_final) == 2
     assert compilations.count("jit(refine)") == 2
@@ -188,7 +188,7 @@ def test_a_scaled_part_has_the_same_map(pose, part):
 @pytest.mark.parametrize("wrong", [{"trims": -1}, {"trimmed_from": 0.0}, {"trimmed_area": 0.0}])
 def test_wrong_settings_of_trimming_are_refused(wrong):
     with pytest.raises(InputError, match=next(iter(wrong))):
-        RepairSettings(**wrong)
+        SearchSettings(**wrong)
 
 
 @pytest.mark.sampled

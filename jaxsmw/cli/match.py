@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,7 @@ from jaxsmw.cli.measurement import (
     measure_errors,
     show_match,
 )
-from jaxsmw.cli.method import add_method, check_method, match_meshes
+from jaxsmw.cli.method import add_method, check_method, match_meshes, preset_name
 from jaxsmw.cli.outputs import check_outputs, report_written, write_match_report
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write, make_directory
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     from jaxsmw.matching.correspondence import Correspondence
 
 HELP = "match two meshes and write the map"
+
+# A search leaves fewer maps than this.
+_MOST_ALTERNATIVES = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--alternatives",
         metavar="K",
-        type=whole_number(1),
+        type=whole_number(1, _MOST_ALTERNATIVES),
         help="write up to K other maps that could be right beside --output, the most probable first, for "
         "example map_alternative_1.txt beside map.txt",
     )
@@ -124,6 +128,8 @@ def _check(options: argparse.Namespace) -> None:
     init_files = options.init.files
     check_method(options)
     check_evaluation(options)
+    searches = preset_name(options) == "accurate"
+    refuse_without(options, "--preset accurate", searches, "alternatives")
     refuse_without(options, "--partial", options.partial, "scale", "overlap")
     refuse_without(options, "--report", bool(options.report), "up")
     reads_indices = bool(options.ground_truth or init_files)
@@ -185,8 +191,8 @@ def _write_files(
 
 def _alternative_file(output: str, number: int) -> str:
     """Return the name of the file of an alternative map, beside the output."""
-    file = Path(output)
-    return str(file.with_name(f"{file.stem}_alternative_{number}{file.suffix}"))
+    root, suffix = os.path.splitext(output)
+    return f"{root}_alternative_{number}{suffix}"
 
 
 def _write_points(options: argparse.Namespace, correspondence: Correspondence, points: SurfacePoints) -> None:

@@ -66,8 +66,8 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_MATCH_INIT,
         help=f"initial map: {', '.join(get_args(MatchInit))}, landmarks:FILE, "
         "landmarks:SOURCE_FILE,TARGET_FILE or map:FILE (default: "
-        "%(default)s). auto is shot; with --preset accurate, shapes that differ from their own mirror "
-        "images, like teeth, are also matched from aligned, and the better map is kept. With shot, wks, hks "
+        "%(default)s). auto is shot; with --preset accurate, other initial maps are also tried if the map "
+        "is uncertain. With shot, wks, hks "
         "and wavelet, each source vertex is matched to the target vertex with the most similar descriptor. "
         "aligned also compares positions after a rigid alignment. "
         "functional computes a functional map that preserves SHOT descriptors. A landmarks file has a "
@@ -79,9 +79,9 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         "--preset",
         choices=get_args(PresetName),
         help="method of refinement: paper is the method of the MWP paper; fast is the same method on "
-        "samples; accurate has more stages and repairs maps, so refinement takes nine to ten times as long "
-        f"as with paper (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next group is "
-        "given)",
+        "samples; accurate has more stages and a search for the right map, so refinement takes nine to ten "
+        f"times as long as with paper (default: {DEFAULT_PRESET}, or {_PAPER} if any option of the next "
+        "group is given)",
     )
     group.add_argument(
         "--backend",

@@ -48,8 +48,8 @@ def choose_hands(number: int, evidence: Mapping[Edge, float]) -> Bool[np.ndarray
     agreement = np.zeros((number, number))
     for (i, j), of_edge in evidence.items():
         agreement[i, j] = agreement[j, i] = -of_edge
-    if not agreement.any():
-        return np.zeros(number, bool)
+    if agreement.min() >= 0:
+        return np.zeros(number, bool)  # all pairs are of one hand; they need not connect all shapes
     _, vectors = np.linalg.eigh(agreement)
     hands = np.where(vectors[:, -1] < 0, -1.0, 1.0)
     for _ in range(number):
@@ -86,7 +86,7 @@ def compare_hands(
             return {"evidence": np.array(hand_evidence(reading))}
 
         key_x, key_y = (shape_key(shape, preset, eigensolver) for shape in (x, y))
-        return float(store.get("hand", (*key_x, *key_y), compute)["evidence"])
+        return float(store.get("evidence", (*key_x, *key_y), compute)["evidence"])
 
     edges = choose_edges(shape_distances(shapes), edges_per_shape=_COMPARED_PER_SHAPE, seed=seed)
     first = edges[:: max(1, len(edges) // _COMPARED_FIRST)][:_COMPARED_FIRST]
