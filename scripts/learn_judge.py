@@ -7,8 +7,8 @@
 of each kind of made shapes: people, animals, an ape and people, bodies with topological noise, teeth of both
 sides, jaws, halves of a brain, parts called partial and parts called full, creatures, and bumpy bodies with
 their mirror images. `search` always runs all hypotheses, and returns maps that differ from each other. A map
-is right if its mean error is below 0.1 and at most 10 % of its errors exceed 0.25, in units of the square root
-of the area.
+is right if its mean error is below 0.1 and at most 10 % of its errors exceed 0.25. The unit of errors is the
+square root of the area.
 
 The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence.probabilities`, and the
 script maximises their likelihood. It prints the weights of all kinds together. For the tables of results, the
@@ -36,7 +36,7 @@ from jaxsmw import Mesh, Pair, creature_pair, make_mesh, read_mesh
 from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
 from jaxsmw.benchmark.tables import markdown
 from jaxsmw.matching.preparation import prepare
-from jaxsmw.matching.search.evidence import MIRRORED, probabilities
+from jaxsmw.matching.search.evidence import probabilities
 from jaxsmw.matching.search.search import Judged, search
 from jaxsmw.matching.stages import PRESETS
 from jaxsmw.matching.starts import make_start
@@ -49,6 +49,8 @@ MEAN, GROSS, SHARE = 0.1, 0.25, 0.1
 GROUPS = (0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1)
 # The penalty of large weights, which keeps them finite.
 PENALTY = 0.05
+# The weights from which the fit begins, with the intercept first.
+FIRST = np.array([-1.5, -2.0, -1.0, -0.5, 0.5, -0.5])
 
 
 class KnownPair(NamedTuple):
@@ -191,21 +193,17 @@ def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
 
 
 def fitted(pairs: Sequence[JudgedPair]) -> Float[np.ndarray, " f"]:
-    """Return the weights of the largest likelihood: that one of the right maps is right, or none.
-
-    The last weight, of mirror images, is given.
-    """
+    """Return the weights of the largest likelihood: that one of the right maps is right, or none."""
 
     def loss(weights: Float[np.ndarray, " f"]) -> float:
         total = 0.0
         for pair in pairs:
-            log_odds = features(pair.evidence) @ [*weights, MIRRORED]
-            likely = np.logaddexp.reduce(log_odds[pair.right]) if pair.right.any() else 0.0
-            total += np.logaddexp(0, np.logaddexp.reduce(log_odds)) - likely
+            shares = probabilities(features(pair.evidence) @ weights)
+            right = pair.right
+            total -= np.log(max(shares[right].sum() if right.any() else 1 - shares.sum(), 1e-9))
         return float(total + PENALTY * weights[1:] @ weights[1:])
 
-    first = np.zeros(features(pairs[0].evidence).shape[1] - 1)
-    return np.append(minimize(loss, first).x, MIRRORED)
+    return minimize(loss, FIRST).x
 
 
 def tables(pairs: Sequence[JudgedPair]) -> Iterator[str]:

@@ -15,6 +15,8 @@ from jaxsmw.matching.search.reading import Reading
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py). The
 # weight of mirror images is not fitted: it is the logarithm of their odds among all pairs that people match.
 _INTERCEPT, _DEFORMATION, _DISSIMILARITY, _UNCOVERED, _IN_PLACE, MIRRORED = -1.5, -3.0, -5.5, -3.0, 0.0, -2.0
+# How much differences of log-odds count between maps of the same pair.
+_CONTRAST = 10.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
 _LEAST = 0.01
 # A sample of Y is covered if a match is nearer than the first distance. A map is in place if the mean
@@ -74,14 +76,22 @@ class Evidence(NamedTuple):
         )
 
 
+NO_EVIDENCE = Evidence(np.inf, np.inf, 1.0, in_place=False, mirrored=False)
+"""What there is for a map whose refinement failed. Its log-odds are minus infinity."""
+
+
 def probabilities(log_odds: Sequence[float]) -> Float[np.ndarray, " c"]:
     """Return the probability of each of several different maps to be right, given the log-odds of each (c,).
 
-    At most one of the maps is right, and perhaps none, as in a multinomial logistic regression.
+    The log-odds of the best map say how probable it is that one of the maps is right. This probability is
+    divided among the maps by a multinomial logistic model, in which differences of the log-odds count
+    `_CONTRAST` times, because maps of the same pair are easier to compare than maps of different pairs.
     """
-    largest = max([0.0, *log_odds])
-    odds = np.exp(np.asarray(log_odds) - largest)
-    return odds / (odds.sum() + np.exp(-largest))
+    odds = np.asarray(log_odds, float)
+    if not np.isfinite(odds).any():
+        return np.zeros(len(odds))
+    shares = np.exp(_CONTRAST * (odds - odds.max()))
+    return shares / shares.sum() / (1 + np.exp(-odds.max()))
 
 
 def deformation(reading: Reading, matches: SampleMap) -> Float[np.ndarray, " s"]:

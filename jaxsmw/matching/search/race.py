@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool
@@ -28,8 +28,8 @@ _STAGES = (
     Stage(WaveletPreservation(), number_of_eigenvectors=50),
     Stage(FeatureRegression((20, 20, 26, 35)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),
 )
-# The number of maps that are mended.
-_MENDED = 4
+# The number of the best maps that are mended in each round, and the number of rounds.
+_MENDED, _ROUNDS = 4, 2
 # Two maps are different if they differ on at least this share of the area.
 DIFFERENT_AREA = 0.05
 # Faults on less than the first share or more than the second share of the area are not mended. From the third
@@ -51,21 +51,26 @@ class Candidate:
         return self.evidence.log_odds
 
 
-def race(
-    readings: Sequence[Reading], known: Iterable[tuple[Reading, SampleMap]], hypotheses: bool = True
-) -> list[Candidate]:
+Kind = TypeVar("Kind", bound=Candidate)
+
+
+def race(readings: Sequence[Reading], known: Iterable[Candidate], hypotheses: bool = True) -> list[Candidate]:
     """Refine maps of samples together, and return different maps, the best first.
 
     **Arguments:**
 
     - `readings`: the readings of the pair.
-    - `known`: known maps of samples, each with its reading.
+    - `known`: known maps of samples.
     - `hypotheses`: whether all hypotheses of all readings are refined as well.
     """
     starts = [task for reading in readings if hypotheses for task in _hypotheses(reading)]
-    refined = _refined([*starts, *(_Task(*one) for one in known)])
-    moves = [move for best in islice(different(refined), _MENDED) for move in _moves(best, readings)]
-    return list(different(refined + _refined(moves)))
+    found = _refined([*starts, *(_Task(one.reading, one.matches) for one in known)])
+    moved: list[Candidate] = []
+    for _ in range(_ROUNDS):
+        new = [best for best in islice(different(found), _MENDED) if best not in moved]
+        found += _refined([move for best in new for move in _moves(best, readings)])
+        moved += new
+    return list(different(found))
 
 
 def hand_evidence(reading: Reading) -> float:
@@ -77,9 +82,9 @@ def hand_evidence(reading: Reading) -> float:
     return mirrored - direct if np.isfinite(direct + mirrored) else MIRRORED
 
 
-def different(candidates: Sequence[Candidate]) -> Iterator[Candidate]:
+def different(candidates: Sequence[Kind]) -> Iterator[Kind]:
     """Yield candidates that differ from all better ones, the best first."""
-    yielded: list[Candidate] = []
+    yielded: list[Kind] = []
     for candidate in sorted(candidates, key=lambda candidate: -candidate.log_odds):
         twins = (
             candidate.reading.difference(candidate.matches, other.matches) < DIFFERENT_AREA

@@ -6,7 +6,6 @@ import logging
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Int64
@@ -21,8 +20,8 @@ from jaxsmw.matching.judge import area_shape_difference
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.search.evidence import Evidence, probabilities
-from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, race
+from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probabilities
+from jaxsmw.matching.search.race import Candidate, Kind, different, race
 from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
@@ -33,44 +32,30 @@ logger = logging.getLogger("jaxsmw")
 # One mesh can be a part of the other if its boundary is so long, relative to the square root of its area, and
 # longer than that of the other by this factor.
 _LONG, _LONGER = 0.4, 1.5
+# The largest number of races. The maps of the first race, refined at all vertices, are mended by the second.
+_ROUNDS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
-    """A refined map and the evidence for it.
+class Judged(Candidate):
+    """A map that was refined at all vertices, and the evidence for it.
 
-    **Attributes:**
-
-    - `reading`: the `Reading` of the pair in which the map was refined.
-    - `outcome`: the `Outcome` of the stages.
-    - `evidence`: the `Evidence` that the map is right; None if a stage failed.
+    **Attributes:** those of `Candidate`, and `outcome`, the successful `Outcome` of the stages.
     """
 
-    reading: Reading
     outcome: Outcome
-    evidence: Evidence | None
 
     @classmethod
     def of(cls, reading: Reading, outcome: Outcome) -> Judged:
-        """Judge the outcome of stages."""
-        if not outcome.successful:
-            return cls(reading, outcome, None)
-        return cls(reading, outcome, Evidence.of(reading, reading.reduced(outcome.pointwise_map)))
-
-    @property
-    def log_odds(self) -> float:
-        """The log-odds that the map is right; minus infinity after a failure."""
-        return -np.inf if self.evidence is None else self.evidence.log_odds
+        """Judge the outcome of stages. After a failure, there is no evidence for the map."""
+        matches = reading.reduced(outcome.pointwise_map)
+        evidence = Evidence.of(reading, matches) if outcome.successful else NO_EVIDENCE
+        return cls(reading, matches, evidence, outcome)
 
     @property
     def pointwise_map(self) -> Int64[np.ndarray, " m"]:
         """The map of the last stage (m,), 0-based vertices of Y."""
         return self.outcome.pointwise_map
-
-    def differs(self, other: Judged) -> bool:
-        """Return whether two maps differ on a relevant share of X's area."""
-        first, second = (self.reading.reduced(one.pointwise_map) for one in (self, other))
-        return self.reading.difference(first, second) >= DIFFERENT_AREA
 
 
 def search(
@@ -103,22 +88,29 @@ def search(
     if settings is None:
         return [first]
     judged = [first]
-    if probabilities([first.log_odds])[0] < settings.certain:
+    searches = hypotheses and not _certain(judged, settings)
+    readings = list(_readings(reading, mirror)) if searches else [reading]
+    for number in range(_ROUNDS):
+        if _certain(judged, settings):
+            break
         logger.info("the map is uncertain, so other maps are tried ...")
-        known = [(reading, reading.reduced(first.pointwise_map))] if first.evidence else []
-        candidates = race(list(_readings(reading, mirror)) if hypotheses else [reading], known, hypotheses)
-        for number, candidate in enumerate(_likely(candidates, settings), 1):
-            logger.info("map %d ...", number)
-            judged.append(_refined(candidate.reading, candidate.reading.extended(candidate.matches), preset))
-    judged = _different(judged)
+        candidates = race(readings, judged, hypotheses and number == 0)
+        # A twin can be better if it reads the pair in another way.
+        new = [one for one in different([*judged, *candidates]) if one not in judged]
+        refined = [_refined(one, preset) for one in _likely(new, settings)]
+        if not refined:
+            break
+        judged = list(different([*judged, *refined]))
     likely = _likely(judged, settings)
-    return _different([_finished(one, preset) if one in likely else one for one in judged])
+    return list(different([_finished(one, preset) if one in likely else one for one in judged]))
 
 
-_Map = TypeVar("_Map", Candidate, Judged)
+def _certain(judged: Sequence[Judged], settings: SearchSettings) -> bool:
+    """Return whether the best map is right with a large enough probability."""
+    return bool(probabilities([one.log_odds for one in judged]).max() >= settings.certain)
 
 
-def _likely(maps: Sequence[_Map], settings: SearchSettings) -> list[_Map]:
+def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
     """Return the most probable maps, the best first, if they are not much less probable than the best."""
     shares = probabilities([one.log_odds for one in maps])
     order = np.argsort(-shares, kind="stable")[: settings.finalists]
@@ -159,19 +151,11 @@ def _as_parts(reading: Reading) -> Iterator[Reading]:
 _SAME_SCALE = 0.05
 
 
-def _different(judged: Sequence[Judged]) -> list[Judged]:
-    """Return the maps that differ from all better ones, the best first."""
-    kept: list[Judged] = []
-    for one in sorted(judged, key=lambda judged: -judged.log_odds):
-        if not kept or (one.evidence and all(one.differs(other) for other in kept)):
-            kept.append(one)
-    return kept
-
-
-def _refined(reading: Reading, pointwise_map: Int64[np.ndarray, " m"], preset: Preset) -> Judged:
-    """Run the repeated stages of a preset from a map in a reading."""
-    reading = reading.described(preset)
-    return Judged.of(reading, run(preset.repeated, reading.prepared.spectra, Start(pointwise_map)))
+def _refined(candidate: Candidate, preset: Preset) -> Judged:
+    """Run the repeated stages of a preset from a map of samples."""
+    reading = candidate.reading.described(preset)
+    start = Start(reading.extended(candidate.matches))
+    return Judged.of(reading, run(preset.repeated, reading.prepared.spectra, start))
 
 
 def _finished(judged: Judged, preset: Preset) -> Judged:
