@@ -212,7 +212,7 @@ def test_twins_are_merged_and_the_better_one_is_kept(pair):
     slightly[few] = wrong[few]
 
     def candidate(matches, score):
-        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, 0.0, False, False))
+        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, False, False))
 
     candidates = [candidate(matches, 1.0), candidate(slightly, 2.0), candidate(wrong, 0.5)]
     assert list(different(candidates)) == [candidates[1], candidates[2]]

@@ -12,16 +12,15 @@ from jaxsmw.geometry.alignment import nearest_rotations
 from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import Reading
 
-# The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py). The
-# weight of mirror images is not fitted: it is the logarithm of their odds among all pairs that people match.
-_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _UNCOVERED, _IN_PLACE, MIRRORED = -1.5, -3.0, -5.5, -3.0, 0.0, -2.0
+# The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
+_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, MIRRORED = -0.8, -1.8, -2.1, 0.9, -2.1
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 10.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
 _LEAST = 0.01
-# A sample of Y is covered if a match is nearer than the first distance. A map is in place if the mean
-# distance between the given positions of samples and of their matches is below the second one.
-_COVERED, _NEAR = 0.08, 0.1
+# A map is in place if the mean distance between the given positions of samples and of their matches is below
+# this number of units of Y.
+_NEAR = 0.1
 
 
 class Evidence(NamedTuple):
@@ -33,14 +32,12 @@ class Evidence(NamedTuple):
       `deformation`.
     - `dissimilarity`: the mean squared difference between the SHOT descriptors of samples and of their
       matches, divided by its mean for random matches. It is 0 for congruent shapes.
-    - `uncovered`: the square root of the share of Y's area without matches, from 0 to 1; 0 for partial pairs.
     - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
     - `mirrored`: whether X is mirrored. Most pairs are of the same hand, or their own mirror images.
     """
 
     deformation: float
     dissimilarity: float
-    uncovered: float
     in_place: bool
     mirrored: bool
 
@@ -54,14 +51,9 @@ class Evidence(NamedTuple):
             # The descriptors are principal components of variance 1.
             differences = ((np.asarray(of_x) - np.asarray(of_y)[matches]) ** 2).mean(axis=1) / 2
             dissimilarity = float(areas @ differences)
-        uncovered = 0.0
-        if not reading.prepared.pair.partial:
-            uncovered = float(y.areas @ (y.distances[:, np.unique(matches)].min(axis=1) > _COVERED)) ** 0.5
         offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         in_place = bool(areas @ offsets < _NEAR * y.unit) and not x.mirrored
-        return cls(
-            float(areas @ deformation(reading, matches)), dissimilarity, uncovered, in_place, x.mirrored
-        )
+        return cls(float(areas @ deformation(reading, matches)), dissimilarity, in_place, x.mirrored)
 
     @property
     def log_odds(self) -> float:
@@ -70,13 +62,12 @@ class Evidence(NamedTuple):
             _INTERCEPT
             + _DEFORMATION * np.log(self.deformation + _LEAST)
             + _DISSIMILARITY * self.dissimilarity
-            + _UNCOVERED * self.uncovered
             + _IN_PLACE * self.in_place
             + MIRRORED * self.mirrored
         )
 
 
-NO_EVIDENCE = Evidence(np.inf, np.inf, 1.0, in_place=False, mirrored=False)
+NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False, mirrored=False)
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 
