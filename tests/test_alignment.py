@@ -1,14 +1,11 @@
 """Rigid alignment, and the initial map that uses it."""
 
-import importlib
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
-from jaxsmw import PRESETS, Pair, RepairSettings, creature_pair, initial_map, make_mesh, match, paired_spectra
+from jaxsmw import Pair, initial_map, make_mesh, match, paired_spectra
 from jaxsmw.geometry.alignment import align_rigidly
 
 LUMP = bumpy_mesh(3)
@@ -58,45 +55,6 @@ def test_mirrored_shapes_are_aligned_as_their_mirror_images():
     np.testing.assert_array_equal(found.initial_map, np.arange(len(LUMP.vertices)))
 
 
-def _expected(found):
-    return float(found.expected_error().mean())
-
-
-def _count_calls(monkeypatch, name):
-    """Let a function append to the returned list whenever it is called."""
-    module, _, function = name.rpartition(".")
-    original, calls = getattr(importlib.import_module(module), function), []
-
-    def counted(*arguments, **options):
-        calls.append(None)
-        return original(*arguments, **options)
-
-    monkeypatch.setattr(name, counted)
-    return calls
-
-
-@pytest.mark.slow
-def test_asymmetric_shapes_are_matched_from_both_initial_maps(monkeypatch):
-    """The lump differs from its mirror image, so `match` keeps the better of two maps."""
-    noise = 0.004 * np.random.default_rng(1).normal(size=LUMP.vertices.shape)
-    target = make_mesh(Rotation.random(random_state=3).apply(LUMP.vertices + noise), LUMP.faces)
-    each = {init: match(LUMP, target, init=init, mirror="no") for init in ("shot", "aligned")}
-    from_shot = _expected(each["shot"]) < RepairSettings().aligned_preference * _expected(each["aligned"])
-    best = each["shot" if from_shot else "aligned"]
-    estimates = _count_calls(monkeypatch, "jaxsmw.matching.judge.expected_error")
-    descriptors = _count_calls(monkeypatch, "jaxsmw.matching.preparation.shot_descriptors")
-    for mirror in ("auto", "no"):
-        estimates.clear()
-        descriptors.clear()
-        found = match(LUMP, target, mirror=mirror)
-        found.expected_error()
-        assert len(estimates) == 3  # one for each map before the choice, and one for the result
-        assert len(descriptors) == 2  # one for each shape
-        assert found.init == best.init
-        np.testing.assert_array_equal(found.pointwise_map, best.pointwise_map)
-        assert {"mirror test", "choice of start"} <= found.seconds.keys()
-
-
 @pytest.mark.sampled
 def test_a_bent_shape_is_matched_from_descriptors():
     """No rigid motion brings a bent shape into place, so the map from SHOT is better."""
@@ -107,27 +65,7 @@ def test_a_bent_shape_is_matched_from_descriptors():
     target = make_mesh(Rotation.random(random_state=4).apply(bent), faces)
     found = match(make_mesh(straight, faces), target)
     apart = np.linalg.norm(target.vertices[found.pointwise_map] - target.vertices, axis=1)
-    assert found.init == "shot" and apart.mean() < 0.02 * target.area**0.5
-
-
-@pytest.mark.sampled
-def test_a_mirrored_asymmetric_shape_is_aligned_as_its_mirror_image():
-    settings = replace(PRESETS["accurate"], repair=RepairSettings(aligned_preference=0.0))
-    found = match(LUMP, _turned(LUMP.mirrored()), preset=settings)
-    assert found.mirrored and found.init == "aligned"
-    np.testing.assert_array_equal(found.initial_map, np.arange(len(LUMP.vertices)))
-
-
-@pytest.mark.slow
-def test_symmetric_and_partial_shapes_and_presets_without_repair_start_from_descriptors():
-    pair = creature_pair(vertices=700)
-    assert match(pair.source, pair.target).init == "shot"
-    assert match(LUMP, _turned(LUMP), preset="paper").init == "shot"
-    assert match(LUMP, _turned(LUMP), partial=True).init == "shot"
-
-
-def _turned(mesh):
-    return make_mesh(Rotation.random(random_state=3).apply(mesh.vertices), mesh.faces)
+    assert apart.mean() < 0.02 * target.area**0.5
 
 
 def test_tangent_planes_bring_a_nearly_round_copy_into_its_exact_place():

@@ -46,8 +46,9 @@ class Proxy:
     def __init__(self, shape: PreparedShape, unit: float) -> None:
         mesh, compared = shape.mesh, shape.compared
         self.mesh, self.spectrum, self.unit, self.mirrored = mesh, shape.spectrum, unit, False
-        number = min(SAMPLES, len(mesh.referenced_indices))
-        vertices = farthest_point_samples(mesh, number, None if compared is None else compared.vertices)
+        among = mesh.referenced_indices if compared is None else compared.vertices
+        number = min(SAMPLES, len(among))
+        vertices = farthest_point_samples(mesh, number, among)
         self.samples = SurfaceSamples.along_surface(mesh, vertices, compared)
         areas = np.bincount(self.samples.nearest, mesh.vertex_areas, number)
         self.areas = areas / mesh.area
