@@ -5,9 +5,9 @@
 - `paper`: three iterations for random pairs in float32. The candidates are a Python loop over `refine`,
   `jax.lax.map`, `jax.vmap` with several batch sizes, and `jaxsmw.refine_pairs`. The time of `refine_pairs`
   includes the transfer of initial maps and results.
-- `accurate`: all stages of the preset `"accurate"` in float32, without repair. The candidates are several
+- `accurate`: all stages of the preset `"accurate"` in float32, without a search. The candidates are several
   batch sizes of `run_batches`, which includes the transfer of initial maps and results. The last row is
-  `jaxsmw.match_pairs`, which also computes initial maps and scores, and repairs maps, on the host.
+  `jaxsmw.match_pairs`, which also computes initial maps and searches for better maps, on the host.
 
 The candidates of a table take turns in one process. The lower bound is the time of all matrix products of a
 program, computed in full float32 precision and in batches. The script finds these products in the traced
@@ -277,7 +277,7 @@ def agreement(options: argparse.Namespace) -> Iterator[Part]:
             measured[name]["errors"] = errors
     yield (
         "Agreement with the CPU",
-        f"{len(shapes.pairs)} ordered pairs of {len(shapes.meshes)} shapes, all stages, without repair, "
+        f"{len(shapes.pairs)} ordered pairs of {len(shapes.meshes)} shapes, all stages, without a search, "
         "float32 on both devices.",
         rows,
         measured,

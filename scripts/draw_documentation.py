@@ -245,7 +245,7 @@ def draw_another_kind() -> None:
     draw_side_by_side("failure_another_kind", panels)
 
 
-def draw_without_repair() -> None:
+def draw_without_search() -> None:
     """Match a collection by `paper` and by `accurate`, and draw its template and one other quadruped."""
     meshes = [creature("quadruped", vertices=800 + 20 * seed, seed=seed) for seed in range(5)]
     collections = {
@@ -308,7 +308,7 @@ def main() -> None:
         ("tutorial", draw_tutorial),
         ("transfers", draw_transfers),
         ("another_kind", draw_another_kind),
-        ("collection", draw_without_repair),
+        ("collection", draw_without_search),
     ):
         if not options.only or name in options.only:
             draw()

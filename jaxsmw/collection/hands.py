@@ -75,7 +75,7 @@ def compare_hands(
 
     A few pairs are compared first. If one of them is not its own mirror image, all other pairs are compared.
 
-    **Returns:** For each compared edge, the `hand_evidence` that its shapes have opposite hands.
+    **Returns:** For each compared edge, the evidence that its shapes have opposite hands, in log-odds.
     """
 
     def evidence(edge: Edge) -> float:
@@ -97,4 +97,6 @@ def compare_hands(
         if edge not in compared:
             compared[edge] = evidence(edge)
         progress("hands", number + 1, len(edges))
-    return compared
+    # That mirror images are rare counts once for each shape, and not once for each of its edges.
+    counted_again = MIRRORED * (1 - 0.5 / _COMPARED_PER_SHAPE)
+    return {edge: of_edge - counted_again for edge, of_edge in compared.items()}

@@ -26,7 +26,7 @@ from jaxsmw.matching.starts import make_start
 from jaxsmw.runtime.backends import Device, check_devices, chosen_backend
 from jaxsmw.runtime.threads import one_blas_thread
 
-# Each device refines this number of pairs before their maps are judged.
+# Each device refines this number of pairs before their maps are judged, and others are searched for.
 _PAIRS_PER_DEVICE = 64
 
 
