@@ -103,14 +103,22 @@ def test_rigid_motions_have_no_deformation_and_reflections_have(pair):
 
 
 def test_deformation_is_the_residual_of_procrustes_alignment(pair):
+    """Each sample stands for two points on its normal, at a distance of 0.1 from the surface."""
     mesh_x, mesh_y, truth = pair
     reading = read(mesh_x, mesh_y)
     x, y, matches = reading.x, reading.y, reading.reduced(truth)
     found = deformation(reading, matches)
     for sample in range(0, len(x.areas), 50):
         patch = x.distances[sample] < 0.2
-        weights = x.areas[patch] / x.areas[patch].sum()
-        source, target = (p - weights @ p for p in (x.positions[patch], y.positions[matches[patch]]))
+        weights = np.tile(x.areas[patch], 2) / x.areas[patch].sum() / 2
+        source, target = (
+            np.concatenate([p - 0.1 * n, p + 0.1 * n])
+            for p, n in (
+                (x.positions[patch], x.normals[patch]),
+                (y.positions[matches[patch]], y.normals[matches[patch]]),
+            )
+        )
+        source, target = source - weights @ source, target - weights @ target
         rotation, _ = Rotation.align_vectors(target, source, weights=weights)
         residual = weights @ np.sum((rotation.apply(source) - target) ** 2, axis=1)
         size = weights @ np.sum(source**2 + target**2, axis=1)

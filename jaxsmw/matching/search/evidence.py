@@ -13,11 +13,13 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, MIRRORED = -0.8, -1.8, -2.1, 0.9, -2.1
+_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, MIRRORED = -1.0, -2.0, -2.0, 0.9, -1.5
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 10.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
 _LEAST = 0.01
+# The distance of the points on normals from the surface, in units of the square root of the area.
+_THICKNESS = 0.1
 # A map is in place if the mean distance between the given positions of samples and of their matches is below
 # this number of units of Y.
 _NEAR = 0.1
@@ -90,18 +92,20 @@ def deformation(reading: Reading, matches: SampleMap) -> Float[np.ndarray, " s"]
 
     A rotation and a translation carry the patch as close as possible to its matches. The deformation is the
     mean squared distance that remains, divided by the size of the patch. The size is the variance of the
-    patch's positions plus the variance of its matches.
+    patch's positions plus the variance of its matches. For each sample, two points on its normal count, one
+    on either side of the surface, because a reflection of a thin flat patch would only turn it over.
 
-    A map that bends a body at its joints deforms most patches little. A mirrored map deforms most patches,
-    because no rotation undoes a reflection. Upside-down maps also deform most patches. The deformation is an
-    "as-rigid-as-possible" energy (Sorkine, Alexa 2007).
+    A map that bends a body at its joints deforms most patches little. Mirrored and upside-down maps deform
+    most patches. The deformation is an "as-rigid-as-possible" energy (Sorkine, Alexa 2007).
 
     **Returns:** The deformation of each patch (s,), from 0 for a rigid motion to at most 1.
     """
     source, target = reading.x.positions, reading.y.positions[matches]
-    products = np.einsum("sa,sb->sab", source, target).reshape(-1, 9)
-    squares = np.sum(source**2 + target**2, axis=1, keepdims=True)
-    columns = reading.patches @ np.hstack([source, target, products, squares])
+    products = np.einsum("sa,sb->sab", source, target)
+    # The sums over two points on the normal of each sample, one on either side of the surface.
+    products += _THICKNESS**2 * np.einsum("sa,sb->sab", reading.x.normals, reading.y.normals[matches])
+    squares = np.sum(source**2 + target**2, axis=1, keepdims=True) + 2 * _THICKNESS**2
+    columns = reading.patches @ np.hstack([source, target, products.reshape(-1, 9), squares])
     mean_x, mean_y = columns[:, :3], columns[:, 3:6]
     moments = columns[:, 6:15].reshape(-1, 3, 3) - np.einsum("sa,sb->sab", mean_x, mean_y)
     size = columns[:, 15] - np.sum(mean_x**2 + mean_y**2, axis=1)

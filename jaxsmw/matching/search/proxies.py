@@ -40,7 +40,8 @@ class Proxy:
     - `samples`: the samples, as `SurfaceSamples`.
     - `areas`: the share of the surface area that belongs to each sample (s,). The shares have the sum 1.
     - `positions`: the positions of the samples (s, 3).
-    - `mirrored`: whether positions and SHOT are those of the mirror image.
+    - `normals`: the outward mean normals of the regions of the samples (s, 3).
+    - `mirrored`: whether positions, normals and SHOT are those of the mirror image.
     """
 
     def __init__(self, shape: PreparedShape, unit: float) -> None:
@@ -53,12 +54,18 @@ class Proxy:
         areas = np.bincount(self.samples.nearest, mesh.vertex_areas, number)
         self.areas = areas / mesh.area
         self.positions = mesh.vertices[self.samples.vertices] / unit
+        outward = mesh.vertex_areas * mesh.vertex_normals.T * (-1 if mesh.is_inside_out else 1)
+        sums = [np.bincount(self.samples.nearest, row, len(self.areas)) for row in outward]
+        normals = np.stack(sums, axis=1)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        self.normals = normals / np.maximum(lengths, np.finfo(float).tiny)
 
     def mirror(self) -> Proxy:
         """Return the proxy of the mirror image, which shares the distances of this proxy."""
         self.distances  # noqa: B018 (computed once, for both)
         mirrored = copy.copy(self)
-        mirrored.positions, mirrored.mirrored = self.positions * [-1, 1, 1], not self.mirrored
+        mirrored.positions, mirrored.normals = (rows * [-1, 1, 1] for rows in (self.positions, self.normals))
+        mirrored.mirrored = not self.mirrored
         return mirrored
 
     @functools.cached_property
