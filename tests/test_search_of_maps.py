@@ -300,6 +300,7 @@ def test_a_wrong_map_is_reported_with_what_could_be_done(pair):
     assert found.suspicious and found.wrong_probability() == 1 - found.probability > 0.5
 
 
+@pytest.mark.filterwarnings("ignore:.*the map is wrong as a whole:UserWarning")
 def test_the_given_hand_is_used(lump):
     target = turned(lump)
     given = match(lump, target, preset="fast", mirror="yes")
@@ -327,6 +328,7 @@ def test_evidence_of_hands_has_opposite_signs_for_opposite_hands(lump):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*neighbours within the SHOT radius:UserWarning")
 def test_a_part_given_as_a_whole_is_recognised(pair):
     mesh_x, mesh_y, truth = pair
     height = mesh_x.vertices[:, 1]
