@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import Literal
 
 import numpy as np
@@ -40,9 +39,8 @@ _DENSE = 400
 _BLOCK = 4
 # The number of subspace dimensions per eigenvector.
 _DIMENSIONS_OF_SUBSPACE = 30
-# If a mesh has at least this number of vertices, the two meshes of a pair are prepared one after the other,
-# which takes half of the memory.
-ONE_BY_ONE_FROM = 200_000
+# The number of rows of a matrix that fit into the cache.
+_ROWS = 1024
 # If one more smoothing step lowers an eigenvalue by more than this fraction, the approximation is rejected.
 # The relative error of an accepted eigenvalue is up to three times this fraction.
 _MOST_LOWERED = 0.015
@@ -180,8 +178,7 @@ def solve_on_surface(
         values, vectors = _solve(stiffness, areas, number, eigensolver, mesh.name)
     # Signs are changed in place, because another copy of the eigenvectors of a large mesh may not fit into
     # memory.
-    for column in vectors.T:
-        column *= np.sign(column[np.argmax(np.abs(column))])
+    vectors *= np.where(vectors.max(axis=0) < -vectors.min(axis=0), -1, 1)
     return values, mesh.spread(vectors)
 
 
@@ -425,28 +422,28 @@ def _approximate(stiffness: sp.csc_matrix, mass: sp.csc_matrix, k: int) -> tuple
     except RuntimeError:
         _, combinations = _arpack(coarse.stiffness, coarse.mass, taken)
     n, single = stiffness.shape[0], combinations.astype(np.float32)
-    basis, eigenvectors = np.empty((n, taken)), np.empty((n, k))
+    basis = np.empty((n, taken))
     grams = np.zeros((2, taken, taken))  # only the upper triangles of these matrices are filled
-
-    def smooth(columns: slice) -> None:
-        basis[:, columns] = coarse.smooth(coarse.prolongation @ single[:, columns])
-
-    # Meshes of such sizes are prepared one after the other, so each of them may use two cores.
-    with ThreadPoolExecutor(2 if n >= ONE_BY_ONE_FROM else 1) as executor:
-        list(executor.map(smooth, _slices(taken)))
     for columns in _slices(taken):
+        basis[:, columns] = coarse.smooth(coarse.prolongation @ single[:, columns])
         for gram, matrix in zip(grams, (stiffness, mass), strict=True):
             gram[: columns.stop, columns] = basis[:, : columns.stop].T @ (matrix @ basis[:, columns])
     eigenvalues, combinations = scipy.linalg.eigh(*grams, lower=False, subset_by_index=(0, k - 1))
-    for columns in _slices(k):
-        eigenvectors[:, columns] = basis @ combinations[:, columns]
+    # The eigenvectors replace the basis, because both may not fit into memory.
+    for start in range(0, n, _ROWS):
+        rows = slice(start, start + _ROWS)
+        basis[rows, :k] = basis[rows] @ combinations
+    eigenvectors = basis[:, :k]
     # The last ten eigenvectors are checked, because they are the least accurate if all triangles are badly
     # shaped. Every third eigenvector is also checked, because any eigenvector can be the least accurate if
     # only one region has badly shaped triangles.
     looked_at = np.union1d(np.arange(1, k, 3), np.arange(max(1, k - 10), k))
-    smoother = coarse.smooth(eigenvectors[:, looked_at]).astype(float)
-    norms, energies = (np.sum(smoother * (matrix @ smoother), axis=0) for matrix in (mass, stiffness))
-    lowered = (eigenvalues[looked_at] * norms / energies - 1).max(initial=0)
+    lowered = 0.0
+    for columns in _slices(len(looked_at)):
+        checked = looked_at[columns]
+        smoother = coarse.smooth(eigenvectors[:, checked]).astype(float)
+        norms, energies = (np.einsum("nk,nk->k", smoother, matrix @ smoother) for matrix in (mass, stiffness))
+        lowered = max(lowered, (eigenvalues[checked] * norms / energies - 1).max())
     if lowered > _MOST_LOWERED:
         raise RuntimeError(f"eigenvalues would be wrong by {lowered:.0%} or more")
     return eigenvalues, eigenvectors

@@ -8,14 +8,14 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float, Float64, Int, Int64, Shaped
+from jaxtyping import Float, Int, Int64, Shaped
 
 from jaxsmw.choices import DEFAULT_BACKEND, Backend, Eigensolver, Laplacian
-from jaxsmw.core.arrays import Array, namespace, on_host
+from jaxsmw.core.arrays import Array, float_type, namespace, on_host
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.creases import crease_eigenvectors
-from jaxsmw.geometry.eigenbasis import ONE_BY_ONE_FROM, as_spectrum, choose_eigensolver, eigenpairs
+from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples, poisson_disk_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
@@ -148,16 +148,18 @@ def prepare_shapes(
     """
     if eigensolver == "auto":
         eigensolver = choose_eigensolver(*meshes)
-    pairwise = len(meshes) == 2 and max(len(mesh.vertices) for mesh in meshes) < ONE_BY_ONE_FROM
+    dtype = float_type()  # threads do not inherit `jax.enable_x64`
 
     def each(compute: Callable[[Mesh], Computed]) -> Sequence[Computed]:
-        return side_by_side(compute, *meshes) if pairwise else [compute(mesh) for mesh in meshes]
+        return side_by_side(compute, *meshes) if len(meshes) == 2 else [compute(mesh) for mesh in meshes]
+
+    def shape(mesh: Mesh) -> PreparedShape:
+        pairs = eigenpairs(mesh, number, laplacian=laplacian, eigensolver=eigensolver)
+        return _shape(mesh, as_spectrum(mesh, *pairs, dtype=dtype))
 
     number, creases, samples = sizes
     with step("eigenbases"):
-        pairs = each(lambda mesh: eigenpairs(mesh, number, laplacian=laplacian, eigensolver=eigensolver))
-        # Spectra are made outside of the threads, because threads do not inherit `jax.enable_x64`.
-        shapes = [_shape(mesh, *of_mesh) for mesh, of_mesh in zip(meshes, pairs, strict=True)]
+        shapes = list(each(shape))
     if samples:
         with step("samples"):
             vertices = each(lambda mesh: farthest_point_samples(mesh, samples))
@@ -181,13 +183,7 @@ def prepare_shapes(
     ]
 
 
-def _shape(
-    mesh: Mesh,
-    eigenvalues: Float64[np.ndarray, " k"],
-    eigenvectors: Float64[np.ndarray, "n k"],
-    vertex_areas: Float64[np.ndarray, " n"],
-) -> PreparedShape:
-    spectrum = as_spectrum(mesh, eigenvalues, eigenvectors, vertex_areas)
+def _shape(mesh: Mesh, spectrum: Spectrum) -> PreparedShape:
     if np.asarray(spectrum.eigenvalues)[-1] == 0:
         raise InputError(
             f"{mesh.name}: the largest of the {len(spectrum.eigenvalues)} eigenvalues is zero, so the "
