@@ -15,7 +15,7 @@ from jaxsmw.matching.search.reading import Reading
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
 _INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, MIRRORED = -0.2, -1.9, -2.7, 1.1, -1.5
 # How much differences of log-odds count between maps of the same pair.
-_CONTRAST = 5.0
+_CONTRAST = 7.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
 _LEAST = 0.01
 # The distance of the points on normals from the surface, in units of the square root of the area.
