@@ -46,7 +46,8 @@ class Evidence(NamedTuple):
     @classmethod
     def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
         """Measure a map of samples (s,)."""
-        x, y, areas = reading.x, reading.y, reading.x.areas
+        x, y, of_patches = reading.x, reading.y, deformation(reading, matches)
+        areas = _overlapping_areas(reading, of_patches)
         of_x, of_y = (spectrum.descriptors for spectrum in reading.spectra.both)
         dissimilarity = 1.0  # as for random matches
         if of_x is not None and of_y is not None:
@@ -55,7 +56,7 @@ class Evidence(NamedTuple):
             dissimilarity = float(areas @ differences)
         offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         in_place = bool(areas @ offsets < _NEAR * y.unit) and not x.mirrored
-        return cls(float(areas @ deformation(reading, matches)), dissimilarity, in_place, x.mirrored)
+        return cls(float(areas @ of_patches), dissimilarity, in_place, x.mirrored)
 
     @property
     def log_odds(self) -> float:
@@ -85,6 +86,22 @@ def probabilities(log_odds: Sequence[float]) -> Float[np.ndarray, " c"]:
         return np.zeros(len(odds))
     shares = np.exp(_CONTRAST * (odds - odds.max()))
     return shares / shares.sum() / (1 + np.exp(-odds.max()))
+
+
+def _overlapping_areas(reading: Reading, deformations: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+    """Return the areas of the samples of X that count, with the sum 1.
+
+    If Y is a part of X, only the least deformed patches count, with the area of Y in total.
+    """
+    areas, pair = reading.x.areas, reading.prepared.pair
+    area_x, area_y = pair.areas
+    if not pair.partial or area_y >= area_x:
+        return areas
+    order = np.argsort(deformations, kind="stable")
+    before = np.cumsum(areas[order]) - areas[order]
+    counted = np.zeros(len(areas))
+    counted[order] = np.where(before < area_y / area_x, areas[order], 0)
+    return counted / counted.sum()
 
 
 def deformation(reading: Reading, matches: SampleMap) -> Float[np.ndarray, " s"]:

@@ -105,10 +105,15 @@ class Reading:
     @cached_property
     def patches(self) -> Float[np.ndarray, "s s"]:
         """The weights of the samples in the patch around each sample of X. Each row has the sum 1."""
-        weights = (self.x.distances < _PATCH) * self.x.areas
+        distances = self.x.distances
+        fewest = min(_FEWEST, len(distances)) - 1
+        radii = np.maximum(_PATCH, np.partition(distances, fewest, axis=1)[:, fewest])
+        weights = (distances <= radii[:, None]) * self.x.areas
         return weights / weights.sum(axis=1, keepdims=True)
 
 
 # Two maps differ at a sample if its two matches are at least so far apart along the surface, and the radius
 # of the patches that a right map moves nearly rigidly; both in units of the square root of the area.
 _DIFFERENT, _PATCH = 0.2, 0.2
+# The least number of samples in a patch. Smaller patches would fit any matches.
+_FEWEST = 8
