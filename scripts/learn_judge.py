@@ -187,8 +187,11 @@ def errors_of(known: KnownPair, judged: Judged) -> tuple[float, float]:
 
 
 def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
-    """Return what the log-odds depend on linearly, in the order of `Evidence`, with the intercept first."""
-    deformation, *others = evidence.T
+    """Return what the log-odds depend on linearly, in the order of `Evidence`, with the intercept first.
+
+    The distortion is left out, because its weight is given.
+    """
+    deformation, *others, _ = evidence.T
     return np.stack([np.ones(len(evidence)), np.log(deformation + 0.01), *others], axis=1)
 
 

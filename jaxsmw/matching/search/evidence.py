@@ -14,6 +14,9 @@ from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
 _INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, MIRRORED = -0.2, -1.9, -2.7, 1.1, -1.5
+# Right maps have distortions of at most 1.2, so larger distortions count against a map. Wrong maps can have
+# small distortions, so these say nothing.
+_DISTORTION, _DISTORTED = -5.0, 1.2
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 7.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
@@ -36,16 +39,18 @@ class Evidence(NamedTuple):
       matches, divided by its mean for random matches. It is 0 for congruent shapes.
     - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
     - `mirrored`: whether X is mirrored. Most pairs are of the same hand, or their own mirror images.
+    - `distortion`: `jaxsmw.matching.judge.distortion` of a map of all vertices; 1 for a map of samples.
     """
 
     deformation: float
     dissimilarity: float
     in_place: bool
     mirrored: bool
+    distortion: float = 1.0
 
     @classmethod
-    def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
-        """Measure a map of samples (s,)."""
+    def of(cls, reading: Reading, matches: SampleMap, distortion: float = 1.0) -> Evidence:
+        """Measure a map of samples (s,), perhaps with the distortion of a map of all vertices."""
         x, y, of_patches = reading.x, reading.y, deformation(reading, matches)
         areas = _overlapping_areas(reading, of_patches)
         of_x, of_y = (spectrum.descriptors for spectrum in reading.spectra.both)
@@ -56,7 +61,7 @@ class Evidence(NamedTuple):
             dissimilarity = float(areas @ differences)
         offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         in_place = bool(areas @ offsets < _NEAR * y.unit) and not x.mirrored
-        return cls(float(areas @ of_patches), dissimilarity, in_place, x.mirrored)
+        return cls(float(areas @ of_patches), dissimilarity, in_place, x.mirrored, distortion)
 
     @property
     def log_odds(self) -> float:
@@ -67,6 +72,7 @@ class Evidence(NamedTuple):
             + _DISSIMILARITY * self.dissimilarity
             + _IN_PLACE * self.in_place
             + MIRRORED * self.mirrored
+            + _DISTORTION * max(0.0, np.log(self.distortion / _DISTORTED))
         )
 
 
