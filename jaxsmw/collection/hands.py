@@ -23,9 +23,9 @@ from jaxsmw.runtime.progress import Progress
 
 # The number of pairs whose hands are compared, divided by the number of shapes.
 _COMPARED_PER_SHAPE = 1.5
-# This number of pairs is compared first. No further pairs are compared if the evidence of each of these pairs
-# differs by less than `_SYMMETRIC` from that of shapes that are their own mirror images.
-_COMPARED_FIRST, _SYMMETRIC = 5, 3.0
+# This number of pairs is compared first. If all of them are their own mirror images, no further pairs are
+# compared.
+_COMPARED_FIRST = 5
 
 
 def choose_hands(number: int, evidence: Mapping[Edge, float]) -> Bool[np.ndarray, " N"]:
@@ -75,7 +75,7 @@ def compare_hands(
 
     A few pairs are compared first. If one of them is not its own mirror image, all other pairs are compared.
 
-    **Returns:** For each compared edge, the evidence that its shapes have opposite hands, in log-odds.
+    **Returns:** For each compared edge, the log-odds that its shapes have opposite hands.
     """
 
     def evidence(edge: Edge) -> float:
@@ -91,12 +91,10 @@ def compare_hands(
     edges = choose_edges(shape_distances(shapes), edges_per_shape=_COMPARED_PER_SHAPE, seed=seed)
     first = edges[:: max(1, len(edges) // _COMPARED_FIRST)][:_COMPARED_FIRST]
     compared = {edge: evidence(edge) for edge in first}
-    if all(abs(of_edge - MIRRORED) < _SYMMETRIC for of_edge in compared.values()):
+    if all(of_edge == MIRRORED for of_edge in compared.values()):
         return compared
     for number, edge in enumerate(edges):
         if edge not in compared:
             compared[edge] = evidence(edge)
         progress("hands", number + 1, len(edges))
-    # That mirror images are rare counts once for each shape, and not once for each of its edges.
-    counted_again = MIRRORED * (1 - 0.5 / _COMPARED_PER_SHAPE)
-    return {edge: of_edge - counted_again for edge, of_edge in compared.items()}
+    return compared

@@ -38,14 +38,14 @@ class Evidence(NamedTuple):
     - `dissimilarity`: the mean squared difference between the SHOT descriptors of samples and of their
       matches, divided by its mean for random matches. It is 0 for congruent shapes.
     - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
-    - `mirrored`: whether X is mirrored. Most pairs are of the same hand, or their own mirror images.
+    - `unlikely`: whether X is mirrored although both shapes are nearly their own mirror images.
     - `distortion`: `jaxsmw.matching.judge.distortion` of a map of all vertices; 1 for a map of samples.
     """
 
     deformation: float
     dissimilarity: float
     in_place: bool
-    mirrored: bool
+    unlikely: bool
     distortion: float = 1.0
 
     @classmethod
@@ -61,7 +61,7 @@ class Evidence(NamedTuple):
             dissimilarity = float(areas @ differences)
         offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         in_place = bool(areas @ offsets < _NEAR * y.unit) and not x.mirrored
-        return cls(float(areas @ of_patches), dissimilarity, in_place, x.mirrored, distortion)
+        return cls(float(areas @ of_patches), dissimilarity, in_place, reading.unlikely, distortion)
 
     @property
     def log_odds(self) -> float:
@@ -71,12 +71,12 @@ class Evidence(NamedTuple):
             + _DEFORMATION * np.log(self.deformation + _LEAST)
             + _DISSIMILARITY * self.dissimilarity
             + _IN_PLACE * self.in_place
-            + MIRRORED * self.mirrored
+            + MIRRORED * self.unlikely
             + _DISTORTION * max(0.0, np.log(self.distortion / _DISTORTED))
         )
 
 
-NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False, mirrored=False)
+NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False, unlikely=False)
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 

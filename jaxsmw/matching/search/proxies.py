@@ -97,6 +97,11 @@ class Proxy:
         columns = None if descriptors is None else xp.asarray(descriptors, dtype)
         return sampled.with_descriptors(columns).with_crease_eigenvectors(None)
 
+    def distance_error(self, matches: SampleMap) -> float:
+        """Return the mean absolute change of distances under a map from the samples to themselves (s,)."""
+        change = np.abs(self.distances - self.distances[np.ix_(matches, matches)])
+        return float(self.areas @ change @ self.areas)
+
     @functools.cached_property
     def distances(self) -> Float[np.ndarray, "s s"]:
         """The lengths of the shortest paths between the samples.

@@ -74,10 +74,15 @@ def race(readings: Sequence[Reading], known: Iterable[Candidate], hypotheses: bo
 
 
 def hand_evidence(reading: Reading) -> float:
-    """Return the log-odds that X and Y have opposite hands, from the best map of each hand."""
+    """Return the log-odds that X and Y have opposite hands, from the best map of each hand.
+
+    Shapes that are nearly their own mirror images are not compared. They have the same hand.
+    """
+    if not reading.is_asymmetric():
+        return MIRRORED
     direct, mirrored = (
         max((one.log_odds for one in _refined(list(_hypotheses(hand)))), default=-np.inf)
-        for hand in (reading, reading.mirror())
+        for hand in (reading, reading.mirror(unlikely=False))
     )
     return mirrored - direct if np.isfinite(direct + mirrored) else MIRRORED
 

@@ -31,11 +31,13 @@ class Reading:
 
     - `prepared`: the `PreparedPair`. Its attributes `mirrored` and `pair.partial` tell how the pair is read.
     - `x`, `y`: the proxies of X (s samples) and of Y (t samples), in `Pair.units_of_length`.
+    - `unlikely`: whether X is mirrored although both shapes are nearly their own mirror images.
     """
 
     prepared: PreparedPair
     x: Proxy
     y: Proxy
+    unlikely: bool = False
 
     @classmethod
     def of(cls, prepared: PreparedPair) -> Reading:
@@ -47,11 +49,32 @@ class Reading:
             made.distances  # noqa: B018 (both shapes side by side)
             return made
 
-        return cls(prepared, *side_by_side(proxy, *enumerate(prepared.pair.units_of_length)))
+        x, y = side_by_side(proxy, *enumerate(prepared.pair.units_of_length))
+        return cls(prepared, x, y)
 
-    def mirror(self) -> Reading:
+    def mirror(self, *, unlikely: bool = True) -> Reading:
         """Return the reading in which X has the other hand."""
-        return Reading(self.prepared.mirror(), self.x.mirror(), self.y)
+        return Reading(self.prepared.mirror(), self.x.mirror(), self.y, unlikely)
+
+    def is_asymmetric(self) -> bool:
+        """Return whether both shapes differ from their own mirror images, as teeth do, but people do not.
+
+        Samples are matched to samples of the mirror image by SHOT. The asymmetry is the distance error of
+        this map, divided by that of a random map (seed 0). (Entry R23 of docs/research_log.md)
+        """
+
+        def asymmetry(side: Proxy) -> float:
+            own, mirrored = (
+                np.hstack([one.shot(radius) for radius in _ASYMMETRY_RADII]) for one in (side, side.mirror())
+            )
+            matches = np.argmax(own @ mirrored.T, axis=1)  # all descriptors have the same norm
+            random = np.random.default_rng(0).permutation(len(matches))
+            return side.distance_error(matches) / max(side.distance_error(random), np.finfo(float).tiny)
+
+        try:
+            return bool(np.mean(side_by_side(asymmetry, self.x, self.y)) >= _ASYMMETRIC)
+        except InputError:  # the samples are too sparse for SHOT
+            return False
 
     def described(self, preset: Preset) -> Reading:
         """Return the reading whose prepared pair has the descriptors that a preset uses."""
@@ -112,6 +135,8 @@ class Reading:
         return weights / weights.sum(axis=1, keepdims=True)
 
 
+# The radii of SHOT, in units of 0.06, and the least mean asymmetry of asymmetric shapes. (Entry R23)
+_ASYMMETRY_RADII, _ASYMMETRIC = (3, 6), 0.61
 # Two maps differ at a sample if its two matches are at least so far apart along the surface, and the radius
 # of the patches that a right map moves nearly rigidly; both in units of the square root of the area.
 _DIFFERENT, _PATCH = 0.2, 0.2

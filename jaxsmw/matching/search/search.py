@@ -91,10 +91,14 @@ def search(
     if settings is None:
         return [first]
     judged = [first]
-    searches = hypotheses and not _certain(judged, settings)
-    readings = list(_readings(reading, mirror)) if searches else [reading]
+    # Of asymmetric shapes, both hands are compared, because the wrong hand can have a good map.
+    both_hands = hypotheses and mirror == "auto" and not prepared.pair.partial and reading.is_asymmetric()
+    certain = _certain(judged, settings) and not both_hands
+    readings = [reading]
+    if hypotheses and not certain:
+        readings = list(_readings(reading, mirror, unlikely=not both_hands))
     for number in range(_ROUNDS):
-        if _certain(judged, settings):
+        if certain:
             break
         logger.info("the map is uncertain, so other maps are tried ...")
         candidates = race(readings, judged, hypotheses and number == 0)
@@ -104,6 +108,7 @@ def search(
         if not refined:
             break
         judged = list(different([*judged, *refined]))
+        certain = _certain(judged, settings)
     likely = _likely(judged, settings)
     return list(different([_finished(one, preset) if one in likely else one for one in judged]))
 
@@ -120,12 +125,12 @@ def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
     return [maps[number] for number in order if shares[number] >= settings.likely * shares[order[0]]]
 
 
-def _readings(reading: Reading, mirror: Mirror) -> Iterator[Reading]:
+def _readings(reading: Reading, mirror: Mirror, *, unlikely: bool) -> Iterator[Reading]:
     """Yield the readings of a pair: as it was called, with the other hand, and as a part."""
     for one in (reading, *_as_parts(reading)):
         yield one
         if mirror == "auto":
-            yield one.mirror()
+            yield one.mirror(unlikely=unlikely)
 
 
 def _as_parts(reading: Reading) -> Iterator[Reading]:
