@@ -20,7 +20,7 @@ def pair(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*limbs may be swapped:UserWarning")
+@pytest.mark.filterwarnings("ignore:.*the map is wrong as a whole:UserWarning")
 def test_a_tiny_mesh_is_refused(run, tmp_path):
     (tmp_path / "tetrahedron.off").write_text(OFF.format(4, 4, TRIANGLES, FACES))
     call = ["match", *[tmp_path / "tetrahedron.off"] * 2, "--output", tmp_path / "map.txt", "--quiet"]
