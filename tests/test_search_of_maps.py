@@ -327,21 +327,6 @@ def test_evidence_of_hands_has_opposite_signs_for_opposite_hands(lump):
     assert hand_evidence(read(lump, turned(lump.mirrored()))) > 0 > hand_evidence(read(lump, turned(lump)))
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*neighbours within the SHOT radius:UserWarning")
-def test_a_part_given_as_a_whole_is_recognised():
-    found = creature_pair("biped", vertices=1500, seed=1)
-    mesh_x, mesh_y, truth = found.source, found.target, found.truth.nearest_corners(found.target)
-    along = mesh_x.vertices[:, np.argmax(np.ptp(mesh_x.vertices, axis=0))]
-    kept = (along > np.quantile(along, 0.65))[mesh_x.faces].all(axis=1)
-    part = make_mesh(mesh_x.vertices, mesh_x.faces[kept], name="bust")
-    with pytest.warns(UserWarning, match="bust looks like a part of"):
-        found = match(part, mesh_y)
-    assert found.pair.partial
-    used = part.referenced_vertices
-    assert mean_error(mesh_y, found.pointwise_map[used], truth[used]) < 0.08
-
-
 def test_asymmetric_shapes_are_compared_in_both_hands(pair, lump):
     assert read(lump, turned(lump)).is_asymmetric() and not read(*pair[:2]).is_asymmetric()
 
