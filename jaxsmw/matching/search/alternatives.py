@@ -58,7 +58,7 @@ def difference(best: Judged, other: Judged) -> str:
             if second.prepared.pair.partial
             else "both meshes are full shapes"
         )
-    matches = [first.reduced(judged.pointwise_map) for judged in (best, other)]
+    matches = best.matches, other.matches
     areas, (placed, elsewhere) = first.x.areas, (first.y.positions[chosen] for chosen in matches)
     turn = rigid_fit(placed, elsewhere, areas)
     left, apart = (areas @ ((points - elsewhere) ** 2).sum(axis=1) for points in (turn.apply(placed), placed))

@@ -59,18 +59,15 @@ class Proxy:
         normals = np.stack(sums, axis=1)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         self.normals = normals / np.maximum(lengths, np.finfo(float).tiny)
+        self._shot: dict[int, Float[np.ndarray, "s 352"]] = {}  # by radius, shared with mirror images
 
     def mirror(self) -> Proxy:
-        """Return the proxy of the mirror image, which shares the distances of this proxy."""
+        """Return the proxy of the mirror image, which shares the distances and SHOT of this proxy."""
         self.distances  # noqa: B018 (computed once, for both)
         mirrored = copy.copy(self)
         mirrored.positions, mirrored.normals = (rows * [-1, 1, 1] for rows in (self.positions, self.normals))
         mirrored.mirrored = not self.mirrored
         return mirrored
-
-    @functools.cached_property
-    def _shot(self) -> dict[int, Float[np.ndarray, "s 352"]]:
-        return {}
 
     def shot(self, radius: int) -> Float[np.ndarray, "s 352"]:
         """Return SHOT at the samples, with a radius in units of 0.06, in `unit`.

@@ -40,7 +40,7 @@ _ROUNDS = 2
 class Judged(Candidate):
     """A map that was refined at all vertices, and the evidence for it.
 
-    **Attributes:** those of `Candidate`, and `outcome`, the successful `Outcome` of the stages.
+    **Attributes:** those of `Candidate`, and `outcome`, the `Outcome` of the stages.
     """
 
     outcome: Outcome
