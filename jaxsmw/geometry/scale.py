@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ from jaxtyping import Float, Int64
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import poisson_disk_samples
-from jaxsmw.geometry.shot import SHOT_RADIUS, shot_descriptors
+from jaxsmw.geometry.shot import SHOT_RADIUS, sampled_shot_descriptors
 from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 
 # Lengths are in units of the square root of the full shape's area. Table R33 is in `docs/research_log.md`.
@@ -120,13 +119,10 @@ def _sample(mesh: Mesh, share: float) -> _Samples:
     """Return samples with descriptors. `share` is the shape's area divided by the full shape's area."""
     unit = (mesh.area / share) ** 0.5
     samples = poisson_disk_samples(mesh, max(1, round(_SAMPLES * share)))
-    with warnings.catch_warnings():
-        # SHOT's warning about sparse samples is ignored, because sparse samples only lower the support.
-        warnings.simplefilter("ignore")
-        shot = side_by_side(
-            lambda radius: shot_descriptors(mesh, radius=radius * SHOT_RADIUS / share**0.5, samples=samples),
-            *_RADII,
-        )
+    shot = side_by_side(
+        lambda radius: sampled_shot_descriptors(mesh, samples, radius=radius * SHOT_RADIUS / share**0.5),
+        *_RADII,
+    )
     vertices = samples.vertices
     return _Samples(mesh.vertices[vertices] / unit, mesh.vertex_normals[vertices], np.hstack(shot))
 

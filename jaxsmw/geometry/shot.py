@@ -65,6 +65,27 @@ def shot_descriptors(
 
     **Raises:** `InputError` if the radius is not positive, or if most vertices have fewer than 3 neighbours.
     """
+    descriptors, lonely = _cached(mesh, radius, samples, required)
+    if lonely > 0.01:
+        warnings.warn(_too_coarse(mesh, lonely, radius, required), stacklevel=2)
+    return descriptors
+
+
+def sampled_shot_descriptors(
+    mesh: Mesh, samples: SurfaceSamples, *, radius: float
+) -> Float32[np.ndarray, "s 352"]:
+    """Return `shot_descriptors` at samples, without a warning if some samples have few neighbours.
+
+    A caller that ignored the warning of `shot_descriptors` could not run in several threads, because they
+    share the filters of warnings.
+    """
+    return _cached(mesh, radius, samples, required=False)[0]
+
+
+def _cached(
+    mesh: Mesh, radius: float, samples: SurfaceSamples | None, required: bool
+) -> tuple[Float32[np.ndarray, "n 352"], float]:
+    """Return descriptors, and the share of vertices with few neighbours; see `shot_descriptors`."""
     if not radius > 0:
         raise InputError(f"the SHOT radius is {radius}, but must be positive: the usual choice is 0.06.")
 
@@ -108,9 +129,7 @@ def shot_descriptors(
 
     chosen = () if samples is None else samples
     result = cached("shot", (mesh.vertices, mesh.faces, radius, "float32", *chosen), compute)
-    if (lonely := float(result["lonely"])) > 0.01:
-        warnings.warn(_too_coarse(mesh, lonely, radius, required), stacklevel=2)
-    return result["descriptors"]
+    return result["descriptors"], float(result["lonely"])
 
 
 def mirrored_descriptors(descriptors: Float32[np.ndarray, "n 352"]) -> Float32[np.ndarray, "n 352"]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from scipy.spatial.distance import cdist
 from jaxsmw.core.arrays import namespace
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
-from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, shot_descriptors
+from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, sampled_shot_descriptors
 from jaxsmw.matching.shape import PreparedShape
 
 SampleMap = Int64[np.ndarray, " s"]
@@ -76,13 +75,8 @@ class Proxy:
         """
         known = self._shot
         if radius not in known:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # sparse samples only make a start less accurate
-                known[radius] = shot_descriptors(
-                    self.mesh,
-                    radius=radius * SHOT_RADIUS * self.unit / self.mesh.area**0.5,
-                    samples=self.samples,
-                )
+            in_unit = radius * SHOT_RADIUS * self.unit / self.mesh.area**0.5
+            known[radius] = sampled_shot_descriptors(self.mesh, self.samples, radius=in_unit)
         return mirrored_descriptors(known[radius]) if self.mirrored else known[radius]
 
     def sampled_spectrum(self, descriptors: Float[np.ndarray, "s d"] | None) -> Spectrum:

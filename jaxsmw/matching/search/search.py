@@ -91,12 +91,13 @@ def search(
     if settings is None:
         return [first]
     judged = [first]
-    # Of asymmetric shapes, both hands are compared, because the wrong hand can have a good map.
+    parts = list(_as_parts(reading)) if hypotheses else []
+    # Of asymmetric shapes, the wrong hand can have a good map, so both hands are compared.
     both_hands = hypotheses and mirror == "auto" and not prepared.pair.partial and reading.is_asymmetric()
-    certain = _certain(judged, settings) and not both_hands
-    readings = [reading]
-    if hypotheses and not certain:
-        readings = list(_readings(reading, mirror, unlikely=not both_hands))
+    certain = _certain(judged, settings) and not both_hands and not parts
+    readings = [reading, *parts]
+    if mirror == "auto" and hypotheses and not certain:
+        readings = [hand for one in readings for hand in (one, one.mirror(unlikely=not both_hands))]
     for number in range(_ROUNDS):
         if certain:
             break
@@ -123,14 +124,6 @@ def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
     shares = probabilities([one.log_odds for one in maps])
     order = np.argsort(-shares, kind="stable")[: settings.finalists]
     return [maps[number] for number in order if shares[number] >= settings.likely * shares[order[0]]]
-
-
-def _readings(reading: Reading, mirror: Mirror, *, unlikely: bool) -> Iterator[Reading]:
-    """Yield the readings of a pair: as it was called, with the other hand, and as a part."""
-    for one in (reading, *_as_parts(reading)):
-        yield one
-        if mirror == "auto":
-            yield one.mirror(unlikely=unlikely)
 
 
 def _as_parts(reading: Reading) -> Iterator[Reading]:
