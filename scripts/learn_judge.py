@@ -50,7 +50,7 @@ GROUPS = (0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1)
 # The penalty of large weights, which keeps them finite.
 PENALTY = 0.05
 # The weights from which the fit begins, with the intercept first.
-FIRST = np.array([-1.5, -2.0, -1.0, 0.5, -0.5])
+FIRST = np.array([-1.5, -2.0, -1.0, 0.5])
 
 
 class KnownPair(NamedTuple):

@@ -35,7 +35,7 @@ from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.executor import run, run_batches
 from jaxsmw.matching.outcome import Start
-from jaxsmw.matching.search.evidence import MIRRORED
+from jaxsmw.matching.search.race import SAME_HAND
 from jaxsmw.matching.shape import prepare_shapes
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, Preset, Sizes, Stage
@@ -224,7 +224,7 @@ def test_a_few_pairs_tell_whether_shapes_are_their_own_mirror_images(monkeypatch
     def evidence(value):
         monkeypatch.setattr(hands, "hand_evidence", lambda reading: compared.append(reading) or value)
 
-    evidence(MIRRORED)
+    evidence(SAME_HAND)
     assert len(compare(store)) == len(compared) == 5 and not reports
     evidence(4.0)
     found = compare(store)

@@ -18,7 +18,7 @@ from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.alternatives import alternatives
-from jaxsmw.matching.search.evidence import MIRRORED, Evidence, deformation, probabilities
+from jaxsmw.matching.search.evidence import Evidence, deformation, probabilities
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, race
 from jaxsmw.matching.search.reading import Reading
@@ -95,11 +95,11 @@ def test_rigid_motions_have_no_deformation_and_reflections_have(pair):
     identity = np.arange(len(reading.x.areas))
     assert deformation(reading, identity).max() < 1e-12
     evidence = Evidence.of(reading, identity)
-    assert evidence.deformation < 1e-12 and evidence.dissimilarity < 1e-6 and not evidence.unlikely
+    assert evidence.deformation < 1e-12 and evidence.dissimilarity < 1e-6
     other = reading.mirror()
     assert other.x.distances is reading.x.distances and other.prepared.mirrored
     assert deformation(other, identity).mean() > 0.01
-    assert Evidence.of(other, identity).log_odds < evidence.log_odds + MIRRORED
+    assert Evidence.of(other, identity).log_odds < evidence.log_odds
 
 
 def test_deformation_is_the_residual_of_procrustes_alignment(pair):
@@ -220,7 +220,7 @@ def test_twins_are_merged_and_the_better_one_is_kept(pair):
     slightly[few] = wrong[few]
 
     def candidate(matches, score):
-        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, False, False))
+        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, False))
 
     candidates = [candidate(matches, 1.0), candidate(slightly, 2.0), candidate(wrong, 0.5)]
     assert list(different(candidates)) == [candidates[1], candidates[2]]
@@ -254,7 +254,7 @@ def test_a_certain_map_ends_the_search(pair, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:.*neighbours within the SHOT radius:UserWarning")
-def test_readings_as_a_part_are_tried_only_for_different_boundaries(pair, monkeypatch):
+def test_readings_are_tried_only_where_they_are_possible(pair, lump, monkeypatch):
     mesh_x, mesh_y, _ = pair
     height = mesh_x.vertices[:, 1]
     part = make_mesh(
@@ -270,7 +270,9 @@ def test_readings_as_a_part_are_tried_only_for_different_boundaries(pair, monkey
     never = replace(SEARCH, search=replace(SEARCH.search, certain=1.0))
     for shapes, mirror, expected in (
         ((mesh_x, mesh_y), "no", {(False, False)}),
-        ((mesh_x, mesh_y), "auto", {(False, False), (True, False)}),
+        ((mesh_x, mesh_y), "auto", {(False, False)}),
+        ((lump, turned(lump)), "no", {(False, False)}),
+        ((lump, turned(lump)), "auto", {(False, False), (True, False)}),
         ((part, mesh_y), "no", {(False, False), (False, True)}),
         ((part, part), "no", {(False, False)}),
     ):
@@ -279,6 +281,21 @@ def test_readings_as_a_part_are_tried_only_for_different_boundaries(pair, monkey
         start = Start(np.zeros(len(shapes[0].vertices), np.int64))
         search(prepared, start, never, mirror=mirror)
         assert set(seen) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", first_always([0.4, 0.6]))
+def test_a_part_given_as_a_whole_is_matched_as_a_part(share):
+    """The message appears, although proxies of both shapes are made in threads."""
+    creatures = jaxsmw.creature_pair()
+    whole, height = creatures.source, creatures.source.vertices[:, 1]
+    kept = height > np.quantile(height, 1 - share)
+    part = make_mesh(whole.vertices, whole.faces[kept[whole.faces].all(axis=1)], name="part")
+    with pytest.warns(UserWarning, match="part looks like a part of .* matched with partial=True"):
+        found = match(part, creatures.target)
+    used = part.referenced_indices
+    error = mean_error(creatures.target, found.pointwise_map[used], creatures.true_map[used])
+    assert found.pair.partial and error < 0.03
 
 
 @pytest.mark.slow

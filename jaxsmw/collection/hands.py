@@ -13,8 +13,7 @@ from jaxsmw.collection.graph import choose_edges, shape_distances
 from jaxsmw.collection.shapes import shape_key
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.search.evidence import MIRRORED
-from jaxsmw.matching.search.race import hand_evidence
+from jaxsmw.matching.search.race import SAME_HAND, hand_evidence
 from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset
@@ -91,7 +90,7 @@ def compare_hands(
     edges = choose_edges(shape_distances(shapes), edges_per_shape=_COMPARED_PER_SHAPE, seed=seed)
     first = edges[:: max(1, len(edges) // _COMPARED_FIRST)][:_COMPARED_FIRST]
     compared = {edge: evidence(edge) for edge in first}
-    if all(of_edge == MIRRORED for of_edge in compared.values()):
+    if all(of_edge == SAME_HAND for of_edge in compared.values()):
         return compared
     for number, edge in enumerate(edges):
         if edge not in compared:

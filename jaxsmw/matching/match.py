@@ -95,8 +95,8 @@ def match(
       mirror image of X is matched instead of X. Whether X is mirrored or not, entry i of the map is the match
       of vertex i of X.
 
-        - `"auto"` (the default): if the preset has a search and the map of X itself is uncertain, maps of
-          the mirror image are tried as well. They are chosen only if they are clearly better.
+        - `"auto"` (the default): if the preset has a search and both shapes differ from their own mirror
+          images, as teeth do, maps of the mirror image are tried as well. The better map is chosen.
         - `"no"`: match X itself.
         - `"yes"`: match the mirror image of X.
 

@@ -13,7 +13,7 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, MIRRORED = -0.2, -1.9, -2.7, 1.1, -1.5
+_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE = -0.2, -1.9, -2.7, 1.1
 # Right maps have distortions of at most 1.2, so larger distortions count against a map. Wrong maps can have
 # small distortions, so these say nothing.
 _DISTORTION, _DISTORTED = -5.0, 1.2
@@ -38,14 +38,12 @@ class Evidence(NamedTuple):
     - `dissimilarity`: the mean squared difference between the SHOT descriptors of samples and of their
       matches, divided by its mean for random matches. It is 0 for congruent shapes.
     - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
-    - `unlikely`: whether X is mirrored although both shapes are nearly their own mirror images.
     - `distortion`: `jaxsmw.matching.judge.distortion` of a map of all vertices; 1 for a map of samples.
     """
 
     deformation: float
     dissimilarity: float
     in_place: bool
-    unlikely: bool
     distortion: float = 1.0
 
     @classmethod
@@ -61,7 +59,7 @@ class Evidence(NamedTuple):
             dissimilarity = float(areas @ differences)
         offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         in_place = bool(areas @ offsets < _NEAR * y.unit) and not x.mirrored
-        return cls(float(areas @ of_patches), dissimilarity, in_place, reading.unlikely, distortion)
+        return cls(float(areas @ of_patches), dissimilarity, in_place, distortion)
 
     @property
     def log_odds(self) -> float:
@@ -71,12 +69,11 @@ class Evidence(NamedTuple):
             + _DEFORMATION * np.log(self.deformation + _LEAST)
             + _DISSIMILARITY * self.dissimilarity
             + _IN_PLACE * self.in_place
-            + MIRRORED * self.unlikely
             + _DISTORTION * max(0.0, np.log(self.distortion / _DISTORTED))
         )
 
 
-NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False, unlikely=False)
+NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False)
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 

@@ -17,7 +17,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.matching.executor import run_all
 from jaxsmw.matching.judge import discontinuous_parts, orientation_reversal
 from jaxsmw.matching.outcome import Start
-from jaxsmw.matching.search.evidence import MIRRORED, Evidence
+from jaxsmw.matching.search.evidence import Evidence
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import NUMBER_OF_DESCRIPTORS, Reading
@@ -35,6 +35,8 @@ DIFFERENT_AREA = 0.05
 # Faults on less than the first share or more than the second share of the area are not mended. From the third
 # share of reversed area on, a map is tried for the other hand.
 _SMALL, _LARGE, _MOSTLY = 0.002, 0.5, 0.4
+# The evidence of opposite hands for two shapes that are nearly their own mirror images.
+SAME_HAND = -1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,12 +81,12 @@ def hand_evidence(reading: Reading) -> float:
     Shapes that are nearly their own mirror images are not compared. They have the same hand.
     """
     if not reading.is_asymmetric():
-        return MIRRORED
+        return SAME_HAND
     direct, mirrored = (
         max((one.log_odds for one in _refined(list(_hypotheses(hand)))), default=-np.inf)
-        for hand in (reading, reading.mirror(unlikely=False))
+        for hand in (reading, reading.mirror())
     )
-    return mirrored - direct if np.isfinite(direct + mirrored) else MIRRORED
+    return mirrored - direct if np.isfinite(direct + mirrored) else SAME_HAND
 
 
 def different(candidates: Sequence[Kind]) -> Iterator[Kind]:
@@ -130,7 +132,7 @@ def _refined(tasks: Sequence[_Task]) -> list[Candidate]:
 
 
 def _moves(candidate: Candidate, readings: Sequence[Reading]) -> Iterator[_Task]:
-    """Yield what may mend a map: to leave out its faults, or the same map and its twin for the other hand."""
+    """Yield what may mend a map: to leave out its faults, or to read it with the other hand."""
     reading, matches = candidate.reading, candidate.matches
     pair, spectrum = reading.prepared.pair, reading.prepared.x.spectrum.truncate(50)
     everywhere = reading.extended(matches)
@@ -138,9 +140,8 @@ def _moves(candidate: Candidate, readings: Sequence[Reading]) -> Iterator[_Task]
     for fault in (reversed_, discontinuous_parts(pair, everywhere)):
         if _SMALL < pair.mesh_x.average(fault) < _LARGE:
             yield _Task(reading, matches, fault[reading.x.samples.vertices])
+    if pair.mesh_x.average(reversed_) <= _MOSTLY:
+        return
     for other in readings:
         if other.x.distances is reading.x.distances and other.x.mirrored != reading.x.mirrored:
-            if pair.mesh_x.average(reversed_) > _MOSTLY:
-                yield _Task(other, matches)
-            # If X is its own mirror image, both hands then have equally good maps.
-            yield _Task(other, matches[reading.self_symmetry])
+            yield _Task(other, matches)

@@ -31,13 +31,11 @@ class Reading:
 
     - `prepared`: the `PreparedPair`. Its attributes `mirrored` and `pair.partial` tell how the pair is read.
     - `x`, `y`: the proxies of X (s samples) and of Y (t samples), in `Pair.units_of_length`.
-    - `unlikely`: whether X is mirrored although both shapes are nearly their own mirror images.
     """
 
     prepared: PreparedPair
     x: Proxy
     y: Proxy
-    unlikely: bool = False
 
     @classmethod
     def of(cls, prepared: PreparedPair) -> Reading:
@@ -52,9 +50,9 @@ class Reading:
         x, y = side_by_side(proxy, *enumerate(prepared.pair.units_of_length))
         return cls(prepared, x, y)
 
-    def mirror(self, *, unlikely: bool = True) -> Reading:
+    def mirror(self) -> Reading:
         """Return the reading in which X has the other hand."""
-        return Reading(self.prepared.mirror(), self.x.mirror(), self.y, unlikely)
+        return Reading(self.prepared.mirror(), self.x.mirror(), self.y)
 
     def is_asymmetric(self) -> bool:
         """Return whether both shapes differ from their own mirror images, as teeth do, but people do not.
@@ -103,14 +101,6 @@ class Reading:
         x, y = (side.sampled_spectrum(of_side) for side, of_side in zip(both, components, strict=True))
         partial = self.prepared.pair.partial
         return SpectralPair(x, y, partial=partial, common_limit=partial)
-
-    @cached_property
-    def self_symmetry(self) -> SampleMap:
-        """For each sample of X the sample of X with the most similar mirror image, which may be itself."""
-        mirrored, own = (
-            np.hstack([side.shot(radius) for radius in _RADII]) for side in (self.x.mirror(), self.x)
-        )
-        return np.argmax(mirrored @ own.T, axis=1)  # all descriptors have the same norm
 
     def reduced(self, pointwise_map: Int64[np.ndarray, " m"]) -> SampleMap:
         """Return the map of the samples of a map X -> Y (m,)."""

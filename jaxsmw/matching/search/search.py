@@ -91,13 +91,15 @@ def search(
     if settings is None:
         return [first]
     judged = [first]
-    parts = list(_as_parts(reading)) if hypotheses else []
-    # Of asymmetric shapes, the wrong hand can have a good map, so both hands are compared.
-    both_hands = hypotheses and mirror == "auto" and not prepared.pair.partial and reading.is_asymmetric()
-    certain = _certain(judged, settings) and not both_hands and not parts
-    readings = [reading, *parts]
-    if mirror == "auto" and hypotheses and not certain:
-        readings = [hand for one in readings for hand in (one, one.mirror(unlikely=not both_hands))]
+    # Of asymmetric shapes, the wrong hand can have a good map, so both hands are compared. A shape that is
+    # nearly its own mirror image, such as a person, needs no second hand: its left stays its left.
+    both_hands = hypotheses and mirror == "auto" and reading.is_asymmetric()
+    certain = _certain(judged, settings) and not both_hands
+    readings = [reading]
+    if hypotheses and not certain:
+        readings += _as_parts(reading)
+    if both_hands:
+        readings = [hand for one in readings for hand in (one, one.mirror())]
     for number in range(_ROUNDS):
         if certain:
             break
