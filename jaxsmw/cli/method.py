@@ -96,7 +96,7 @@ def add_method(parser: argparse.ArgumentParser) -> None:
         default=DEFAULT_MIRROR,
         help="whether to match the mirror image of the source, because the meshes are of opposite hands, "
         "such as a left and a right tooth; the map belongs to the same source vertices; auto compares both "
-        "hands if the map is uncertain (default: %(default)s)",
+        "hands of shapes that differ from their mirror images (default: %(default)s)",
     )
     group.add_argument(
         "--precision",

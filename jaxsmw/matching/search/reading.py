@@ -47,8 +47,7 @@ class Reading:
             made.distances  # noqa: B018 (both shapes side by side)
             return made
 
-        x, y = side_by_side(proxy, *enumerate(prepared.pair.units_of_length))
-        return cls(prepared, x, y)
+        return cls(prepared, *side_by_side(proxy, *enumerate(prepared.pair.units_of_length)))
 
     def mirror(self) -> Reading:
         """Return the reading in which X has the other hand."""
