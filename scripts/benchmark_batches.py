@@ -294,8 +294,8 @@ def errors_of(data: Path, shapes: Shapes, maps: Sequence[np.ndarray]) -> list[fl
 def prepared_tasks(shapes: Shapes, preset: PresetName) -> list[tuple[SpectralPair, Start]]:
     """Return the spectra of all pairs, with initial maps from SHOT."""
     prepared_shapes, _ = prepare_collection(shapes.meshes, PRESETS[preset])
-    prepared = (prepare_task(prepared_shapes[i], prepared_shapes[j]) for i, j in shapes.pairs)
-    return [(pair.spectra, starts[0]) for pair, starts in prepared]
+    tasks = (prepare_task(prepared_shapes[i], prepared_shapes[j]) for i, j in shapes.pairs)
+    return [(task.prepared.spectra, task.start) for task in tasks]
 
 
 PARTS = {"paper": paper, "accurate": accurate, "agreement": agreement}
