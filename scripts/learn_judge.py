@@ -50,7 +50,7 @@ GROUPS = (0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1)
 # The penalty of large weights, which keeps them finite.
 PENALTY = 0.05
 # The weights from which the fit begins, with the intercept first.
-FIRST = np.array([-1.5, -2.0, -1.0, 0.5])
+FIRST = np.array([-1.5, -2.0, -1.0, 0.5, -3.0])
 
 
 class KnownPair(NamedTuple):
@@ -187,12 +187,10 @@ def errors_of(known: KnownPair, judged: Judged) -> tuple[float, float]:
 
 
 def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
-    """Return what the log-odds depend on linearly, in the order of `Evidence`, with the intercept first.
-
-    The distortion is left out, because its weight is given.
-    """
-    deformation, *others, _ = evidence.T
-    return np.stack([np.ones(len(evidence)), np.log(deformation + 0.01), *others], axis=1)
+    """Return what the log-odds depend on linearly, in the order of `Evidence`, with the intercept first."""
+    deformation, *others, discontinuity = evidence.T
+    columns = np.ones(len(evidence)), np.log(deformation + 0.01), *others, np.sqrt(discontinuity)
+    return np.stack(columns, axis=1)
 
 
 def fitted(pairs: Sequence[JudgedPair]) -> Float[np.ndarray, " f"]:

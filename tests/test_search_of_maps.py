@@ -1,6 +1,7 @@
 """The search for the right map: proxies, evidence, the race of hypotheses, and its results."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.alternatives import alternatives
-from jaxsmw.matching.search.evidence import Evidence, deformation, probabilities
+from jaxsmw.matching.search.evidence import Evidence, deformation, discontinuity, probabilities
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, race
 from jaxsmw.matching.search.reading import Reading
@@ -125,6 +126,23 @@ def test_deformation_is_the_residual_of_procrustes_alignment(pair):
         assert found[sample] == pytest.approx(residual / size, rel=1e-6)
 
 
+def test_discontinuity_is_the_share_of_neighbours_whose_matches_are_far_apart(pair):
+    mesh_x, mesh_y, truth = pair
+    reading = read(mesh_x, mesh_y)
+    x, y, matches = reading.x, reading.y, reading.reduced(truth)
+    assert discontinuity(reading, matches) == 0
+    moved = x.distances[0] < 0.3
+    torn = np.where(moved, np.argmax(y.distances[matches[0]]), matches)
+    far = neighbours = 0.0
+    for first, second in combinations(range(len(x.areas)), 2):
+        if x.distances[first, second] < 0.12:
+            weight = x.areas[first] * x.areas[second]
+            neighbours += weight
+            far += weight * (y.distances[torn[first], torn[second]] > 0.3)
+    assert 0 < far < neighbours
+    assert discontinuity(reading, torn) == pytest.approx(far / neighbours)
+
+
 def test_the_true_map_has_better_evidence_than_wrong_maps(pair):
     mesh_x, mesh_y, truth = pair
     reading = read(mesh_x, mesh_y)
@@ -220,7 +238,7 @@ def test_twins_are_merged_and_the_better_one_is_kept(pair):
     slightly[few] = wrong[few]
 
     def candidate(matches, score):
-        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, False))
+        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, False, 0.0))
 
     candidates = [candidate(matches, 1.0), candidate(slightly, 2.0), candidate(wrong, 0.5)]
     assert list(different(candidates)) == [candidates[1], candidates[2]]

@@ -113,7 +113,7 @@ class SearchSettings:
     **Raises:** `InputError` if a number is out of its range.
     """
 
-    certain: float = 0.88
+    certain: float = 0.875
     finalists: int = 3
     likely: float = 0.05
     non_isometric: float = 0.14

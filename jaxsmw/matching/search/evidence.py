@@ -13,10 +13,7 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE = -0.2, -1.9, -2.7, 1.1
-# Right maps have distortions of at most 1.2, so larger distortions count against a map. Wrong maps can have
-# small distortions, so these say nothing.
-_DISTORTION, _DISTORTED = -5.0, 1.2
+_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, _DISCONTINUITY = 0.15, -1.9, -2.7, 1.1, -3.0
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 7.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
@@ -26,6 +23,9 @@ _THICKNESS = 0.1
 # A map is in place if the mean distance between the given positions of samples and of their matches is below
 # this number of units of Y.
 _NEAR = 0.1
+# The matches of two neighbours are far apart if their distance along the surface is larger, in units of the
+# square root of the area.
+_FAR = 0.3
 
 
 class Evidence(NamedTuple):
@@ -38,17 +38,17 @@ class Evidence(NamedTuple):
     - `dissimilarity`: the mean squared difference between the SHOT descriptors of samples and of their
       matches, divided by its mean for random matches. It is 0 for congruent shapes.
     - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
-    - `distortion`: `jaxsmw.matching.judge.distortion` of a map of all vertices; 1 for a map of samples.
+    - `discontinuity`: the share of neighbouring samples whose matches are far apart; see `discontinuity`.
     """
 
     deformation: float
     dissimilarity: float
     in_place: bool
-    distortion: float = 1.0
+    discontinuity: float
 
     @classmethod
-    def of(cls, reading: Reading, matches: SampleMap, distortion: float = 1.0) -> Evidence:
-        """Measure a map of samples (s,), perhaps with the distortion of a map of all vertices."""
+    def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
+        """Measure a map of samples (s,)."""
         x, y, of_patches = reading.x, reading.y, deformation(reading, matches)
         areas = _overlapping_areas(reading, of_patches)
         of_x, of_y = (spectrum.descriptors for spectrum in reading.spectra.both)
@@ -59,7 +59,8 @@ class Evidence(NamedTuple):
             dissimilarity = float(areas @ differences)
         offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         in_place = bool(areas @ offsets < _NEAR * y.unit) and not x.mirrored
-        return cls(float(areas @ of_patches), dissimilarity, in_place, distortion)
+        torn = discontinuity(reading, matches)
+        return cls(float(areas @ of_patches), dissimilarity, in_place, torn)
 
     @property
     def log_odds(self) -> float:
@@ -69,11 +70,11 @@ class Evidence(NamedTuple):
             + _DEFORMATION * np.log(self.deformation + _LEAST)
             + _DISSIMILARITY * self.dissimilarity
             + _IN_PLACE * self.in_place
-            + _DISTORTION * max(0.0, np.log(self.distortion / _DISTORTED))
+            + _DISCONTINUITY * np.sqrt(self.discontinuity)
         )
 
 
-NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False)
+NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False, discontinuity=1.0)
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 
@@ -105,6 +106,17 @@ def _overlapping_areas(reading: Reading, deformations: Float[np.ndarray, " s"]) 
     counted = np.zeros(len(areas))
     counted[order] = np.where(before < area_y / area_x, areas[order], 0)
     return counted / counted.sum()
+
+
+def discontinuity(reading: Reading, matches: SampleMap) -> float:
+    """Measure how much a map tears neighbouring samples apart, as where exchanged limbs begin.
+
+    **Returns:** The share of the neighbouring pairs of samples of X whose matches are far apart along the
+    surface of Y, from 0 to 1. A pair counts by the product of the areas of its samples.
+    """
+    pairs, weights = reading.neighbours
+    first, second = matches[pairs]
+    return float(weights @ (reading.y.distances[first, second] > _FAR))
 
 
 def deformation(reading: Reading, matches: SampleMap) -> Float[np.ndarray, " s"]:

@@ -16,7 +16,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.scale import relative_boundary
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import area_shape_difference, distortion
+from jaxsmw.matching.judge import area_shape_difference
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -51,9 +51,7 @@ class Judged(Candidate):
         matches = reading.reduced(outcome.pointwise_map)
         if not outcome.successful:
             return cls(reading, matches, NO_EVIDENCE, outcome)
-        prepared = reading.prepared
-        distorted = distortion(prepared.pair, outcome.pointwise_map, prepared.x.spectrum)
-        return cls(reading, matches, Evidence.of(reading, matches, distorted), outcome)
+        return cls(reading, matches, Evidence.of(reading, matches), outcome)
 
     @property
     def pointwise_map(self) -> Int64[np.ndarray, " m"]:
