@@ -3,12 +3,8 @@
     python scripts/learn_judge.py DATA_DIRECTORY [--pairs N] [--seed SEED] [--maps FILE.json]
         [--output FILE.md]
 
-`DATA_DIRECTORY` contains the data sets of `docs/datasets.md`. The script draws N pairs of each data set and
-of each kind of made shapes: people, animals, an ape and people, bodies with topological noise, teeth of both
-sides, jaws, halves of a brain, parts called partial and parts called full, creatures, and bumpy bodies with
-their mirror images. `search` always runs all hypotheses, and returns maps that differ from each other. A map
-is right if its mean error is below 0.1 and at most 10 % of its errors exceed 0.25. The unit of errors is the
-square root of the area.
+`DATA_DIRECTORY` contains the data sets of `docs/datasets.md`. The script draws N pairs of each kind of
+`scripts/judged_pairs.py`. `search` always runs all hypotheses, and returns maps that differ from each other.
 
 The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence.probabilities`, and the
 script maximises their likelihood. It prints the weights of all kinds together. For the tables of results, the
@@ -27,126 +23,27 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import common_landmarks, make_parser, scan_files, side_of, write_text
-from jaxtyping import Bool, Float, Int64
+from common import make_parser, write_text
+from jaxtyping import Bool, Float
+from judged_pairs import KnownPair, is_right, known_pairs
 from scipy.optimize import minimize
-from scipy.spatial import KDTree
 
-from jaxsmw import Mesh, Pair, creature_pair, make_mesh, read_mesh
-from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
+from jaxsmw import Pair
 from jaxsmw.benchmark.tables import markdown
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.evidence import probabilities
-from jaxsmw.matching.search.search import Judged, search
+from jaxsmw.matching.search.search import search
 from jaxsmw.matching.stages import PRESETS
 from jaxsmw.matching.starts import make_start
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.runtime.threads import one_blas_thread
 
-# A map is right if its mean error, and the share of its errors above `GROSS`, are below these limits.
-MEAN, GROSS, SHARE = 0.1, 0.25, 0.1
 # The ends of the groups of maps in the table of reliability.
 GROUPS = (0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1)
 # The penalty of large weights, which keeps them finite.
 PENALTY = 0.05
 # The weights from which the fit begins, with the intercept first.
 FIRST = np.array([-1.5, -2.0, -1.0, 0.5, -3.0])
-
-
-class KnownPair(NamedTuple):
-    """Two meshes, whether they are called partial, and vertices of X with their true matches."""
-
-    kind: str
-    x: Mesh
-    y: Mesh
-    partial: bool
-    vertices: Int64[np.ndarray, " p"]
-    truth: Int64[np.ndarray, " p"]
-
-
-def of_data_sets(data: Path, number: int, seed: int) -> Iterator[KnownPair]:
-    """Draw pairs of data sets with ground truth for all vertices."""
-    for kind, name, partial in (
-        ("people", "faust_r", False),
-        ("people", "shrec19_r", False),
-        ("animals", "smal_r", False),
-        ("animals", "tosca_r", False),
-        ("ape and people", "tosca_nonisometric", False),
-        ("topological noise", "shrec16_topology", False),
-        ("parts", "shrec16_partial", True),
-        ("parts called full", "shrec16_partial", False),
-    ):
-        if not (data / name).is_dir():
-            continue
-        for pair in choose_pairs(open_data_set(data / name), str(number), seed):
-            x, y = (read_mesh(file) for file in pair.meshes)
-            truth = pair.ground_truth(x, y)
-            targets = truth.targets
-            matches = targets if isinstance(targets, np.ndarray) else targets.nearest_corners(y)
-            yield KnownPair(kind, x, y, partial, truth.source_vertices, matches)
-
-
-def of_landmarks(data: Path, number: int, seed: int) -> Iterator[KnownPair]:
-    """Draw pairs of scans with manual landmarks, half of the teeth from opposite sides."""
-    random = np.random.default_rng(seed)
-    for kind, name in (("teeth", "primate_molars"), ("jaws", "mouse_mandibles")):
-        files = scan_files(data / name) if (data / name).is_dir() else []
-        drawn = 0
-        while files and drawn < number:
-            x, y = (files[i] for i in random.choice(len(files), 2, replace=False))
-            if kind == "teeth" and (side_of(x) != side_of(y)) != bool(drawn % 2):
-                continue
-            drawn += 1
-            meshes, landmarks = [read_mesh(x), read_mesh(y)], common_landmarks(x, y)
-            vertices = [
-                mesh.referenced_indices[
-                    KDTree(mesh.vertices[mesh.referenced_indices]).query(own.positions)[1]
-                ]
-                for mesh, own in zip(meshes, landmarks, strict=True)
-            ]
-            yield KnownPair(kind, *meshes, False, *vertices)
-
-
-def of_brains(data: Path) -> Iterator[KnownPair]:
-    """Yield both halves of a brain in both directions."""
-    files = sorted((data / "brain_halves").glob("*.off"))
-    for x, y in (files, files[::-1]) if len(files) == 2 else ():
-        meshes = read_mesh(x), read_mesh(y)
-        same = np.arange(len(meshes[0].vertices))
-        yield KnownPair("brain", *meshes, False, same, same)
-
-
-def of_creatures(number: int, seed: int) -> Iterator[KnownPair]:
-    """Make creatures, and parts of creatures that are called full."""
-    for drawn in range(number):
-        kind = ("biped", "quadruped")[drawn % 2]
-        pair = creature_pair(kind, vertices=1500, seed=seed + drawn)
-        x, y, truth = pair.source, pair.target, pair.truth.nearest_corners(pair.target)
-        yield KnownPair("creatures", x, y, False, np.arange(len(truth)), truth)
-        along = x.vertices[:, np.argmax(np.ptp(x.vertices, axis=0))]
-        kept = along > np.quantile(along, (0.6, 0.4)[drawn // 2 % 2])
-        part = make_mesh(x.vertices, x.faces[kept[x.faces].all(axis=1)], name="part")
-        used = part.referenced_indices
-        yield KnownPair("parts called full", part, y, False, used, truth[used])
-
-
-def of_bumpy_bodies(number: int, seed: int) -> Iterator[KnownPair]:
-    """Make bumpy bodies, and match them to bent copies and to bent mirror images."""
-    ball = creature_pair("biped", vertices=2500).source
-    directions = ball.vertices - ball.middle
-    sphere = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    for drawn in range(number):
-        random = np.random.default_rng(seed + drawn)
-        centers = random.normal(size=(20, 3))
-        centers /= np.linalg.norm(centers, axis=1, keepdims=True)
-        heights = np.exp(40 * (sphere @ centers.T - 1)) @ random.choice([-1, 1], 20)
-        body = sphere * (1 + 0.3 * np.tanh(heights))[:, None] * [1.6, 1.1, 1]
-        bent = body + 0.1 * np.sin(2 * body[:, [1, 2, 0]] + random.uniform(0, 6, 3))
-        order = random.permutation(len(body))
-        other, faces = np.empty_like(bent), order[ball.faces]
-        other[order] = bent * ([-1, 1, 1] if drawn % 2 else [1, 1, 1])
-        meshes = make_mesh(body, ball.faces), make_mesh(other, faces[:, ::-1] if drawn % 2 else faces)
-        yield KnownPair("bumpy bodies", *meshes, False, np.arange(len(order)), order)
 
 
 class JudgedPair(NamedTuple):
@@ -159,7 +56,7 @@ class JudgedPair(NamedTuple):
     @property
     def right(self) -> Bool[np.ndarray, " c"]:
         """Whether each map is right as a whole."""
-        return (self.errors < [MEAN, SHARE]).all(axis=1)
+        return np.array([is_right(*errors) for errors in self.errors], bool)
 
 
 def judged_pair(known: KnownPair) -> JudgedPair:
@@ -174,16 +71,9 @@ def judged_pair(known: KnownPair) -> JudgedPair:
         start = make_start(prepared, "shot")
         prepared = prepared.describe(preset.number_of_descriptors)
         maps = search(prepared, start, prepared.usable(preset), mirror="auto")
-    rows = [(list(one.evidence), errors_of(known, one)) for one in maps if one.evidence is not None]
+    rows = [(list(one.evidence), known.errors(one.pointwise_map)) for one in maps if one.evidence is not None]
     evidence, errors = zip(*rows, strict=True)
     return JudgedPair(known.kind, np.array(evidence, float), np.array(errors))
-
-
-def errors_of(known: KnownPair, judged: Judged) -> tuple[float, float]:
-    """Return the mean error of a map, and its share of gross errors."""
-    offsets = known.y.vertices[judged.pointwise_map[known.vertices]] - known.y.vertices[known.truth]
-    errors = np.linalg.norm(offsets, axis=1) / known.y.area**0.5
-    return float(errors.mean()), float(np.mean(errors > GROSS))
 
 
 def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
@@ -253,14 +143,7 @@ def main() -> None:
     stored: list[dict[str, Any]] = []
     if options.maps and options.maps.exists():
         stored = json.loads(options.maps.read_text("utf-8"))
-    sources = (
-        of_data_sets(data, number, seed),
-        of_landmarks(data, number, seed),
-        of_brains(data),
-        of_creatures(number, seed),
-        of_bumpy_bodies(number, seed),
-    )
-    for position, known in enumerate(known for source in sources for known in source):
+    for position, known in enumerate(known_pairs(data, number, seed)):
         if position < len(stored):
             continue
         pair = judged_pair(known)

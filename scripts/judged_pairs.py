@@ -1,0 +1,167 @@
+"""Pairs of many kinds of shapes with known matches, on which the search for the right map is judged.
+
+The pairs come from data sets (`docs/datasets.md`) and from made shapes: people, animals, an ape and people,
+bodies with topological noise, teeth of both sides, jaws, halves of a brain, parts called partial and parts
+called full, a mask and a head, creatures, and bumpy bodies with their mirror images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from common import common_landmarks, scan_files, side_of
+from jaxtyping import Int, Int64
+from scipy.spatial import KDTree
+
+from jaxsmw import Mesh, creature_pair, make_mesh, read_mesh
+from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
+
+# A map is right if its mean error, and the share of its errors above `GROSS`, are below these limits. The
+# unit of errors is the square root of the area.
+MEAN, GROSS, SHARE = 0.1, 0.25, 0.1
+
+
+class KnownPair(NamedTuple):
+    """Two meshes, whether they are called partial, and vertices of X with their true matches."""
+
+    kind: str
+    x: Mesh
+    y: Mesh
+    partial: bool
+    vertices: Int64[np.ndarray, " p"]
+    truth: Int64[np.ndarray, " p"]
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """Names of the meshes, which no other pair has."""
+        x, y = (Path(mesh.name).stem for mesh in (self.x, self.y))
+        return f"{self.kind}: {x}", y
+
+    def errors(self, pointwise_map: Int[np.ndarray, " m"]) -> tuple[float, float]:
+        """Return the mean error of a map, and its share of gross errors."""
+        offsets = self.y.vertices[pointwise_map[self.vertices]] - self.y.vertices[self.truth]
+        errors = np.linalg.norm(offsets, axis=1) / self.y.area**0.5
+        return float(errors.mean()), float(np.mean(errors > GROSS))
+
+
+def is_right(mean: float, gross: float) -> bool:
+    """Return whether a map with this mean error and this share of gross errors is right as a whole."""
+    return mean < MEAN and gross < SHARE
+
+
+def known_pairs(data: Path, number: int, seed: int) -> Iterator[KnownPair]:
+    """Draw at most `number` pairs of each data set and of each kind of made shapes."""
+    return chain(
+        of_data_sets(data, number, seed),
+        of_landmarks(data, number, seed),
+        of_brains(data),
+        of_masks(data),
+        of_creatures(number, seed),
+        of_bumpy_bodies(number, seed),
+    )
+
+
+def of_data_sets(data: Path, number: int, seed: int) -> Iterator[KnownPair]:
+    """Draw pairs of data sets with ground truth for all vertices."""
+    for kind, name, partial in (
+        ("people", "faust_r", False),
+        ("people", "shrec19_r", False),
+        ("animals", "smal_r", False),
+        ("animals", "tosca_r", False),
+        ("ape and people", "tosca_nonisometric", False),
+        ("topological noise", "shrec16_topology", False),
+        ("parts", "shrec16_partial", True),
+        ("parts called full", "shrec16_partial", False),
+    ):
+        if not (data / name).is_dir():
+            continue
+        for pair in choose_pairs(open_data_set(data / name), str(number), seed):
+            x, y = (read_mesh(file) for file in pair.meshes)
+            truth = pair.ground_truth(x, y)
+            targets = truth.targets
+            matches = targets if isinstance(targets, np.ndarray) else targets.nearest_corners(y)
+            yield KnownPair(kind, x, y, partial, truth.source_vertices, matches)
+
+
+def of_landmarks(data: Path, number: int, seed: int) -> Iterator[KnownPair]:
+    """Draw pairs of scans with manual landmarks, half of the teeth from opposite sides."""
+    random = np.random.default_rng(seed)
+    for kind, name in (("teeth", "primate_molars"), ("jaws", "mouse_mandibles")):
+        files = scan_files(data / name) if (data / name).is_dir() else []
+        drawn = 0
+        while files and drawn < number:
+            x, y = (files[i] for i in random.choice(len(files), 2, replace=False))
+            if kind == "teeth" and (side_of(x) != side_of(y)) != bool(drawn % 2):
+                continue
+            drawn += 1
+            meshes, landmarks = [read_mesh(x), read_mesh(y)], common_landmarks(x, y)
+            vertices = [
+                mesh.referenced_indices[
+                    KDTree(mesh.vertices[mesh.referenced_indices]).query(own.positions)[1]
+                ]
+                for mesh, own in zip(meshes, landmarks, strict=True)
+            ]
+            yield KnownPair(kind, *meshes, False, *vertices)
+
+
+def of_brains(data: Path) -> Iterator[KnownPair]:
+    """Yield both halves of a brain in both directions."""
+    files = sorted((data / "brain_halves").glob("*.off"))
+    for x, y in (files, files[::-1]) if len(files) == 2 else ():
+        meshes = read_mesh(x), read_mesh(y)
+        same = np.arange(len(meshes[0].vertices))
+        yield KnownPair("brain", *meshes, False, same, same)
+
+
+def of_masks(data: Path) -> Iterator[KnownPair]:
+    """Yield a mask and a head of different people in both directions, with landmarks."""
+    folder = data / "open_shells"
+    if folder.is_dir():
+        meshes = read_mesh(folder / "mask.off"), read_mesh(folder / "head.off")
+        landmarks = np.loadtxt(folder / "landmarks.csv", delimiter=",", skiprows=1, dtype=np.int64).T
+        for x, y in ((0, 1), (1, 0)):
+            yield KnownPair("mask", meshes[x], meshes[y], False, landmarks[x], landmarks[y])
+
+
+def of_creatures(number: int, seed: int) -> Iterator[KnownPair]:
+    """Make creatures, and parts of creatures that are called full."""
+    for drawn in range(number):
+        kind = ("biped", "quadruped")[drawn % 2]
+        pair = creature_pair(kind, vertices=1500, seed=seed + drawn)
+        x, y, truth = pair.source, pair.target, pair.truth.nearest_corners(pair.target)
+        yield KnownPair("creatures", x, y, False, np.arange(len(truth)), truth)
+        along = x.vertices[:, np.argmax(np.ptp(x.vertices, axis=0))]
+        kept = along > np.quantile(along, (0.6, 0.4)[drawn // 2 % 2])
+        part = make_mesh(x.vertices, x.faces[kept[x.faces].all(axis=1)], name=f"part of {x.name}")
+        used = part.referenced_indices
+        yield KnownPair("parts called full", part, y, False, used, truth[used])
+
+
+def of_bumpy_bodies(number: int, seed: int) -> Iterator[KnownPair]:
+    """Make bumpy bodies, and match them to bent copies and to bent mirror images."""
+    ball = creature_pair("biped", vertices=2500).source
+    directions = ball.vertices - ball.middle
+    sphere = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    for drawn in range(number):
+        random = np.random.default_rng(seed + drawn)
+        centers = random.normal(size=(20, 3))
+        centers /= np.linalg.norm(centers, axis=1, keepdims=True)
+        heights = np.exp(40 * (sphere @ centers.T - 1)) @ random.choice([-1, 1], 20)
+        body = sphere * (1 + 0.3 * np.tanh(heights))[:, None] * [1.6, 1.1, 1]
+        bent = body + 0.1 * np.sin(2 * body[:, [1, 2, 0]] + random.uniform(0, 6, 3))
+        order = random.permutation(len(body))
+        other, faces = np.empty_like(bent), order[ball.faces]
+        other[order] = bent * ([-1, 1, 1] if drawn % 2 else [1, 1, 1])
+        meshes = (
+            make_mesh(body, ball.faces, name=f"bumpy body {seed + drawn}"),
+            make_mesh(
+                other,
+                faces[:, ::-1] if drawn % 2 else faces,
+                name="its mirror image" if drawn % 2 else "itself, bent",
+            ),
+        )
+        yield KnownPair("bumpy bodies", *meshes, False, np.arange(len(order)), order)
