@@ -82,8 +82,9 @@ class SearchSettings:
 
     **Attributes:**
 
-    - `certain`: a probability. If the map of the first start is right with at least this probability, no
-      other map is tried. With 0, the first map is always taken.
+    - `certain` and `certain_distortion` (entry R49): a probability, and a number of at least 1. If the map of
+      the first start is right with at least this probability, and has at most this distortion, no other map is
+      tried. With a probability of 0, the first map is always taken.
     - `finalists`: the largest number of maps that are refined at all vertices after the race, at least 1.
     - `likely`: a share. A map of the race is refined at all vertices only if its probability is at least this
       share of the best one.
@@ -113,7 +114,8 @@ class SearchSettings:
     **Raises:** `InputError` if a number is out of its range.
     """
 
-    certain: float = 0.875
+    certain: float = 0.8
+    certain_distortion: float = 1.06
     finalists: int = 3
     likely: float = 0.05
     non_isometric: float = 0.14
@@ -136,7 +138,7 @@ class SearchSettings:
             check_number(name, getattr(self, name), most=1.0)
         for name in ("non_isometric", "pass_tolerance", "without_creases_from", "coarse_from"):
             check_number(name, getattr(self, name))
-        for name in ("trimmed_from", "trimmed_area"):
+        for name in ("certain_distortion", "trimmed_from", "trimmed_area"):
             check_number(name, getattr(self, name), positive=True)
         if not isinstance(self.cut_shortcuts, bool):
             raise InputError(f"cut_shortcuts is {self.cut_shortcuts!r}: give True or False.")

@@ -16,7 +16,7 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.scale import relative_boundary
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import area_shape_difference
+from jaxsmw.matching.judge import area_shape_difference, distortion
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -92,7 +92,7 @@ def search(
     # Of asymmetric shapes, the wrong hand can have a good map, so both hands are compared. A shape that is
     # nearly its own mirror image, such as a person, needs no second hand: its left stays its left.
     both_hands = hypotheses and mirror == "auto" and reading.is_asymmetric()
-    certain = _certain(judged, settings) and not both_hands
+    certain = _ends_the_search(first, settings) and not both_hands
     readings = [reading]
     if hypotheses and not certain:
         readings += _as_parts(reading)
@@ -112,6 +112,19 @@ def search(
         certain = _certain(judged, settings)
     likely = _likely(judged, settings)
     return list(different([_finished(one, preset) if one in likely else one for one in judged]))
+
+
+def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
+    """Return whether the first map needs no comparison with other maps.
+
+    The probability alone does not suffice, because a map that exchanges two limbs of an animal can be as good
+    on most patches as a right map of other animals. Such a map is not nearly isometric.
+    """
+    if not _certain([first], settings):
+        return False
+    prepared = first.reading.prepared
+    distorted = distortion(prepared.pair, first.pointwise_map, prepared.x.spectrum)
+    return settings.certain == 0 or distorted <= settings.certain_distortion
 
 
 def _certain(judged: Sequence[Judged], settings: SearchSettings) -> bool:
