@@ -6,8 +6,8 @@
 `scripts/judged_pairs.py`, and matches them by `jaxsmw.match` with its defaults. It writes `pairs.csv`, which
 a later run continues, the tables `search.md`, and the reliability curve `search.png`.
 
-- A map is right if its mean error is below 0.1 and at most 10 % of its errors exceed 0.25, in units of the
-  square root of the area. It is silent if its probability is at least one half.
+- A map is right if its mean geodesic error is below 0.1 and less than 5 % of its errors exceed 0.25, in units
+  of the square root of the area. It is silent if its probability is at least one half.
 - *right among four*: the map or one of the first three alternatives is right.
 - The reliability curve groups the maps by probability. The bars are 95 % intervals of the share of right maps
   (Wilson 1927).

@@ -262,13 +262,20 @@ def test_a_certain_map_ends_the_search(pair, monkeypatch):
     prepared = prepare(Pair.make(mesh_x, mesh_y), Sizes(60)).describe(30)
     raced = []
     monkeypatch.setattr("jaxsmw.matching.search.search.race", lambda *a: raced.append(a) or [])
-    for start, certain, races in ((truth, 0.5, 0), (truth, 1.0, 1), (upside_down(mesh_x, truth), 0.5, 1)):
+    wrong = upside_down(mesh_x, truth)
+    for start, certain, most, races in (
+        (truth, 0.5, 2.0, 0),
+        (truth, 1.0, 2.0, 1),
+        (truth, 0.5, 1.0, 1),
+        (wrong, 0.5, 9.0, 1),
+        (wrong, 0.0, 1.0, 0),
+    ):
         raced.clear()
-        preset = replace(SEARCH, search=replace(SEARCH.search, certain=certain))
+        preset = replace(SEARCH, search=replace(SEARCH.search, certain=certain, certain_distortion=most))
         (found,) = search(prepared, Start(start), preset)
         assert len(raced) == races and found.outcome.successful
-    (found,) = search(prepared, Start(upside_down(mesh_x, truth)), replace(SEARCH, search=None))
-    assert found.log_odds < 0 and len(raced) == 1
+    (found,) = search(prepared, Start(wrong), replace(SEARCH, search=None))
+    assert found.log_odds < 0 and not raced
 
 
 @pytest.mark.filterwarnings("ignore:.*neighbours within the SHOT radius:UserWarning")

@@ -82,9 +82,9 @@ class SearchSettings:
 
     **Attributes:**
 
-    - `certain` and `certain_distortion` (entry R49): a probability, and a number of at least 1. If the map of
-      the first start is right with at least this probability, and has at most this distortion, no other map is
-      tried. With a probability of 0, the first map is always taken.
+    - `certain` and `certain_distortion` (entry R49): a probability and a positive number. If the map of the
+      first start is right with at least this probability, and has at most this distortion, no other map is
+      tried. If `certain` is 0, the first map is always taken.
     - `finalists`: the largest number of maps that are refined at all vertices after the race, at least 1.
     - `likely`: a share. A map of the race is refined at all vertices only if its probability is at least this
       share of the best one.
@@ -114,7 +114,7 @@ class SearchSettings:
     **Raises:** `InputError` if a number is out of its range.
     """
 
-    certain: float = 0.8
+    certain: float = 0.75
     certain_distortion: float = 1.06
     finalists: int = 3
     likely: float = 0.05

@@ -13,7 +13,7 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, _DISCONTINUITY = 0.15, -1.9, -2.7, 1.1, -3.0
+_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, _DISCONTINUITY = -0.2, -1.9, -2.7, 1.1, -3.0
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 7.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.

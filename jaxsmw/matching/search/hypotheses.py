@@ -25,7 +25,7 @@ _SHOT_RADII = ((1,), (1, 2, 4), (2, 4), (4, 8))
 _ALIGNED, _ALONG_AXES, _TO_EXTREMITIES = 9.0, 10.0, 2.25
 # The number of alignments that differ from each other, and of pairings of extremities: of the most plausible
 # ones, those with the most similar features.
-_ALIGNMENTS, _PLAUSIBLE, _PAIRINGS = 4, 64, 6
+_ALIGNMENTS, _PLAUSIBLE, _PAIRINGS = 4, 64, 12
 # The identity and the half turns about the three principal axes, as factors of the three coordinates.
 _HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
