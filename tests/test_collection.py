@@ -138,6 +138,7 @@ def test_a_second_call_matches_nothing_and_gives_the_same_result(meshes, work, f
     assert again.edges == found.edges
 
 
+@pytest.mark.sampled
 def test_maps_of_another_eigensolver_are_not_reused(meshes, work, found, matched, monkeypatch):
     """A large mesh that is added to a collection changes the eigensolver of all shapes."""
     monkeypatch.setattr("jaxsmw.collection.matching.choose_eigensolver", lambda *_: "approximate")
@@ -334,7 +335,7 @@ def test_meshes_of_the_other_hand_can_be_named(meshes, found):
         assert same.mean() > 0.99
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_shapes_of_the_other_hand_are_recognised(tmp_path):
     """Of four noisy asymmetric lumps, one is a mirror image."""
     lump = bumpy_mesh(3)

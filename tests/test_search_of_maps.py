@@ -365,6 +365,7 @@ def test_a_mirrored_result_is_in_terms_of_the_source():
     assert found.distortion < 1.1
 
 
+@pytest.mark.sampled
 def test_evidence_of_hands_has_opposite_signs_for_opposite_hands(lump):
     assert hand_evidence(read(lump, turned(lump.mirrored()))) > 0 > hand_evidence(read(lump, turned(lump)))
 

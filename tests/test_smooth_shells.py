@@ -91,6 +91,7 @@ def test_the_rigid_deformation_lowers_its_energy(surface):
         assert energy(moved) < energy(moved + step)
 
 
+@pytest.mark.sampled
 def test_a_turned_copy_is_recovered_exactly():
     body = creature("biped", vertices=800)
     copy, order = turned_copy(body)
