@@ -176,7 +176,8 @@ def test_the_ground_truth_follows_the_deformation(kind, pair):
 
     moved = creature(kind, vertices=800, pose=pose_of(pair.target), seed=4).vertices
     error = np.linalg.norm(pair.truth.positions(pair.target) - moved, axis=1) / size
-    assert error.mean() < 0.004 and error.max() < 0.05  # an edge is about 0.04 long
+    # The horns of the dragon are thinner than the edges, which are about 0.04 long.
+    assert error.mean() < 0.004 and error.max() < (0.05 if kind == "dragon" else 0.03)
     # Neighbouring vertices stay close, so no vertex is projected onto another limb or through a thin limb.
     edges = igl.edges(pair.source.faces)
     ends = pair.truth.positions(pair.target)[edges]

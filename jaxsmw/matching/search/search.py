@@ -122,9 +122,10 @@ def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
     """
     if not _certain([first], settings):
         return False
+    if settings.certain == 0:
+        return True
     prepared = first.reading.prepared
-    distorted = distortion(prepared.pair, first.pointwise_map, prepared.x.spectrum)
-    return settings.certain == 0 or distorted <= settings.certain_distortion
+    return distortion(prepared.pair, first.pointwise_map, prepared.x.spectrum) <= settings.certain_distortion
 
 
 def _certain(judged: Sequence[Judged], settings: SearchSettings) -> bool:
