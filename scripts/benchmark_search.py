@@ -29,7 +29,7 @@ from scipy.stats import binomtest
 
 from jaxsmw import match
 from jaxsmw.benchmark.tables import markdown
-from jaxsmw.report.figures import save_figure
+from jaxsmw.report.figures import new_figure, save_figure, style_axes
 from jaxsmw.runtime.provenance import made_with
 
 # The ends of the groups of maps by probability.
@@ -121,9 +121,7 @@ def reliability(own: Sequence[Judged]) -> tuple[float, tuple[float, float, float
 
 def draw(results: Sequence[Judged], file: Path) -> None:
     """Draw the reliability curve."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5, 4.2), layout="constrained")
+    figure = new_figure(5.0, 4.2, plot=True)
     axes = figure.add_subplot()
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
     for _, _, own in grouped(results):
@@ -131,6 +129,7 @@ def draw(results: Sequence[Judged], file: Path) -> None:
         axes.errorbar(stated, share, [[share - least], [most - share]], color="C0", marker="o", capsize=3)
         axes.annotate(str(len(own)), (stated, share), xytext=(5, -11), textcoords="offset points", fontsize=8)
     axes.set(xlabel="probability that the map is right", ylabel="share of right maps", ylim=(-0.02, 1.04))
+    style_axes(axes)
     save_figure(file, figure)
 
 
