@@ -7,6 +7,8 @@ import pickle
 import shutil
 import signal
 import sys
+import threading
+import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -46,6 +48,26 @@ jax.config.update("jax_include_full_tracebacks_in_locations", False)
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# `beartype` suppresses warnings while it decorates a function. If two threads do so at once, the one that ends last can
+# leave all warnings suppressed (before Python 3.14), and `pytest.warns` then sees none. So they take turns.
+_turns = threading.RLock()
+_enter, _exit = warnings.catch_warnings.__enter__, warnings.catch_warnings.__exit__
+
+
+def _in_turn(context: warnings.catch_warnings) -> Any:
+    if threading.current_thread() is not threading.main_thread():
+        _turns.acquire()
+    return _enter(context)
+
+
+def _end_turn(context: warnings.catch_warnings, *error: Any) -> None:
+    _exit(context, *error)
+    if threading.current_thread() is not threading.main_thread():
+        _turns.release()
+
+
+warnings.catch_warnings.__enter__, warnings.catch_warnings.__exit__ = _in_turn, _end_turn
 
 # A Hypothesis example may compile a program, which can take longer than Hypothesis's default deadline.
 hypothesis.settings.register_profile("default", deadline=None, derandomize=True)
