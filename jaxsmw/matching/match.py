@@ -36,6 +36,7 @@ from jaxsmw.matching.search.search import search
 from jaxsmw.matching.search.trimming import match_trimmed
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
 from jaxsmw.matching.starts import check_initial_map, make_start
+from jaxsmw.runtime.memory import release_freed_memory
 from jaxsmw.runtime.progress import Step, no_step, timed
 from jaxsmw.runtime.threads import one_blas_thread
 
@@ -132,6 +133,7 @@ def match(
 
     seconds: dict[str, float] = {}
     step = functools.partial(timed, seconds=seconds)
+    release_freed_memory()
     # Searches and preparation use all cores, for which threads of the linear algebra would only wait.
     with one_blas_thread():
         prepared = prepare(
