@@ -78,9 +78,9 @@ def judged_pair(known: KnownPair) -> JudgedPair:
 
 def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
     """Return what the log-odds depend on linearly, in the order of `Evidence`, with the intercept first."""
-    deformation, *others, discontinuity = evidence.T
-    columns = np.ones(len(evidence)), np.log(deformation + 0.01), *others, np.sqrt(discontinuity)
-    return np.stack(columns, axis=1)
+    deformation, *others, discontinuity, uncovered = evidence.T
+    columns = np.log(deformation + 0.01), *others, np.sqrt(discontinuity), np.sqrt(uncovered)
+    return np.stack((np.ones(len(evidence)), *columns), axis=1)
 
 
 def fitted(pairs: Sequence[JudgedPair]) -> Float[np.ndarray, " f"]:

@@ -94,12 +94,12 @@ def test_rigid_motions_have_no_deformation_and_reflections_have(pair):
     rotation = Rotation.random(random_state=0)
     reading = read(mesh, Mesh(rotation.apply(mesh.vertices) + 2, mesh.faces))
     identity = np.arange(len(reading.x.areas))
-    assert deformation(reading, identity).max() < 1e-12
+    assert deformation(reading.x, reading.y, identity).max() < 1e-12
     evidence = Evidence.of(reading, identity)
-    assert evidence.deformation < 1e-12 and evidence.dissimilarity < 1e-6
+    assert evidence.deformation < 1e-12 and evidence.dissimilarity < 1e-6 and evidence.uncovered == 0
     other = reading.mirror()
     assert other.x.distances is reading.x.distances and other.prepared.mirrored
-    assert deformation(other, identity).mean() > 0.01
+    assert deformation(other.x, other.y, identity).mean() > 0.01
     assert Evidence.of(other, identity).log_odds < evidence.log_odds
 
 
@@ -108,7 +108,7 @@ def test_deformation_is_the_residual_of_procrustes_alignment(pair):
     mesh_x, mesh_y, truth = pair
     reading = read(mesh_x, mesh_y)
     x, y, matches = reading.x, reading.y, reading.reduced(truth)
-    found = deformation(reading, matches)
+    found = deformation(x, y, matches)
     for sample in range(0, len(x.areas), 50):
         patch = x.distances[sample] < 0.2
         weights = np.tile(x.areas[patch], 2) / x.areas[patch].sum() / 2
@@ -130,7 +130,7 @@ def test_discontinuity_is_the_share_of_neighbours_whose_matches_are_far_apart(pa
     mesh_x, mesh_y, truth = pair
     reading = read(mesh_x, mesh_y)
     x, y, matches = reading.x, reading.y, reading.reduced(truth)
-    assert discontinuity(reading, matches) == 0
+    assert discontinuity(x, y, matches) == 0
     moved = x.distances[0] < 0.3
     torn = np.where(moved, np.argmax(y.distances[matches[0]]), matches)
     far = neighbours = 0.0
@@ -140,7 +140,31 @@ def test_discontinuity_is_the_share_of_neighbours_whose_matches_are_far_apart(pa
             neighbours += weight
             far += weight * (y.distances[torn[first], torn[second]] > 0.3)
     assert 0 < far < neighbours
-    assert discontinuity(reading, torn) == pytest.approx(far / neighbours)
+    assert discontinuity(x, y, torn) == pytest.approx(far / neighbours)
+
+
+def test_a_one_to_one_map_and_its_reverse_map_have_the_same_evidence(pair):
+    mesh_x, _, _ = pair
+    bent = Mesh(mesh_x.vertices + 0.1 * np.sin(5 * mesh_x.vertices[:, [1, 2, 0]]), mesh_x.faces)
+    there, back = read(mesh_x, bent), read(bent, mesh_x)
+    # Samples are paired in the order of their vertices, so the map is one-to-one.
+    matches = np.argsort(there.y.samples.vertices)[np.argsort(np.argsort(there.x.samples.vertices))]
+    first, second = Evidence.of(there, matches), Evidence.of(back, np.argsort(matches))
+    for name in ("deformation", "discontinuity", "uncovered"):
+        assert getattr(first, name) == pytest.approx(getattr(second, name))
+
+
+def test_a_map_to_a_part_of_the_target_leaves_the_rest_uncovered(pair):
+    mesh, _, _ = pair
+    reading = read(mesh, mesh)
+    x = reading.x
+    near = x.distances[0] < np.quantile(x.distances[0], 0.5)
+    to_the_half = np.where(near, np.arange(len(near)), 0)
+    around = x.distances[:, np.unique(to_the_half)].min(axis=1) > 0.1
+    evidence = Evidence.of(reading, to_the_half)
+    assert evidence.uncovered > 0.2
+    assert evidence.uncovered == pytest.approx(x.areas[around].sum())
+    assert evidence.log_odds < Evidence.of(reading, np.arange(len(near))).log_odds - 1
 
 
 def test_the_true_map_has_better_evidence_than_wrong_maps(pair):
@@ -238,7 +262,7 @@ def test_twins_are_merged_and_the_better_one_is_kept(pair):
     slightly[few] = wrong[few]
 
     def candidate(matches, score):
-        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, False, 0.0))
+        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, False, 0.0, 0.0))
 
     candidates = [candidate(matches, 1.0), candidate(slightly, 2.0), candidate(wrong, 0.5)]
     assert list(different(candidates)) == [candidates[1], candidates[2]]

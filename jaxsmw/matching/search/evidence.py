@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsmw.geometry.alignment import nearest_rotations
-from jaxsmw.matching.search.proxies import SampleMap
+from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE, _DISCONTINUITY = -0.2, -1.9, -2.7, 1.1, -3.0
+_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE = -3.7, -3.6, -2.3, 1.3
+_DISCONTINUITY, _UNCOVERED = -4.2, -2.8
 # How much differences of log-odds count between maps of the same pair.
-_CONTRAST = 7.0
+_CONTRAST = 5.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
 _LEAST = 0.01
 # The distance of the points on normals from the surface, in units of the square root of the area.
@@ -26,10 +27,15 @@ _NEAR = 0.1
 # The matches of two neighbours are far apart if their distance along the surface is larger, in units of the
 # square root of the area.
 _FAR = 0.3
+# A sample of Y is uncovered if no match is nearer, in the same units.
+_COVERED = 0.1
 
 
 class Evidence(NamedTuple):
     """What shows whether a map is right, measured on the samples.
+
+    A map that is right has a right reverse map, in which each sample of Y has the sample of X whose match is
+    nearest. Deformation and discontinuity are means over the map and its reverse map.
 
     **Attributes:**
 
@@ -39,28 +45,37 @@ class Evidence(NamedTuple):
       matches, divided by its mean for random matches. It is 0 for congruent shapes.
     - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
     - `discontinuity`: the share of neighbouring samples whose matches are far apart; see `discontinuity`.
+    - `uncovered`: the share of Y's area, from 0 to 1, that is far from all matches.
     """
 
     deformation: float
     dissimilarity: float
     in_place: bool
     discontinuity: float
+    uncovered: float
 
     @classmethod
     def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
         """Measure a map of samples (s,)."""
-        x, y, of_patches = reading.x, reading.y, deformation(reading, matches)
-        areas = _overlapping_areas(reading, of_patches)
+        x, y = reading.x, reading.y
+        to_matches = y.distances[:, matches]
+        ways = (x, y, matches), (y, x, to_matches.argmin(axis=1))
+        deformations = [deformation(*way) for way in ways]
+        areas_x, areas_y = _overlapping_areas(reading, *deformations)
         of_x, of_y = (spectrum.descriptors for spectrum in reading.spectra.both)
         dissimilarity = 1.0  # as for random matches
         if of_x is not None and of_y is not None:
             # The descriptors are principal components of variance 1.
             differences = ((np.asarray(of_x) - np.asarray(of_y)[matches]) ** 2).mean(axis=1) / 2
-            dissimilarity = float(areas @ differences)
+            dissimilarity = float(areas_x @ differences)
         offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
-        in_place = bool(areas @ offsets < _NEAR * y.unit) and not x.mirrored
-        torn = discontinuity(reading, matches)
-        return cls(float(areas @ of_patches), dissimilarity, in_place, torn)
+        return cls(
+            deformation=float(areas_x @ deformations[0] + areas_y @ deformations[1]) / 2,
+            dissimilarity=dissimilarity,
+            in_place=bool(areas_x @ offsets < _NEAR * y.unit) and not x.mirrored,
+            discontinuity=sum(discontinuity(*way) for way in ways) / 2,
+            uncovered=float(areas_y @ (to_matches.min(axis=1) > _COVERED)),
+        )
 
     @property
     def log_odds(self) -> float:
@@ -71,10 +86,11 @@ class Evidence(NamedTuple):
             + _DISSIMILARITY * self.dissimilarity
             + _IN_PLACE * self.in_place
             + _DISCONTINUITY * np.sqrt(self.discontinuity)
+            + _UNCOVERED * np.sqrt(self.uncovered)
         )
 
 
-NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False, discontinuity=1.0)
+NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False, discontinuity=1.0, uncovered=1.0)
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 
@@ -92,35 +108,39 @@ def probabilities(log_odds: Sequence[float]) -> Float[np.ndarray, " c"]:
     return shares / shares.sum() / (1 + np.exp(-odds.max()))
 
 
-def _overlapping_areas(reading: Reading, deformations: Float[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
-    """Return the areas of the samples of X that count, with the sum 1.
+def _overlapping_areas(
+    reading: Reading, of_x: Float[np.ndarray, " s"], of_y: Float[np.ndarray, " t"]
+) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " t"]]:
+    """Return the areas of the samples of X and of Y that count, each with the sum 1.
 
-    If Y is a part of X, only the least deformed patches count, with the area of Y in total.
+    If one shape is a part of the other, only the least deformed patches of the larger shape count, with the
+    area of the smaller shape in total.
     """
-    areas, pair = reading.x.areas, reading.prepared.pair
-    area_x, area_y = pair.areas
-    if not pair.partial or area_y >= area_x:
-        return areas
-    order = np.argsort(deformations, kind="stable")
-    before = np.cumsum(areas[order]) - areas[order]
-    counted = np.zeros(len(areas))
-    counted[order] = np.where(before < area_y / area_x, areas[order], 0)
-    return counted / counted.sum()
+    pair = reading.prepared.pair
+    areas = []
+    for side, deformations, area in zip((reading.x, reading.y), (of_x, of_y), pair.areas, strict=True):
+        share = min(pair.areas) / area if pair.partial else 1.0
+        order = np.argsort(deformations, kind="stable")
+        before = np.cumsum(side.areas[order]) - side.areas[order]
+        counted = np.zeros(len(side.areas))
+        counted[order] = np.where(before < share, side.areas[order], 0)
+        areas.append(counted / counted.sum())
+    return areas[0], areas[1]
 
 
-def discontinuity(reading: Reading, matches: SampleMap) -> float:
+def discontinuity(source: Proxy, target: Proxy, matches: SampleMap) -> float:
     """Measure how much a map tears neighbouring samples apart, as where exchanged limbs begin.
 
-    **Returns:** The share of the neighbouring pairs of samples of X whose matches are far apart along the
-    surface of Y, from 0 to 1. A pair counts by the product of the areas of its samples.
+    **Returns:** The share of the neighbouring pairs of source samples whose matches are far apart along the
+    surface of the target, from 0 to 1. A pair counts by the product of the areas of its samples.
     """
-    pairs, weights = reading.neighbours
+    pairs, weights = source.neighbours
     first, second = matches[pairs]
-    return float(weights @ (reading.y.distances[first, second] > _FAR))
+    return float(weights @ (target.distances[first, second] > _FAR))
 
 
-def deformation(reading: Reading, matches: SampleMap) -> Float[np.ndarray, " s"]:
-    """Measure how far a map deviates from a rigid motion on the patch around each sample of X.
+def deformation(source: Proxy, target: Proxy, matches: SampleMap) -> Float[np.ndarray, " s"]:
+    """Measure how far a map deviates from a rigid motion on the patch around each source sample.
 
     A rotation and a translation carry the patch as close as possible to its matches. The deformation is the
     mean squared distance that remains, divided by the size of the patch. The size is the variance of the
@@ -132,14 +152,14 @@ def deformation(reading: Reading, matches: SampleMap) -> Float[np.ndarray, " s"]
 
     **Returns:** The deformation of each patch (s,), from 0 for a rigid motion to at most 1.
     """
-    source, target = reading.x.positions, reading.y.positions[matches]
-    products = np.einsum("sa,sb->sab", source, target)
+    before, after = source.positions, target.positions[matches]
+    products = np.einsum("sa,sb->sab", before, after)
     # The sums over two points on the normal of each sample, one on either side of the surface.
-    products += _THICKNESS**2 * np.einsum("sa,sb->sab", reading.x.normals, reading.y.normals[matches])
-    squares = np.sum(source**2 + target**2, axis=1, keepdims=True) + 2 * _THICKNESS**2
-    columns = reading.patches @ np.hstack([source, target, products.reshape(-1, 9), squares])
-    mean_x, mean_y = columns[:, :3], columns[:, 3:6]
-    moments = columns[:, 6:15].reshape(-1, 3, 3) - np.einsum("sa,sb->sab", mean_x, mean_y)
-    size = columns[:, 15] - np.sum(mean_x**2 + mean_y**2, axis=1)
+    products += _THICKNESS**2 * np.einsum("sa,sb->sab", source.normals, target.normals[matches])
+    squares = np.sum(before**2 + after**2, axis=1, keepdims=True) + 2 * _THICKNESS**2
+    columns = source.patches @ np.hstack([before, after, products.reshape(-1, 9), squares])
+    mean_before, mean_after = columns[:, :3], columns[:, 3:6]
+    moments = columns[:, 6:15].reshape(-1, 3, 3) - np.einsum("sa,sb->sab", mean_before, mean_after)
+    size = columns[:, 15] - np.sum(mean_before**2 + mean_after**2, axis=1)
     _, traces = nearest_rotations(moments)
     return np.clip((size - 2 * traces) / np.maximum(size, np.finfo(float).tiny), 0, 1)

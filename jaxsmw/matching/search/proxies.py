@@ -22,6 +22,11 @@ SampleMap = Int64[np.ndarray, " s"]
 
 # The number of samples of each shape. With fewer samples, the bumps of a folded surface are lost.
 SAMPLES = 1000
+# The radius of the patches that a right map moves nearly rigidly, in units of the square root of the area,
+# and the least number of samples in a patch. Smaller patches would fit any matches.
+_PATCH, _FEWEST = 0.2, 8
+# Two samples are neighbours if their distance along the surface is smaller, in the same units.
+_NEIGHBOURS = 0.12
 
 
 class Proxy:
@@ -108,3 +113,22 @@ class Proxy:
             straight = cdist(self.positions, self.positions)
             distances = np.where(np.isfinite(distances), distances, straight)
         return distances
+
+    @functools.cached_property
+    def patches(self) -> Float[np.ndarray, "s s"]:
+        """The weights of the samples in the patch around each sample. Each row has the sum 1."""
+        distances = self.distances
+        fewest = min(_FEWEST, len(distances)) - 1
+        radii = np.maximum(_PATCH, np.partition(distances, fewest, axis=1)[:, fewest])
+        weights = (distances <= radii[:, None]) * self.areas
+        return weights / weights.sum(axis=1, keepdims=True)
+
+    @functools.cached_property
+    def neighbours(self) -> tuple[Int64[np.ndarray, "2 p"], Float[np.ndarray, " p"]]:
+        """The pairs of neighbouring samples, and their weights, which have the sum 1.
+
+        The weight of a pair is proportional to the product of the areas of its samples.
+        """
+        pairs = np.array(np.nonzero(np.triu(self.distances < _NEIGHBOURS, 1)))
+        weights = self.areas[pairs].prod(axis=0)
+        return pairs, weights / max(weights.sum(), np.finfo(float).tiny)

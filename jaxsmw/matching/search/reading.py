@@ -114,32 +114,9 @@ class Reading:
         """Return the share of X's area, from 0 to 1, on which two maps of samples differ."""
         return float(self.x.areas @ (self.y.distances[first, second] > _DIFFERENT))
 
-    @cached_property
-    def patches(self) -> Float[np.ndarray, "s s"]:
-        """The weights of the samples in the patch around each sample of X. Each row has the sum 1."""
-        distances = self.x.distances
-        fewest = min(_FEWEST, len(distances)) - 1
-        radii = np.maximum(_PATCH, np.partition(distances, fewest, axis=1)[:, fewest])
-        weights = (distances <= radii[:, None]) * self.x.areas
-        return weights / weights.sum(axis=1, keepdims=True)
-
-    @cached_property
-    def neighbours(self) -> tuple[Int64[np.ndarray, "2 p"], Float[np.ndarray, " p"]]:
-        """The pairs of neighbouring samples of X, and their weights, which have the sum 1.
-
-        The weight of a pair is proportional to the product of the areas of its samples.
-        """
-        pairs = np.array(np.nonzero(np.triu(self.x.distances < _NEIGHBOURS, 1)))
-        weights = self.x.areas[pairs].prod(axis=0)
-        return pairs, weights / max(weights.sum(), np.finfo(float).tiny)
-
 
 # The radii of SHOT, in units of 0.06, and the least mean asymmetry of asymmetric shapes. (Entry R23)
 _ASYMMETRY_RADII, _ASYMMETRIC = (3, 6), 0.61
-# Two maps differ at a sample if its two matches are at least so far apart along the surface, and the radius
-# of the patches that a right map moves nearly rigidly; both in units of the square root of the area.
-_DIFFERENT, _PATCH = 0.2, 0.2
-# Two samples are neighbours if their distance along the surface is smaller, in the same units.
-_NEIGHBOURS = 0.12
-# The least number of samples in a patch. Smaller patches would fit any matches.
-_FEWEST = 8
+# Two maps differ at a sample if its two matches are at least so far apart along the surface, in units of the
+# square root of the area.
+_DIFFERENT = 0.2
