@@ -171,11 +171,10 @@ def _measure(options: argparse.Namespace, name: str, ablation: str) -> dict[str,
         result["direct"] = _summary(np.array(single))
         result["ratio"] = float(np.mean(through) / np.mean(single))
     if options.ablations and ablation == _DEFAULT:
-        meshes, points = collection.meshes, collection.points
-        template = meshes[collection.template]
+        points, template = collection.points, collection.meshes[collection.template]
         errors = []
         for i, j in pairs:
-            of_pair = points[i], points[j], template, meshes[i], meshes[j]
+            of_pair = points[i], points[j], template, collection.meshes[i], collection.meshes[j]
             unregistered = SimpleNamespace(pointwise_map=vertex_map_between(*of_pair))
             errors.append(_measure_truth(collection, files, i, j, unregistered))
         result["without_registered_meshes"] = _summary(np.array(errors))

@@ -23,6 +23,7 @@ Part = tuple[str, str, list[list[str]], dict[str, Any]]
 """A tuple of a table's title, a note on the measurement, the rows of the table, and all measured numbers."""
 
 PairT = TypeVar("PairT")
+NameT = TypeVar("NameT")
 
 
 def make_parser(
@@ -76,7 +77,8 @@ def measure_parts(
     # Other machines have other paths.
     arguments = [Path(argument).name if os.path.isabs(argument) else argument for argument in sys.argv]
     origin = {"command": shlex.join(["python", *arguments]), **provenance()}
-    texts, numbers = [f"# {title}\n\n{json.dumps(origin)}"], {"provenance": origin}
+    texts = [f"# {title}\n\n{json.dumps(origin)}"]
+    numbers: dict[str, Any] = {"provenance": origin}
     print(texts[0])
     for name in options.only:
         numbers[name] = []
@@ -91,12 +93,12 @@ def measure_parts(
 
 
 def medians(
-    candidates: dict[str, Callable[[], object]],
+    candidates: Mapping[NameT, Callable[[], object]],
     repeats: int,
     clock: Callable[[], Any] = time.perf_counter,
     *,
     warm: bool = True,
-) -> dict[str, Any]:
+) -> dict[NameT, Any]:
     """Run the candidates alternately, and return the median time of each candidate in seconds.
 
     **Arguments:**
@@ -106,7 +108,7 @@ def medians(
     - `clock`: a function that returns the current time in seconds, or an array of times in seconds.
     - `warm`: whether each candidate first runs once without timing, so that JAX compiles it.
     """
-    seconds: dict[str, list[Any]] = {name: [] for name in candidates}
+    seconds: dict[NameT, list[Any]] = {name: [] for name in candidates}
     for turn in range(repeats + warm):
         for name, candidate in candidates.items():
             start = clock()

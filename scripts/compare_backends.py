@@ -19,17 +19,19 @@ from common import make_parser
 
 from jaxsmw import geodesic_error, match, read_mesh
 from jaxsmw.benchmark.datasets import DataPair, open_data_set
+from jaxsmw.choices import Backend, PresetName
 from jaxsmw.errors import InputError
 
-BACKENDS = ("numpy", "jax")
+BACKENDS: tuple[Backend, ...] = ("numpy", "jax")
 FIELDS = ("data set", "pair", "equal", *(f"error, {name}" for name in BACKENDS), *BACKENDS)
 POINTS = 500
 
 
-def compared(pair: DataPair, preset: str) -> dict[str, float]:
+def compared(pair: DataPair, preset: PresetName) -> dict[str, float]:
     """Match a pair with both backends, and return the numbers of its row."""
     meshes = [read_mesh(file) for file in pair.meshes]
-    truth, maps, row = pair.ground_truth(*meshes), [], {}
+    truth, maps = pair.ground_truth(*meshes), []
+    row: dict[str, float] = {}
     for name in BACKENDS:
         began = time.perf_counter()
         with warnings.catch_warnings():

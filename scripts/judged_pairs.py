@@ -102,14 +102,14 @@ def of_landmarks(data: Path, number: int, seed: int) -> Iterator[KnownPair]:
             if kind == "teeth" and (side_of(x) != side_of(y)) != bool(drawn % 2):
                 continue
             drawn += 1
-            meshes, landmarks = [read_mesh(x), read_mesh(y)], common_landmarks(x, y)
-            vertices = [
+            meshes = read_mesh(x), read_mesh(y)
+            at_x, at_y = (
                 mesh.referenced_indices[
                     KDTree(mesh.vertices[mesh.referenced_indices]).query(own.positions)[1]
                 ]
-                for mesh, own in zip(meshes, landmarks, strict=True)
-            ]
-            yield KnownPair(kind, *meshes, False, *vertices)
+                for mesh, own in zip(meshes, common_landmarks(x, y), strict=True)
+            )
+            yield KnownPair(kind, *meshes, False, at_x, at_y)
 
 
 def of_brains(data: Path) -> Iterator[KnownPair]:
