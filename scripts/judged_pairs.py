@@ -1,4 +1,4 @@
-"""Pairs of many kinds of shapes with known matches, on which the search for the right map is judged.
+"""Pairs of many kinds of shapes with known matches, on which the search is judged, and tables of the results.
 
 The pairs come from data sets (`docs/datasets.md`) and from made shapes: people, animals, an ape and people,
 bodies with topological noise, teeth of both sides, jaws, halves of a brain, parts called partial and parts
@@ -7,8 +7,8 @@ called full, a mask and a head, creatures, and bumpy bodies with their mirror im
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import chain
+from collections.abc import Iterator, Sequence
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from common import common_landmarks, scan_files, side_of
 from jaxtyping import Int, Int64
 from scipy.spatial import KDTree
+from scipy.stats import binomtest
 
 from jaxsmw import Mesh, creature_pair, geodesic_error, make_mesh, read_mesh
 from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
@@ -26,6 +27,8 @@ from jaxsmw.evaluation import GroundTruth
 MEAN, GROSS, SHARE = 0.1, 0.25, 0.05
 # The largest number of points at which an error is measured.
 POINTS = 1000
+# The ends of the groups of maps by probability.
+GROUPS = (0, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1)
 
 
 class KnownPair(NamedTuple):
@@ -169,3 +172,66 @@ def of_bumpy_bodies(number: int, seed: int) -> Iterator[KnownPair]:
             ),
         )
         yield KnownPair("bumpy bodies", *meshes, False, np.arange(len(order)), order)
+
+
+class Judged(NamedTuple):
+    """The map of a pair: its mean error, whether it is right, and with which probability.
+
+    `among` states whether this map or another one of the search is right.
+    """
+
+    kind: str
+    error: float
+    right: bool
+    among: bool
+    probability: float
+    seconds: float = np.nan
+
+    @property
+    def silent(self) -> bool:
+        """Whether the map looks right."""
+        return self.probability >= 0.5
+
+
+def count_table(results: Sequence[Judged], among: str) -> list[list[str]]:
+    """Return the numbers of right, silent and flagged maps of each kind. `among` is the title of a column."""
+    rows = [["", "pairs", "right", among, "wrong and silent", "right and flagged"]]
+    for kind in (*dict.fromkeys(result.kind for result in results), "all"):
+        own = [result for result in results if kind in (result.kind, "all")]
+        counts = (
+            len(own),
+            sum(result.right for result in own),
+            sum(result.among for result in own),
+            sum(result.silent and not result.right for result in own),
+            sum(result.right and not result.silent for result in own),
+        )
+        rows.append([kind, *map(str, counts)])
+    return rows
+
+
+def reliability_table(results: Sequence[Judged]) -> list[list[str]]:
+    """Return the mean probability and the share of right maps of each group with similar probabilities."""
+    rows = [["probability", "maps", "mean probability", "right"]]
+    for low, high, own in grouped(results):
+        stated, (share, least, most) = reliability(own)
+        interval = f"{share:.1%} [{least:.1%}, {most:.1%}]"
+        rows.append([f"{low:.0%} to {min(high, 1):.0%}", str(len(own)), f"{stated:.1%}", interval])
+    return rows
+
+
+def grouped(results: Sequence[Judged]) -> list[tuple[float, float, list[Judged]]]:
+    """Return the groups of results with similar probabilities that are not empty, with their limits."""
+    limits = [*pairwise(GROUPS[:-1]), (GROUPS[-2], np.inf)]
+    groups = [
+        (low, high, [result for result in results if low <= result.probability < high])
+        for low, high in limits
+    ]
+    return [group for group in groups if group[2]]
+
+
+def reliability(own: Sequence[Judged]) -> tuple[float, tuple[float, float, float]]:
+    """Return the mean probability of a group, and its share of right maps with a 95 % interval."""
+    right = sum(result.right for result in own)
+    least, most = binomtest(right, len(own)).proportion_ci(method="wilson")
+    stated = float(np.mean([result.probability for result in own]))
+    return stated, (right / len(own), float(least), float(most))
