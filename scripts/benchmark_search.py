@@ -27,7 +27,6 @@ from judged_pairs import (
     Judged,
     KnownPair,
     count_table,
-    grouped,
     is_right,
     known_pairs,
     reliability,
@@ -88,10 +87,9 @@ def draw(results: Sequence[Judged], file: Path) -> None:
     figure = new_figure(5.0, 4.2, plot=True)
     axes = figure.add_subplot()
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
-    for _, _, own in grouped(results):
-        stated, (share, least, most) = reliability(own)
+    for _, number, stated, share, least, most in reliability(results):
         axes.errorbar(stated, share, [[share - least], [most - share]], color="C0", marker="o", capsize=3)
-        axes.annotate(str(len(own)), (stated, share), xytext=(5, -11), textcoords="offset points", fontsize=8)
+        axes.annotate(str(number), (stated, share), xytext=(5, -11), textcoords="offset points", fontsize=8)
     axes.set(xlabel="probability that the map is right", ylabel="share of right maps", ylim=(-0.02, 1.04))
     style_axes(axes)
     save_figure(file, figure)

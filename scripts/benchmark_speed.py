@@ -29,7 +29,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import re
 import resource
 import shutil
 import subprocess
@@ -39,7 +38,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -49,7 +48,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
-from common import Part, make_parser, measure_parts, medians
+from common import Part, data_sets, make_parser, measure_parts, medians, memory
 from jaxtyping import Int64
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
@@ -59,7 +58,6 @@ from jaxsmw.benchmark.datasets import DataPair, open_data_set
 from jaxsmw.choices import Backend, Eigensolver, PresetName
 from jaxsmw.core.refinement import refine, refine_at_once
 from jaxsmw.creature import CREATURES, creature_pair
-from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
@@ -92,12 +90,6 @@ def wall_and_cpu() -> np.ndarray:
     """Return the wall time, and the CPU time of this process and its finished children, in seconds."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return np.array([time.perf_counter(), time.process_time() + children.ru_utime + children.ru_stime])
-
-
-def memory(entry: str) -> float:
-    """Return an entry of `/proc/self/status` in GiB: "VmRSS", or its peak so far, "VmHWM"."""
-    (kilobytes,) = re.findall(rf"{entry}:\s*(\d+) kB", Path("/proc/self/status").read_text("utf-8"))
-    return int(kilobytes) / 2**20
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
@@ -170,12 +162,11 @@ def assorted_pairs(options: argparse.Namespace) -> Iterator[KnownPair]:
         for seed, size in enumerate(sizes):
             yield KnownPair.of_creatures([*CREATURES][seed % len(CREATURES)], int(size), seed)
         return
-    data_sets = []
-    for directory in sorted(options.data.resolve().parent.iterdir()):
-        with suppress(InputError):  # another directory
-            pairs = open_data_set(directory).pairs
-            data_sets.append([pairs[number] for number in random.permutation(len(pairs))])
-    for pair in chain.from_iterable(zip_longest(*data_sets)):
+    shuffled = [
+        [data_set.pairs[number] for number in random.permutation(len(data_set.pairs))]
+        for data_set in data_sets(options.data.resolve().parent)
+    ]
+    for pair in chain.from_iterable(zip_longest(*shuffled)):
         if pair is not None:
             yield KnownPair.read(pair)
 

@@ -6,16 +6,20 @@ import argparse
 import csv
 import json
 import os
+import re
 import shlex
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from jaxsmw.benchmark.datasets import DataSet, open_data_set
 from jaxsmw.benchmark.journal import Journal
+from jaxsmw.errors import InputError
 from jaxsmw.io import Landmarks, read_landmark_file
 from jaxsmw.runtime.files import atomic_write, make_directory
 
@@ -50,6 +54,19 @@ def make_parser(
         text = "number of pairs (default: %(default)s)"
         parser.add_argument("--pairs", type=int, default=pairs, metavar="N", help=text)
     return parser
+
+
+def memory(entry: str) -> float:
+    """Return an entry of `/proc/self/status` in GiB: "VmRSS", or its peak so far, "VmHWM"."""
+    (kilobytes,) = re.findall(rf"{entry}:\s*(\d+) kB", Path("/proc/self/status").read_text("utf-8"))
+    return int(kilobytes) / 2**20
+
+
+def data_sets(directory: Path) -> Iterator[DataSet]:
+    """Yield the data sets in a directory by their names. Other directories are left out."""
+    for place in sorted(directory.iterdir()):
+        with suppress(InputError):
+            yield open_data_set(place)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -21,7 +21,6 @@ After an interruption, the same command continues from the saved results.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import sys
@@ -33,6 +32,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from common import make_parser
 from frame_study import measurement, variants
 from frame_study.drawing import draw_figures
 from frame_study.measurement import (
@@ -203,9 +203,7 @@ def measured_times(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("data", type=Path, metavar="DATA_DIRECTORY")
     parser.add_argument(
         "--output",

@@ -194,7 +194,7 @@ class Judged(NamedTuple):
 
 
 def count_table(results: Sequence[Judged], among: str) -> list[list[str]]:
-    """Return the numbers of right, silent and flagged maps of each kind. `among` is the title of a column."""
+    """Return the numbers of right, silent and flagged maps of each kind; `among` is the title of a column."""
     rows = [["", "pairs", "right", among, "wrong and silent", "right and flagged"]]
     for kind in (*dict.fromkeys(result.kind for result in results), "all"):
         own = [result for result in results if kind in (result.kind, "all")]
@@ -209,29 +209,45 @@ def count_table(results: Sequence[Judged], among: str) -> list[list[str]]:
     return rows
 
 
+class Group(NamedTuple):
+    """Maps with similar probabilities: their number, their mean probability, and the share that it predicts.
+
+    `least` and `most` are the ends of the 95 % interval of the share (Wilson 1927).
+    """
+
+    limits: str
+    number: int
+    probability: float
+    share: float
+    least: float
+    most: float
+
+
+def grouped(
+    probabilities: Sequence[float], outcomes: Sequence[bool], ends: Sequence[float] = GROUPS
+) -> list[Group]:
+    """Return the groups of maps that are not empty. The last group contains its upper end."""
+    predicted, happened = np.array(probabilities), np.array(outcomes)
+    groups = []
+    for low, high in pairwise(ends):
+        own = (low <= predicted) & ((predicted < high) | (high == ends[-1]))
+        if own.any():
+            number, events = int(own.sum()), int(happened[own].sum())
+            least, most = binomtest(events, number).proportion_ci(method="wilson")
+            mean, share = float(predicted[own].mean()), events / number
+            groups.append(Group(f"{low:.0%} to {high:.0%}", number, mean, share, float(least), float(most)))
+    return groups
+
+
+def reliability(results: Sequence[Judged]) -> list[Group]:
+    """Return the groups of results by the probability that the map is right."""
+    return grouped([result.probability for result in results], [result.right for result in results])
+
+
 def reliability_table(results: Sequence[Judged]) -> list[list[str]]:
-    """Return the mean probability and the share of right maps of each group with similar probabilities."""
+    """Return the mean probability and the share of right maps of each group."""
     rows = [["probability", "maps", "mean probability", "right"]]
-    for low, high, own in grouped(results):
-        stated, (share, least, most) = reliability(own)
-        interval = f"{share:.1%} [{least:.1%}, {most:.1%}]"
-        rows.append([f"{low:.0%} to {min(high, 1):.0%}", str(len(own)), f"{stated:.1%}", interval])
+    for group in reliability(results):
+        interval = f"{group.share:.1%} [{group.least:.1%}, {group.most:.1%}]"
+        rows.append([group.limits, str(group.number), f"{group.probability:.1%}", interval])
     return rows
-
-
-def grouped(results: Sequence[Judged]) -> list[tuple[float, float, list[Judged]]]:
-    """Return the groups of results with similar probabilities that are not empty, with their limits."""
-    limits = [*pairwise(GROUPS[:-1]), (GROUPS[-2], np.inf)]
-    groups = [
-        (low, high, [result for result in results if low <= result.probability < high])
-        for low, high in limits
-    ]
-    return [group for group in groups if group[2]]
-
-
-def reliability(own: Sequence[Judged]) -> tuple[float, tuple[float, float, float]]:
-    """Return the mean probability of a group, and its share of right maps with a 95 % interval."""
-    right = sum(result.right for result in own)
-    least, most = binomtest(right, len(own)).proportion_ci(method="wilson")
-    stated = float(np.mean([result.probability for result in own]))
-    return stated, (right / len(own), float(least), float(most))

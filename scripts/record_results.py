@@ -16,7 +16,6 @@ same versions of the software, which a JSON file next to OUTPUT states.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import fnmatch
 import hashlib
@@ -43,6 +42,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from common import make_parser
 from recorded_cases import (
     ACCURATE,
     COMMANDS,
@@ -366,9 +366,7 @@ def provenance() -> dict[str, Any]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the chosen cases, and return the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--data", type=Path, default=Path(), help="directory of the data sets")
     parser.add_argument("--output", type=Path, required=True, help="table of the hashes")
     parser.add_argument("--programs", action="store_true", help="hash the programs of all stages instead")

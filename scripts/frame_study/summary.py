@@ -13,6 +13,7 @@ from frame_study.measurement import INVARIANCE_FRAMES, MOVE, SEARCH, PairName, S
 from frame_study.variants import CONVENTIONS, DEFAULT, GAINS, UPDATES, Variant
 from jaxsmw.benchmark.intervals import CONFIDENCE, RESAMPLES, Interval, mean_interval
 from jaxsmw.benchmark.journal import Row
+from jaxsmw.benchmark.tables import markdown
 from jaxsmw.core.functional_map import Convention
 
 SETTLED = 0.05
@@ -439,5 +440,4 @@ def _list(*items: str) -> str:
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown([header, *rows]).strip()
