@@ -96,9 +96,7 @@ def draw(results: Sequence[Judged], file: Path) -> None:
 
 
 def main() -> None:
-    parser = make_parser(__doc__, pairs=8, output="search")
-    parser.add_argument("data", metavar="DATA_DIRECTORY", type=Path)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the choice of pairs (default: 0)")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", pairs=8, output="search", seed=True)
     options = parser.parse_args()
     pairs = known_pairs(options.data, options.pairs, options.seed)
     journal = measure_pairs(options.output / "pairs.csv", pairs, lambda known: known.names, judged)

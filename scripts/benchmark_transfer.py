@@ -50,8 +50,7 @@ _POINTS = 1000
 
 def main() -> None:
     """Measure the data sets that the command line names, and print a summary of each."""
-    parser = make_parser(__doc__, output="transfer", pairs=20)
-    parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", output="transfer", pairs=20)
     parser.add_argument("sets", nargs="+", metavar="DATA_SET")
     parser.add_argument(
         "--init", choices=get_args(MatchInit), default="auto", help="initial map of scans (default: auto)"
@@ -59,7 +58,7 @@ def main() -> None:
     options = parser.parse_args()
     for name in options.sets:
         measure = _measure_body if name in _BODIES else functools.partial(_measure_scan, init=options.init)
-        pairs = _draw(options.directory / name, options.pairs)
+        pairs = _draw(options.data / name, options.pairs)
         journal = measure_pairs(
             options.output / f"{name}.csv",
             pairs,

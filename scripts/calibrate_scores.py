@@ -127,7 +127,7 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, seed=True)
     parser.add_argument("data_sets", metavar="DATA_SET_DIRECTORY", nargs="+", type=Path)
     parser.add_argument(
         "--pairs",
@@ -135,7 +135,6 @@ def main() -> None:
         default="20",
         help="number of pairs from each data set, or a list of pairs (default: 20)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random draws (default: 0)")
     parser.add_argument(
         "--preset",
         nargs="+",

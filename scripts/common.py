@@ -33,15 +33,22 @@ NameT = TypeVar("NameT")
 def make_parser(
     description: str | None,
     *,
+    data: str | None = None,
     parts: Collection[str] = (),
     faust: bool = False,
     output: str | None = None,
     pairs: int | None = None,
+    seed: bool = False,
 ) -> argparse.ArgumentParser:
-    """Return a parser that prints the description as it is, with the options that several scripts share."""
+    """Return a parser that prints the description as it is, with the options that several scripts share.
+
+    `data` is the name of a directory of data in the help text.
+    """
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
+    if data is not None:
+        parser.add_argument("data", type=Path, metavar=data)
     if parts:
         parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), metavar="PART")
     if faust:
@@ -53,6 +60,9 @@ def make_parser(
     if pairs is not None:
         text = "number of pairs (default: %(default)s)"
         parser.add_argument("--pairs", type=int, default=pairs, metavar="N", help=text)
+    if seed:
+        text = "seed of the random draws (default: %(default)s)"
+        parser.add_argument("--seed", type=int, default=0, help=text)
     return parser
 
 

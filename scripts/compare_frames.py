@@ -203,8 +203,7 @@ def measured_times(
 
 
 def main() -> None:
-    parser = make_parser(__doc__)
-    parser.add_argument("data", type=Path, metavar="DATA_DIRECTORY")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", seed=True)
     parser.add_argument(
         "--output",
         type=Path,
@@ -213,7 +212,6 @@ def main() -> None:
     parser.add_argument(
         "--pairs", type=int, help="number of pairs from each data set (default: 40, with --quick 2)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed, at least 0 (default: %(default)s)")
     parser.add_argument(
         "--workers",
         type=int,

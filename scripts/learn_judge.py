@@ -118,9 +118,7 @@ def tables(pairs: Sequence[JudgedPair]) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = make_parser(__doc__, pairs=8)
-    parser.add_argument("data", metavar="DATA_DIRECTORY", type=Path)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the choice of pairs (default: 0)")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", pairs=8, seed=True)
     parser.add_argument("--maps", metavar="FILE.json", type=Path, help="file in which the evidence is kept")
     parser.add_argument("--output", metavar="FILE.md", type=Path, help="also write the tables to this file")
     options = parser.parse_args()

@@ -299,13 +299,12 @@ def smoothed(values: Float[np.ndarray, " steps"]) -> tuple[np.ndarray, np.ndarra
 
 def parser(description: str, *, output: str, steps: int) -> argparse.ArgumentParser:
     """Return the parser for the arguments of a training script."""
-    made = make_parser(description, output=output)
+    made = make_parser(description, output=output, seed=True)
     made.add_argument("data", type=Path, help="directory that contains faust_r and tosca_r")
     made.add_argument("--steps", type=int, default=steps, help=f"number of training steps (default: {steps})")
     made.add_argument(
         "--test-pairs", type=int, default=40, help="number of test pairs from each data set (default: 40)"
     )
-    made.add_argument("--seed", type=int, default=0, help="seed of the random draws (default: 0)")
     made.add_argument(
         "--quick", action="store_true", help="run 3 steps and 2 test pairs, to check that the script works"
     )
