@@ -86,7 +86,11 @@ def matrix_products(function: Callable, *arguments: Any) -> Counter[MatrixProduc
     def add(jaxpr: Jaxpr, times: int) -> None:
         for equation in jaxpr.eqns:
             if equation.primitive.name == "dot_general":
-                left, right = (variable.aval.shape for variable in equation.invars)
+                left, right = (
+                    variable.aval.shape
+                    for variable in equation.invars
+                    if isinstance(variable.aval, jax.core.ShapedArray)
+                )
                 counts[MatrixProduct(left, right, equation.params["dimension_numbers"])] += times
             inner = times * equation.params.get("length", 1) if equation.primitive.name == "scan" else times
             for value in jax.tree.leaves(
@@ -159,10 +163,11 @@ def paper(options: argparse.Namespace) -> Iterator[Part]:
     programs = {"lax.map": jax.jit(partial(lax.map, refine_one))}
     for size in options.batch_sizes:
         programs[f"vmap of {size}"] = jax.jit(partial(lax.map, refine_one, batch_size=size))
-    memory = {
-        name: program.lower(batch).compile().memory_analysis().temp_size_in_bytes
-        for name, program in programs.items()
-    }
+    memory = {}
+    for name, program in programs.items():
+        analysis = program.lower(batch).compile().memory_analysis()
+        assert analysis is not None
+        memory[name] = analysis.temp_size_in_bytes
     seconds = medians(
         {
             "loop": lambda: [refine_one(pair) for pair in separate],
@@ -258,7 +263,8 @@ def agreement(options: argparse.Namespace) -> Iterator[Part]:
         return
     shapes = chosen_shapes(options)
     shapes = shapes._replace(pairs=shapes.pairs[:: max(1, len(shapes.pairs) // COMPARED)])
-    rows, measured = [["preset", "equal matches", "smallest share of a pair"]], {}
+    rows = [["preset", "equal matches", "smallest share of a pair"]]
+    measured: dict[str, dict[str, object]] = {}
     if options.data is not None:
         rows[0] += ["error x10^-3", "error of the CPU"]
     names: tuple[PresetName, ...] = ("paper", "accurate")

@@ -80,8 +80,7 @@ ABLATIONS: dict[str, tuple[float, dict[str, float]]] = {
 
 def main() -> None:
     """Measure the collections that the command line names, and print a summary of each."""
-    parser = make_parser(__doc__, output="collections", pairs=200)
-    parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", output="collections", pairs=200)
     parser.add_argument("sets", nargs="+", metavar="DATA_SET")
     parser.add_argument("--preset", choices=tuple(PRESETS), default=DEFAULT_PRESET)
     parser.add_argument("--ablations", action="store_true", help="also measure all ablations")
@@ -92,7 +91,7 @@ def main() -> None:
     options = parser.parse_args()
     for name in options.sets:
         for number in options.growth or ():
-            print(f"{name}: {json.dumps(_growth(options.directory, name, number))}", flush=True)
+            print(f"{name}: {json.dumps(_growth(options.data, name, number))}", flush=True)
         if options.growth:
             continue
         for ablation in ABLATIONS if options.ablations else [_DEFAULT]:
@@ -112,7 +111,7 @@ def _measure(options: argparse.Namespace, name: str, ablation: str) -> dict[str,
     """Match a collection, and measure the errors of its maps."""
     edges_per_shape, constants = ABLATIONS[ablation]
     direct = ablation == _DEFAULT and not options.no_direct
-    files = _files(options.directory, name)
+    files = _files(options.data, name)
     meshes = [read_mesh(file) for file in files]
     place = options.output / name.replace("/", "_")
     work = place / "work"
@@ -171,11 +170,10 @@ def _measure(options: argparse.Namespace, name: str, ablation: str) -> dict[str,
         result["direct"] = _summary(np.array(single))
         result["ratio"] = float(np.mean(through) / np.mean(single))
     if options.ablations and ablation == _DEFAULT:
-        meshes, points = collection.meshes, collection.points
-        template = meshes[collection.template]
+        points, template = collection.points, collection.meshes[collection.template]
         errors = []
         for i, j in pairs:
-            of_pair = points[i], points[j], template, meshes[i], meshes[j]
+            of_pair = points[i], points[j], template, collection.meshes[i], collection.meshes[j]
             unregistered = SimpleNamespace(pointwise_map=vertex_map_between(*of_pair))
             errors.append(_measure_truth(collection, files, i, j, unregistered))
         result["without_registered_meshes"] = _summary(np.array(errors))

@@ -41,12 +41,11 @@ _EVALUATED = 400
 
 def main() -> None:
     """Measure all pairs, and print a summary."""
-    parser = make_parser(__doc__, output="overlap")
-    parser.add_argument("directory", type=Path, metavar="SHREC16_PARTIAL")
+    parser = make_parser(__doc__, data="SHREC16_PARTIAL", output="overlap")
     parser.add_argument("--pairs", type=int, help="largest number of pairs (default: all pairs)")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    pairs = itertools.islice(_pairs(options.directory), options.pairs)
+    pairs = itertools.islice(_pairs(options.data), options.pairs)
     file = options.output / "overlap.csv"
     journal = measure_pairs(file, pairs, lambda pair: pair.names, _PartialPair.measure)
     for name in ("error", "iou", "iou_of_all", "seconds"):

@@ -10,7 +10,6 @@ a mesh. Errors are geodesic errors on the mesh of the target, in thousandths of 
 from __future__ import annotations
 
 import warnings
-from pathlib import Path
 
 import numpy as np
 from common import make_parser
@@ -23,8 +22,7 @@ from jaxsmw.runtime.provenance import made_with
 
 def main() -> None:
     """Match the pairs, and print the errors of each pair and their means."""
-    parser = make_parser(__doc__, pairs=20)
-    parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", pairs=20)
     parser.add_argument(
         "--noise",
         type=float,
@@ -34,7 +32,7 @@ def main() -> None:
     options = parser.parse_args()
     warnings.simplefilter("ignore")  # suspicious maps are measured too
     rows = []
-    for pair in choose_pairs(open_data_set(options.directory), str(options.pairs), 0):
+    for pair in choose_pairs(open_data_set(options.data), str(options.pairs), 0):
         meshes = [read_mesh(file) for file in pair.meshes]
         clouds = [_cloud(mesh, options.noise) for mesh in meshes]
         truth = pair.ground_truth(*meshes)

@@ -24,7 +24,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from common import Part, make_parser, measure_parts
+from common import Part, make_parser, measure_parts, memory
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
@@ -138,11 +138,8 @@ def edge_length(mesh: Mesh) -> float:
 
 def status() -> tuple[float, int, int]:
     """Return the memory of this process in MiB, and its numbers of memory maps and open files (Linux)."""
-    (line,) = (
-        text for text in Path("/proc/self/status").read_text().splitlines() if text.startswith("VmRSS")
-    )
     maps = Path("/proc/self/maps").read_text().count("\n")
-    return int(line.split()[1]) / 1024, maps, len(os.listdir("/proc/self/fd"))
+    return 1024 * memory("VmRSS"), maps, len(os.listdir("/proc/self/fd"))
 
 
 def long_run(options: argparse.Namespace) -> Iterator[Part]:

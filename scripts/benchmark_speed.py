@@ -29,7 +29,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import re
 import resource
 import shutil
 import subprocess
@@ -39,7 +38,8 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import chain, islice, zip_longest
@@ -48,7 +48,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
-from common import Part, make_parser, measure_parts, medians
+from common import Part, data_sets, make_parser, measure_parts, medians, memory
 from jaxtyping import Int64
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
@@ -58,7 +58,6 @@ from jaxsmw.benchmark.datasets import DataPair, open_data_set
 from jaxsmw.choices import Backend, Eigensolver, PresetName
 from jaxsmw.core.refinement import refine, refine_at_once
 from jaxsmw.creature import CREATURES, creature_pair
-from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.evaluation.metrics import geodesic_error
 from jaxsmw.geometry.eigenbasis import compute_spectrum, eigenpairs
@@ -91,12 +90,6 @@ def wall_and_cpu() -> np.ndarray:
     """Return the wall time, and the CPU time of this process and its finished children, in seconds."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return np.array([time.perf_counter(), time.process_time() + children.ru_utime + children.ru_stime])
-
-
-def memory(entry: str) -> float:
-    """Return an entry of `/proc/self/status` in GiB: "VmRSS", or its peak so far, "VmHWM"."""
-    (kilobytes,) = re.findall(rf"{entry}:\s*(\d+) kB", Path("/proc/self/status").read_text("utf-8"))
-    return int(kilobytes) / 2**20
 
 
 def compared(seconds: dict[str, float], of: str) -> list[list[str]]:
@@ -169,12 +162,11 @@ def assorted_pairs(options: argparse.Namespace) -> Iterator[KnownPair]:
         for seed, size in enumerate(sizes):
             yield KnownPair.of_creatures([*CREATURES][seed % len(CREATURES)], int(size), seed)
         return
-    data_sets = []
-    for directory in sorted(options.data.resolve().parent.iterdir()):
-        with suppress(InputError):  # another directory
-            pairs = open_data_set(directory).pairs
-            data_sets.append([pairs[number] for number in random.permutation(len(pairs))])
-    for pair in chain.from_iterable(zip_longest(*data_sets)):
+    shuffled = [
+        [data_set.pairs[number] for number in random.permutation(len(data_set.pairs))]
+        for data_set in data_sets(options.data.resolve().parent)
+    ]
+    for pair in chain.from_iterable(zip_longest(*shuffled)):
         if pair is not None:
             yield KnownPair.read(pair)
 
@@ -235,9 +227,9 @@ def commands(options: argparse.Namespace) -> Iterator[Part]:
                 [*program, "match", *of_pair, *extra, *output] for of_pair in (files, of_others)
             )
             same, others = (root / f"{name}, {kind} meshes" for kind in ("same", "other"))
-            for command, kept in ((match_timed, same), (match_others, others)):
+            for command, copy in ((match_timed, same), (match_others, others)):
                 run_python(command, cache)
-                shutil.copytree(cache, kept)
+                shutil.copytree(cache, copy)
             candidates |= {
                 f"{name}, first": (match_timed, None, nullcontext()),
                 f"{name}, other meshes": (match_timed, others, nullcontext()),
@@ -309,7 +301,8 @@ def matched_twice(
     pairs = [[read_mesh(file) for file in of_pair] for of_pair in files]
     for pair in pairs:
         match(*pair, preset=preset, backend="numpy")  # fills the cache
-    first, again = [], []
+    first: list[list[float]] = []
+    again: list[list[float]] = []
     # The pairs are new, because each source is matched to the target of the next pair.
     for (source, _), (_, target) in zip(pairs, [*pairs[1:], pairs[0]], strict=True):
         for times in (first, again):
@@ -364,9 +357,10 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
     with tempfile.TemporaryDirectory() as directory:
         root = Path(directory)
         files = [written(pair.meshes, root / str(number)) for number, pair in enumerate(pairs)]
-        starts = []
+        starts, walls = [], []
         for of_pair in files:
-            pair = Pair(*map(read_mesh, of_pair))
+            mesh_x, mesh_y = map(read_mesh, of_pair)
+            pair = Pair(mesh_x, mesh_y)
             starts.append(initial_map(pair, *paired_spectra(pair, EIGENVECTORS)))
         for name, (library, refined_from_files, *settings) in LIBRARIES.items():
             if not find_spec(library):
@@ -377,9 +371,9 @@ def peers(options: argparse.Namespace) -> Iterator[Part]:
             errors = [pair.error(of_pair) for pair, of_pair in zip(pairs, maps, strict=True)]
             wall, cpu, refining = np.median(times[1:], axis=0)
             measured[name] = {"seconds": times, "errors": errors}
-            ours = np.median(measured[next(iter(LIBRARIES))]["seconds"][1:], axis=0)[0]
+            walls.append(wall)  # the first one is ours
             numbers = (f"{value:.2f}" for value in (times[0][0], wall, cpu, refining))
-            rows.append([name, *numbers, f"{wall / ours:.1f}", f"{np.mean(errors):.1f}"])
+            rows.append([name, *numbers, f"{wall / walls[0]:.1f}", f"{np.mean(errors):.1f}"])
     yield (
         "Peers",
         f"Times from two mesh files of about 5000 vertices to the map, for {len(pairs)} pairs, each library "
@@ -557,33 +551,35 @@ def matched_from_files(files: list[str], preset: PresetName) -> FromFiles:
 def scale(options: argparse.Namespace) -> Iterator[Part]:
     """For each preset, yield times and memory for shapes of several sizes, cold and warm."""
     (pair,) = known_pairs(options, 1)
+    sizes = (10_000,) if options.quick else LARGE
     for preset in PRESETS:
-        measured = []
-        for size in (10_000,) if options.quick else LARGE:
+        runs: list[list[FromFiles]] = []  # cold and warm
+        errors: list[list[float]] = []
+        for size in sizes:
             meshes = [finer(mesh, size, seed=size + side) for side, mesh in enumerate(pair.meshes)]
             with tempfile.TemporaryDirectory() as directory:
                 files = written(meshes, Path(directory) / "meshes", ".ply")
                 cache = Path(directory) / "cache"
-                runs = [in_new_process(cache, matched_from_files, files, preset) for _ in range(2)]
-            cold, warm = runs
-            errors = [pair.error(of_run, target=meshes[1]) for of_run in cold.maps]
-            totals = [[sum(run.seconds.values()), run.cpu] for run in runs]
+                runs.append([in_new_process(cache, matched_from_files, files, preset) for _ in range(2)])
+            errors.append([pair.error(of_run, target=meshes[1]) for of_run in runs[-1][0].maps])
+        steps = list(dict.fromkeys(chain.from_iterable(cold.seconds for cold, _ in runs)))
+        totals = ["cold, wall", "CPU", "warm, wall", "CPU"]
+        rows = [["vertices", *steps, *totals, "peak GiB", "initial error", "refined error"]]
+        measured = []
+        for size, (cold, warm), of_size in zip(sizes, runs, errors, strict=True):
+            both = [[sum(run.seconds.values()), run.cpu] for run in (cold, warm)]
+            seconds = (*(cold.seconds.get(step, 0) for step in steps), *chain(*both))
+            numbers = [*(f"{value:.1f}" for value in seconds), f"{max(cold.peak, warm.peak):.2f}"]
+            rows.append([str(size), *numbers, *(f"{error:.1f}" for error in of_size)])
             measured.append(
                 {
                     "vertices": size,
                     "seconds": cold.seconds,
-                    "cold and warm": totals,
+                    "cold and warm": both,
                     "peak GiB": [cold.peak, warm.peak],
-                    "errors": errors,
+                    "errors": of_size,
                 }
             )
-        steps = list(dict.fromkeys(chain.from_iterable(each["seconds"] for each in measured)))
-        totals = ["cold, wall", "CPU", "warm, wall", "CPU"]
-        rows = [["vertices", *steps, *totals, "peak GiB", "initial error", "refined error"]]
-        for each in measured:
-            seconds = (*(each["seconds"].get(step, 0) for step in steps), *chain(*each["cold and warm"]))
-            numbers = [*(f"{value:.1f}" for value in seconds), f"{max(each['peak GiB']):.2f}"]
-            rows.append([str(each["vertices"]), *numbers, *(f"{error:.1f}" for error in each["errors"])])
         yield (
             f"Scale, {preset}",
             f"Times of the preset {preset} from two PLY files to the map in seconds, without the start of "
@@ -617,7 +613,9 @@ def refinement(options: argparse.Namespace) -> Iterator[Part]:
 
             return refined
 
-        def products(a=of_numpy[0].eigenvectors, b=of_numpy[1].eigenvectors.T) -> None:
+        def products(
+            a: np.ndarray = of_numpy[0].eigenvectors, b: np.ndarray = of_numpy[1].eigenvectors.T
+        ) -> None:
             # Each block of products fits into the processor's cache. Only the maximum of each row is kept.
             for row in range(0, ITERATIONS * len(a), 256):
                 (a[row % len(a) :][:256] @ b).max(axis=1)
@@ -651,17 +649,17 @@ def eigenbasis(options: argparse.Namespace) -> Iterator[Part]:
         stiffness, areas = assemble_laplacian(mesh)
         masses = sp.diags(areas / areas.sum()).tocsc()
 
-        def usual(stiffness=stiffness, masses=masses) -> object:
+        def usual(stiffness: sp.csc_matrix = stiffness, masses: sp.csc_matrix = masses) -> object:
             with threadpool_limits(1, "blas"):
                 return eigsh(stiffness, EIGENVECTORS, masses, sigma=-1e-2)
 
-        def ours(solver: Eigensolver, mesh=mesh) -> np.ndarray:
+        def ours(solver: Eigensolver, mesh: Mesh = mesh) -> np.ndarray:
             return eigenpairs(mesh, EIGENVECTORS, eigensolver=solver)[0]
 
-        candidates = {
+        candidates: dict[str, Callable[[], object]] = {
             "SciPy's eigsh": usual,
-            "exact": lambda: ours("exact"),
-            "approximate": lambda: ours("approximate"),
+            "exact": partial(ours, "exact"),
+            "approximate": partial(ours, "approximate"),
         }
         seconds = medians(candidates, options.rounds, time.process_time, warm=False)
         excess = ours("approximate")[1:] / ours("exact")[1:] - 1
@@ -684,14 +682,14 @@ def stages(options: argparse.Namespace) -> Iterator[Part]:
         with tempfile.TemporaryDirectory() as directory:
             file = Path(directory) / "mesh.off"
             write_mesh(file, mesh)
-            candidates = {
-                "eigenbasis": lambda mesh=mesh: eigenpairs(mesh, EIGENVECTORS, eigensolver="exact"),
-                "10 000 samples": lambda mesh=mesh: poisson_disk_samples(mesh, 10_000),
-                "SHOT of all": lambda mesh=mesh: shot_descriptors(mesh),
-                "SHOT of samples": lambda mesh=mesh, at=spread: shot_descriptors(mesh, samples=at),
-                "farthest points": lambda mesh=mesh: farthest_point_samples(mesh, SAMPLES),
-                "geodesics from 100": lambda mesh=mesh, at=sources: geodesic_distances(mesh, at),
-                "reading OFF": lambda file=file: read_mesh(file),
+            candidates: dict[str, Callable[[], object]] = {
+                "eigenbasis": partial(eigenpairs, mesh, EIGENVECTORS, eigensolver="exact"),
+                "10 000 samples": partial(poisson_disk_samples, mesh, 10_000),
+                "SHOT of all": partial(shot_descriptors, mesh),
+                "SHOT of samples": partial(shot_descriptors, mesh, samples=spread),
+                "farthest points": partial(farthest_point_samples, mesh, SAMPLES),
+                "geodesics from 100": partial(geodesic_distances, mesh, sources),
+                "reading OFF": partial(read_mesh, file),
             }
             seconds = medians(candidates, options.rounds, warm=False)
         yield (

@@ -50,8 +50,7 @@ _POINTS = 1000
 
 def main() -> None:
     """Measure the data sets that the command line names, and print a summary of each."""
-    parser = make_parser(__doc__, output="transfer", pairs=20)
-    parser.add_argument("directory", type=Path, metavar="DATA_DIRECTORY")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", output="transfer", pairs=20)
     parser.add_argument("sets", nargs="+", metavar="DATA_SET")
     parser.add_argument(
         "--init", choices=get_args(MatchInit), default="auto", help="initial map of scans (default: auto)"
@@ -59,12 +58,12 @@ def main() -> None:
     options = parser.parse_args()
     for name in options.sets:
         measure = _measure_body if name in _BODIES else functools.partial(_measure_scan, init=options.init)
-        pairs = _draw(options.directory / name, options.pairs)
+        pairs = _draw(options.data / name, options.pairs)
         journal = measure_pairs(
             options.output / f"{name}.csv",
             pairs,
             lambda pair: (pair[0].stem, pair[1].stem),
-            lambda pair, measure=measure: measure(*pair),
+            measure,
         )
         print(f"{name}: {_summary(journal)}\n{made_with()}", flush=True)
 
@@ -90,10 +89,10 @@ def _draw(directory: Path, number: int) -> list[tuple[Path, Path]]:
     return [*drawn, *((y, x) for x, y in drawn)][:number]
 
 
-def _measure_body(source: Path, target: Path) -> dict[str, Any]:
+def _measure_body(files: tuple[Path, Path]) -> dict[str, Any]:
     """Measure the errors of the map and of the registered mesh for a pair with ground truth."""
-    mesh_x, mesh_y = read_mesh(source), read_mesh(target)
-    truth_files = [source.parents[1] / "corres" / f"{file.stem}.vts" for file in (source, target)]
+    mesh_x, mesh_y = map(read_mesh, files)
+    truth_files = [files[0].parents[1] / "corres" / f"{file.stem}.vts" for file in files]
     truth = read_ground_truth(truth_files, mesh_x, mesh_y)
     correspondence, registered, seconds = _register(mesh_x, mesh_y, mirrored=False)
     points = correspondence.surface_points()
@@ -118,11 +117,11 @@ def _register(
     return correspondence, registered, times
 
 
-def _measure_scan(source: Path, target: Path, init: MatchInit) -> dict[str, Any]:
+def _measure_scan(files: tuple[Path, Path], init: MatchInit) -> dict[str, Any]:
     """Measure the distances of carried landmarks to manual landmarks, by several methods."""
-    mesh_x, mesh_y = read_mesh(source), read_mesh(target)
-    marks_x, marks_y = common_landmarks(source, target)
-    mirrored = side_of(source) != side_of(target)
+    mesh_x, mesh_y = map(read_mesh, files)
+    marks_x, marks_y = common_landmarks(*files)
+    mirrored = side_of(files[0]) != side_of(files[1])
     correspondence, registered, seconds = _register(mesh_x, mesh_y, mirrored=mirrored, init=init)
     on_source, off_source = nearest_surface_points(marks_x.positions, mesh_x)
     _, off_target = nearest_surface_points(marks_y.positions, mesh_y)

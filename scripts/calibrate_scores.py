@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from common import make_parser, write_text
 from jaxtyping import Float64
+from judged_pairs import grouped
 from scipy.stats import spearmanr
 from tqdm import tqdm
 
@@ -74,14 +75,10 @@ def measure(
 
 def calibration(maps: Sequence[Measured]) -> str:
     """Return a table that compares predicted probabilities with the shares of wrong maps."""
-    predicted = np.array([m.probability for m in maps])
-    wrong = np.array([m.wrong for m in maps])
     rows = [["probability", "maps", "mean probability", "wrong"]]
-    for low, high in pairwise(PROBABILITIES):
-        own = (low <= predicted) & ((predicted < high) | (high == 1))
-        if own.any():
-            figures = f"{predicted[own].mean():.1%}", f"{wrong[own].mean():.1%}"
-            rows.append([f"{low:.0%} to {high:.0%}", str(own.sum()), *figures])
+    for group in grouped([m.probability for m in maps], [m.wrong for m in maps], PROBABILITIES):
+        figures = f"{group.probability:.1%}", f"{group.share:.1%}"
+        rows.append([group.limits, str(group.number), *figures])
     return markdown(rows)
 
 
@@ -130,7 +127,7 @@ def tables(measured: dict[str, list[Measured]]) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, seed=True)
     parser.add_argument("data_sets", metavar="DATA_SET_DIRECTORY", nargs="+", type=Path)
     parser.add_argument(
         "--pairs",
@@ -138,7 +135,6 @@ def main() -> None:
         default="20",
         help="number of pairs from each data set, or a list of pairs (default: 20)",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of the random draws (default: 0)")
     parser.add_argument(
         "--preset",
         nargs="+",

@@ -6,16 +6,20 @@ import argparse
 import csv
 import json
 import os
+import re
 import shlex
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from jaxsmw.benchmark.datasets import DataSet, open_data_set
 from jaxsmw.benchmark.journal import Journal
+from jaxsmw.errors import InputError
 from jaxsmw.io import Landmarks, read_landmark_file
 from jaxsmw.runtime.files import atomic_write, make_directory
 
@@ -23,20 +27,28 @@ Part = tuple[str, str, list[list[str]], dict[str, Any]]
 """A tuple of a table's title, a note on the measurement, the rows of the table, and all measured numbers."""
 
 PairT = TypeVar("PairT")
+NameT = TypeVar("NameT")
 
 
 def make_parser(
     description: str | None,
     *,
+    data: str | None = None,
     parts: Collection[str] = (),
     faust: bool = False,
     output: str | None = None,
     pairs: int | None = None,
+    seed: bool = False,
 ) -> argparse.ArgumentParser:
-    """Return a parser that prints the description as it is, with the options that several scripts share."""
+    """Return a parser that prints the description as it is, with the options that several scripts share.
+
+    `data` is the name of a directory of data in the help text.
+    """
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
+    if data is not None:
+        parser.add_argument("data", type=Path, metavar=data)
     if parts:
         parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), metavar="PART")
     if faust:
@@ -48,7 +60,23 @@ def make_parser(
     if pairs is not None:
         text = "number of pairs (default: %(default)s)"
         parser.add_argument("--pairs", type=int, default=pairs, metavar="N", help=text)
+    if seed:
+        text = "seed of the random draws (default: %(default)s)"
+        parser.add_argument("--seed", type=int, default=0, help=text)
     return parser
+
+
+def memory(entry: str) -> float:
+    """Return an entry of `/proc/self/status` in GiB: "VmRSS", or its peak so far, "VmHWM"."""
+    (kilobytes,) = re.findall(rf"{entry}:\s*(\d+) kB", Path("/proc/self/status").read_text("utf-8"))
+    return int(kilobytes) / 2**20
+
+
+def data_sets(directory: Path) -> Iterator[DataSet]:
+    """Yield the data sets in a directory by their names. Other directories are left out."""
+    for place in sorted(directory.iterdir()):
+        with suppress(InputError):
+            yield open_data_set(place)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -76,7 +104,8 @@ def measure_parts(
     # Other machines have other paths.
     arguments = [Path(argument).name if os.path.isabs(argument) else argument for argument in sys.argv]
     origin = {"command": shlex.join(["python", *arguments]), **provenance()}
-    texts, numbers = [f"# {title}\n\n{json.dumps(origin)}"], {"provenance": origin}
+    texts = [f"# {title}\n\n{json.dumps(origin)}"]
+    numbers: dict[str, Any] = {"provenance": origin}
     print(texts[0])
     for name in options.only:
         numbers[name] = []
@@ -91,12 +120,12 @@ def measure_parts(
 
 
 def medians(
-    candidates: dict[str, Callable[[], object]],
+    candidates: Mapping[NameT, Callable[[], object]],
     repeats: int,
     clock: Callable[[], Any] = time.perf_counter,
     *,
     warm: bool = True,
-) -> dict[str, Any]:
+) -> dict[NameT, Any]:
     """Run the candidates alternately, and return the median time of each candidate in seconds.
 
     **Arguments:**
@@ -106,7 +135,7 @@ def medians(
     - `clock`: a function that returns the current time in seconds, or an array of times in seconds.
     - `warm`: whether each candidate first runs once without timing, so that JAX compiles it.
     """
-    seconds: dict[str, list[Any]] = {name: [] for name in candidates}
+    seconds: dict[NameT, list[Any]] = {name: [] for name in candidates}
     for turn in range(repeats + warm):
         for name, candidate in candidates.items():
             start = clock()

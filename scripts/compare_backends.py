@@ -6,47 +6,42 @@ DATA is a directory with data sets that `jaxsmw benchmark` reads. The same numbe
 set, evenly spread over its pairs. The file gets one row per pair: the share of vertices with equal matches,
 the mean geodesic error of both maps at 500 vertices in units of the square root of the area, and the seconds
 of both backends. An interrupted run continues where it stopped. The summary lists the means for each set, and
-the mean difference of the errors with a 95 % confidence interval from 10 000 bootstrap samples of the pairs.
+the mean difference of the errors with its 95 % bootstrap interval.
 """
 
-import csv
 import time
 import warnings
 from pathlib import Path
 
 import numpy as np
-from common import make_parser
+from common import data_sets, make_parser
 
 from jaxsmw import geodesic_error, match, read_mesh
-from jaxsmw.benchmark.datasets import DataPair, open_data_set
-from jaxsmw.errors import InputError
+from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.intervals import mean_interval
+from jaxsmw.benchmark.journal import Journal
+from jaxsmw.choices import Backend, PresetName
 
-BACKENDS = ("numpy", "jax")
-FIELDS = ("data set", "pair", "equal", *(f"error, {name}" for name in BACKENDS), *BACKENDS)
+BACKENDS: tuple[Backend, ...] = ("numpy", "jax")
 POINTS = 500
 
 
-def compared(pair: DataPair, preset: str) -> dict[str, float]:
+def compared(pair: DataPair, preset: PresetName) -> dict[str, float]:
     """Match a pair with both backends, and return the numbers of its row."""
     meshes = [read_mesh(file) for file in pair.meshes]
-    truth, maps, row = pair.ground_truth(*meshes), [], {}
+    truth, maps = pair.ground_truth(*meshes), []
+    errors: dict[str, float] = {}
+    seconds: dict[str, float] = {}
     for name in BACKENDS:
         began = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             found = match(*meshes, preset=preset, partial=pair.partial, backend=name)
-        row[name] = time.perf_counter() - began
+        seconds[name] = time.perf_counter() - began
         error = geodesic_error(meshes[1], found.pointwise_map, truth, number_of_samples=POINTS)
-        row[f"error, {name}"] = error.mean
+        errors[f"error, {name}"] = error.mean
         maps.append(found.pointwise_map)
-    return {"equal": float(np.mean(maps[0] == maps[1])), **row}
-
-
-def interval(differences: np.ndarray) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval of the mean."""
-    draws = np.random.default_rng(0).choice(differences, (10_000, len(differences)))
-    low, high = np.quantile(draws.mean(axis=1), [0.025, 0.975])
-    return float(low), float(high)
+    return {"equal": float(np.mean(maps[0] == maps[1])), **errors, **seconds}
 
 
 def main() -> None:
@@ -55,41 +50,26 @@ def main() -> None:
     parser.add_argument("--preset", default="accurate")
     parser.add_argument("--output", type=Path, default=Path("backends.csv"), metavar="FILE")
     options = parser.parse_args()
-    rows = list(csv.DictReader(options.output.open())) if options.output.exists() else []
-    known = {(row["data set"], row["pair"]) for row in rows}
-    with options.output.open("a", newline="") as file:
-        writer = csv.DictWriter(file, FIELDS)
-        if not rows:
-            writer.writeheader()
-        for directory in sorted(path for path in options.data.iterdir() if path.is_dir()):
-            try:
-                pairs = open_data_set(directory).pairs
-            except InputError:
-                continue
-            for number in sorted({*np.linspace(0, len(pairs) - 1, options.pairs).astype(int).tolist()}):
-                pair = pairs[number]
-                if (directory.name, pair.name) in known:
-                    continue
-                row = {"data set": directory.name, "pair": pair.name, **compared(pair, options.preset)}
-                writer.writerow(row)
-                file.flush()
-                rows.append({key: str(value) for key, value in row.items()})
-                print(
-                    {
-                        key: round(value, 5) if isinstance(value, float) else value
-                        for key, value in row.items()
-                    },
-                    flush=True,
-                )
+    journal = Journal(options.output, ("data set", "pair"))
+    for data_set in data_sets(options.data):
+        pairs = data_set.pairs
+        for number in sorted({*np.linspace(0, len(pairs) - 1, options.pairs).astype(int).tolist()}):
+            pair = pairs[number]
+            if (data_set.name, pair.name) not in journal:
+                row = {"data set": data_set.name, "pair": pair.name, **compared(pair, options.preset)}
+                journal.append([row])
+                print(row, flush=True)
+    rows = journal.rows
     for name in [*dict.fromkeys(row["data set"] for row in rows), "all"]:
         of_set = [row for row in rows if name in (row["data set"], "all")]
-        numbers = {key: np.array([float(row[key]) for row in of_set]) for key in FIELDS[2:]}
-        differences = 1e3 * (numbers["error, numpy"] - numbers["error, jax"])
-        low, high = interval(differences)
+        equal, by_numpy, by_jax = (
+            np.array([float(row[column]) for row in of_set])
+            for column in ("equal", "error, numpy", "error, jax")
+        )
+        mean, low, high = mean_interval(1e3 * (by_numpy - by_jax), seed=0)
         print(
-            f"{name}: {len(of_set)} pairs, {np.mean(numbers['equal']):.2%} of the matches equal; mean errors "
-            f"x 10^-3: NumPy {1e3 * numbers['error, numpy'].mean():.2f}, JAX "
-            f"{1e3 * numbers['error, jax'].mean():.2f}, difference {differences.mean():+.2f} "
+            f"{name}: {len(of_set)} pairs, {equal.mean():.2%} of the matches equal; mean errors x 10^-3: "
+            f"NumPy {1e3 * by_numpy.mean():.2f}, JAX {1e3 * by_jax.mean():.2f}, difference {mean:+.2f} "
             f"({low:+.2f} to {high:+.2f})"
         )
 

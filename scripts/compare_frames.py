@@ -21,7 +21,6 @@ After an interruption, the same command continues from the saved results.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import os
 import sys
@@ -33,6 +32,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from common import make_parser
 from frame_study import measurement, variants
 from frame_study.drawing import draw_figures
 from frame_study.measurement import (
@@ -203,10 +203,7 @@ def measured_times(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("data", type=Path, metavar="DATA_DIRECTORY")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", seed=True)
     parser.add_argument(
         "--output",
         type=Path,
@@ -215,7 +212,6 @@ def main() -> None:
     parser.add_argument(
         "--pairs", type=int, help="number of pairs from each data set (default: 40, with --quick 2)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed, at least 0 (default: %(default)s)")
     parser.add_argument(
         "--workers",
         type=int,

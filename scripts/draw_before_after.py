@@ -21,6 +21,7 @@ from scipy.spatial import KDTree
 import jaxsmw
 from jaxsmw import geodesic_error, read_mesh
 from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
+from jaxsmw.choices import Axis
 from jaxsmw.io.maps import read_pointwise_map
 from jaxsmw.report.colors import ERROR_LIMIT, error_colors
 from jaxsmw.report.figures import draw_mesh
@@ -32,7 +33,7 @@ MEASURED = 1500
 
 
 def body(
-    mesh: jaxsmw.Mesh, colors: Float[np.ndarray, "n 3"] | None, up: str | None
+    mesh: jaxsmw.Mesh, colors: Float[np.ndarray, "n 3"] | None, up: Axis | None
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return the picture of a body, which fits into a square."""
     picture = picture_of(draw_mesh(mesh, colors, up=up))

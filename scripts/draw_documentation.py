@@ -29,6 +29,7 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.transform import Rotation
 
 import jaxsmw
+from jaxsmw.choices import Axis
 from jaxsmw.creature import creature
 from jaxsmw.report.colors import position_colors
 from jaxsmw.report.figures import draw_correspondence, draw_mesh
@@ -53,7 +54,7 @@ class Case(NamedTuple):
     truth: jaxsmw.evaluation.GroundTruth
     failing: dict[str, Any]
     cure: dict[str, Any] | None
-    up: str | None = "y"
+    up: Axis | None = "y"
 
 
 def procedural_cases() -> Iterator[Case]:

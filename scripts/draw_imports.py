@@ -38,7 +38,7 @@ def imported_modules(library: Path = ROOT / "jaxsmw") -> dict[str, set[str]]:
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Import):
                 imported |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom):
+            elif isinstance(node, ast.ImportFrom) and node.module:
                 inner = {f"{node.module}.{alias.name}" for alias in node.names}
                 imported |= {m if m.removeprefix("jaxsmw.") in names else node.module for m in inner}
         imports[name] = {m.removeprefix("jaxsmw.") for m in imported if m.startswith("jaxsmw.")}
@@ -80,7 +80,8 @@ def direct(layers: dict[str, set[str]]) -> dict[str, set[str]]:
 def draw(axes: Axes, layers: dict[str, set[str]]) -> None:
     """Draw every layer above the layers that it imports."""
     height = heights(layers)
-    in_row, placed = Counter(height.values()), Counter()
+    in_row = Counter(height.values())
+    placed: Counter[int] = Counter()
     places = {}
     for layer in sorted(layers, key=lambda layer: (height[layer], layer)):
         row = height[layer]

@@ -1,4 +1,4 @@
-"""Pairs of many kinds of shapes with known matches, on which the search for the right map is judged.
+"""Pairs of many kinds of shapes with known matches, on which the search is judged, and tables of the results.
 
 The pairs come from data sets (`docs/datasets.md`) and from made shapes: people, animals, an ape and people,
 bodies with topological noise, teeth of both sides, jaws, halves of a brain, parts called partial and parts
@@ -7,8 +7,8 @@ called full, a mask and a head, creatures, and bumpy bodies with their mirror im
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import chain
+from collections.abc import Iterator, Sequence
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from common import common_landmarks, scan_files, side_of
 from jaxtyping import Int, Int64
 from scipy.spatial import KDTree
+from scipy.stats import binomtest
 
 from jaxsmw import Mesh, creature_pair, geodesic_error, make_mesh, read_mesh
 from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
@@ -26,6 +27,8 @@ from jaxsmw.evaluation import GroundTruth
 MEAN, GROSS, SHARE = 0.1, 0.25, 0.05
 # The largest number of points at which an error is measured.
 POINTS = 1000
+# The ends of the groups of maps by probability.
+GROUPS = (0, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1)
 
 
 class KnownPair(NamedTuple):
@@ -102,14 +105,14 @@ def of_landmarks(data: Path, number: int, seed: int) -> Iterator[KnownPair]:
             if kind == "teeth" and (side_of(x) != side_of(y)) != bool(drawn % 2):
                 continue
             drawn += 1
-            meshes, landmarks = [read_mesh(x), read_mesh(y)], common_landmarks(x, y)
-            vertices = [
+            meshes = read_mesh(x), read_mesh(y)
+            at_x, at_y = (
                 mesh.referenced_indices[
                     KDTree(mesh.vertices[mesh.referenced_indices]).query(own.positions)[1]
                 ]
-                for mesh, own in zip(meshes, landmarks, strict=True)
-            ]
-            yield KnownPair(kind, *meshes, False, *vertices)
+                for mesh, own in zip(meshes, common_landmarks(x, y), strict=True)
+            )
+            yield KnownPair(kind, *meshes, False, at_x, at_y)
 
 
 def of_brains(data: Path) -> Iterator[KnownPair]:
@@ -169,3 +172,82 @@ def of_bumpy_bodies(number: int, seed: int) -> Iterator[KnownPair]:
             ),
         )
         yield KnownPair("bumpy bodies", *meshes, False, np.arange(len(order)), order)
+
+
+class Judged(NamedTuple):
+    """The map of a pair: its mean error, whether it is right, and with which probability.
+
+    `among` states whether this map or another one of the search is right.
+    """
+
+    kind: str
+    error: float
+    right: bool
+    among: bool
+    probability: float
+    seconds: float = np.nan
+
+    @property
+    def silent(self) -> bool:
+        """Whether the map looks right."""
+        return self.probability >= 0.5
+
+
+def count_table(results: Sequence[Judged], among: str) -> list[list[str]]:
+    """Return the numbers of right, silent and flagged maps of each kind; `among` is the title of a column."""
+    rows = [["", "pairs", "right", among, "wrong and silent", "right and flagged"]]
+    for kind in (*dict.fromkeys(result.kind for result in results), "all"):
+        own = [result for result in results if kind in (result.kind, "all")]
+        counts = (
+            len(own),
+            sum(result.right for result in own),
+            sum(result.among for result in own),
+            sum(result.silent and not result.right for result in own),
+            sum(result.right and not result.silent for result in own),
+        )
+        rows.append([kind, *map(str, counts)])
+    return rows
+
+
+class Group(NamedTuple):
+    """Maps with similar probabilities: their number, their mean probability, and the share that it predicts.
+
+    `least` and `most` are the ends of the 95 % interval of the share (Wilson 1927).
+    """
+
+    limits: str
+    number: int
+    probability: float
+    share: float
+    least: float
+    most: float
+
+
+def grouped(
+    probabilities: Sequence[float], outcomes: Sequence[bool], ends: Sequence[float] = GROUPS
+) -> list[Group]:
+    """Return the groups of maps that are not empty. The last group contains its upper end."""
+    predicted, happened = np.array(probabilities), np.array(outcomes)
+    groups = []
+    for low, high in pairwise(ends):
+        own = (low <= predicted) & ((predicted < high) | (high == ends[-1]))
+        if own.any():
+            number, events = int(own.sum()), int(happened[own].sum())
+            least, most = binomtest(events, number).proportion_ci(method="wilson")
+            mean, share = float(predicted[own].mean()), events / number
+            groups.append(Group(f"{low:.0%} to {high:.0%}", number, mean, share, float(least), float(most)))
+    return groups
+
+
+def reliability(results: Sequence[Judged]) -> list[Group]:
+    """Return the groups of results by the probability that the map is right."""
+    return grouped([result.probability for result in results], [result.right for result in results])
+
+
+def reliability_table(results: Sequence[Judged]) -> list[list[str]]:
+    """Return the mean probability and the share of right maps of each group."""
+    rows = [["probability", "maps", "mean probability", "right"]]
+    for group in reliability(results):
+        interval = f"{group.share:.1%} [{group.least:.1%}, {group.most:.1%}]"
+        rows.append([group.limits, str(group.number), f"{group.probability:.1%}", interval])
+    return rows

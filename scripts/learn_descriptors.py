@@ -54,6 +54,7 @@ from learning import (
     reading,
     refined,
     root_mean_square,
+    round_trip,
     running,
     smoothed,
     unit_area_positions,
@@ -240,7 +241,7 @@ class Matched(NamedTuple):
 
     by_descriptors: SoftMap | SparseSoftMap
     by_layer: SoftMap | SparseSoftMap
-    functional_map: Float[Array, "k k"]
+    functional_map: Float[Array | np.ndarray, "k k"]
     energy: Float[Array, ""]
 
 
@@ -252,7 +253,8 @@ def matched(network: DescriptorNetwork, x: Shape, y: Shape) -> Matched:
     of_layer = module(*features, *spectra)
     by_descriptors = module.recovery_of_features(*features, *(s.vertex_areas for s in spectra))
     energy = module.refiner.problem(*spectra, sampled=True).energy(of_layer.soft_map)(of_layer.functional_map)
-    return Matched(by_descriptors, of_layer.soft_map, of_layer.functional_map, energy / LAYER_EIGENVECTORS)
+    energy = jnp.asarray(energy / LAYER_EIGENVECTORS)
+    return Matched(by_descriptors, of_layer.soft_map, of_layer.functional_map, energy)
 
 
 def distance_to_truth(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array, ""]:
@@ -273,21 +275,11 @@ def inconsistency(network: DescriptorNetwork, pair: TrainingPair) -> Float[Array
     the forward map followed by the backward map.
     """
     forward, backward = matched(network, pair.x, pair.y), matched(network, pair.y, pair.x)
-    round_trip = product(forward.functional_map, backward.functional_map)
-    bijectivity = jnp.mean(
-        jnp.sum((round_trip - jnp.eye(*round_trip.shape, dtype=round_trip.dtype)) ** 2, axis=1)
-    )
-    by_layer, by_descriptors = (
-        root_mean_square(
-            lambda f, to_y=to_y, to_x=to_x: to_y.pull_back(to_x.pull_back(f)),
-            pair.x.positions,
-            pair.x.positions,
-        )
-        for to_y, to_x in (
-            (forward.by_layer, backward.by_layer),
-            (forward.by_descriptors, backward.by_descriptors),
-        )
-    )
+    there_and_back = product(forward.functional_map, backward.functional_map)
+    identity = jnp.eye(len(there_and_back), dtype=there_and_back.dtype)
+    bijectivity = jnp.mean(jnp.sum((there_and_back - identity) ** 2, axis=1))
+    by_layer = round_trip(forward.by_layer, backward.by_layer, pair.x.positions)
+    by_descriptors = round_trip(forward.by_descriptors, backward.by_descriptors, pair.x.positions)
     return WEIGHT * (forward.energy + backward.energy + bijectivity) + by_layer + by_descriptors / 2
 
 
@@ -321,7 +313,9 @@ _LONGEST_HEADER = 1000
 
 
 @eqx.filter_jit
-def nearest_descriptors(network: DescriptorNetwork, x: Spectrum, y: Spectrum) -> Int[Array, " m"]:
+def nearest_descriptors(
+    network: DescriptorNetwork, x: Spectrum, y: Spectrum
+) -> Int[Array | np.ndarray, " m"]:
     """Return, for each vertex of X, the vertex of Y with the nearest descriptors."""
     return nearest_neighbor(network(x), network(y), database_mask=y.mask)
 

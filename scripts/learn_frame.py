@@ -46,6 +46,7 @@ from learning import (
     parser,
     refined,
     root_mean_square,
+    round_trip,
     running,
     smoothed,
     unit_area_positions,
@@ -66,7 +67,7 @@ from jaxsmw import (
 from jaxsmw.banks import SoftmaxFrame
 from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.core.banks import FilterBank, Power, Warped
-from jaxsmw.core.soft_maps import Recovery, SoftMap, Softmax, SparseSoftMap
+from jaxsmw.core.soft_maps import SoftMap, Softmax, SparseSoftMap
 from jaxsmw.geometry import farthest_point_samples
 from jaxsmw.learning import refine_softly
 from jaxsmw.runtime.files import atomic_write
@@ -98,7 +99,7 @@ def bank_of(frame: SoftmaxFrame) -> FilterBank:
 
 def like_meyer() -> SoftmaxFrame:
     """Return the initial frame of training. It resembles the Meyer frame, but has positive filters."""
-    return SoftmaxFrame.like(Warped(Meyer(FILTERS), Power(2.0)), KNOTS, floor=FLOOR)
+    return SoftmaxFrame.like(Warped(Meyer(FILTERS), Power(np.asarray(2.0))), KNOTS, floor=FLOOR)
 
 
 @cache
@@ -119,11 +120,10 @@ def sampled(pair: DataPair) -> Sampled:
 
     truth = pair.ground_truth(mesh_x, mesh_y).everywhere(mesh_x)[samples[0]]
     return Sampled(
-        *(
-            spectrum.sample(jnp.asarray(of_shape))
-            for spectrum, of_shape in zip(spectra, samples, strict=True)
-        ),
-        *(jnp.asarray(place, jnp.float32) for place in positions),
+        spectra[0].sample(jnp.asarray(samples[0])),
+        spectra[1].sample(jnp.asarray(samples[1])),
+        jnp.asarray(positions[0], jnp.float32),
+        jnp.asarray(positions[1], jnp.float32),
         jnp.asarray(nearest(initial_map(pair_of_meshes, *spectra), 0, mesh_y)),
         jnp.asarray(nearest(initial_map(pair_of_meshes.reversed(), *spectra[::-1]), 1, mesh_x)),
         jnp.asarray(unit_area_positions(mesh_y)[truth], jnp.float32),
@@ -136,9 +136,10 @@ def soft_map(
     """Refine an initial map by `refine_softly` with the frame, and return the soft map."""
     # Eigenvectors restricted to samples are not orthonormal, so they need a least-squares pseudo-inverse.
     refiner = WaveletPreservation(bank_of(frame), Filtering("least_squares"))
-    recovery: Recovery = Softmax(TEMPERATURE)
-    options = {"refiner": refiner, "recovery": recovery, "iterations": ITERATIONS - 1}
-    return refine_softly(spectrum_x, spectrum_y, initial, **options).soft_map
+    recovery = Softmax(np.asarray(TEMPERATURE))
+    return refine_softly(
+        spectrum_x, spectrum_y, initial, refiner=refiner, recovery=recovery, iterations=ITERATIONS - 1
+    ).soft_map
 
 
 def distance_to_truth(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
@@ -151,9 +152,7 @@ def round_trip_distance(frame: SoftmaxFrame, pair: Sampled) -> Float[Array, ""]:
     """Return the loss `cycles`: the mean distance from points of X to their images on a round trip via Y."""
     forward = soft_map(frame, pair.spectrum_x, pair.spectrum_y, pair.initial_map)
     backward = soft_map(frame, pair.spectrum_y, pair.spectrum_x, pair.reverse_initial_map)
-    return root_mean_square(
-        lambda values: forward.pull_back(backward.pull_back(values)), pair.positions_x, pair.positions_x
-    )
+    return round_trip(forward, backward, pair.positions_x)
 
 
 LOSSES: dict[str, Callable[[SoftmaxFrame, Sampled], Float[Array, ""]]] = {

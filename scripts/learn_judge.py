@@ -18,14 +18,13 @@ import json
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from common import make_parser, write_text
 from jaxtyping import Bool, Float
-from judged_pairs import KnownPair, is_right, known_pairs
+from judged_pairs import Judged, KnownPair, count_table, is_right, known_pairs, reliability_table
 from scipy.optimize import minimize
 
 from jaxsmw import Pair
@@ -38,8 +37,6 @@ from jaxsmw.matching.starts import make_start
 from jaxsmw.runtime.provenance import made_with
 from jaxsmw.runtime.threads import one_blas_thread
 
-# The ends of the groups of maps in the table of reliability.
-GROUPS = (0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.97, 1)
 # The penalty of large weights, which keeps them finite.
 PENALTY = 0.05
 # The weights from which the fit begins, with the intercept first.
@@ -83,14 +80,18 @@ def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
     return np.stack((np.ones(len(evidence)), *columns), axis=1)
 
 
+def shares_of(pair: JudgedPair, weights: Float[np.ndarray, " f"]) -> Float[np.ndarray, " c"]:
+    """Return the probability of each map of a pair to be right."""
+    return probabilities((features(pair.evidence) @ weights).tolist())
+
+
 def fitted(pairs: Sequence[JudgedPair]) -> Float[np.ndarray, " f"]:
     """Return the weights of the largest likelihood: that one of the right maps is right, or none."""
 
     def loss(weights: Float[np.ndarray, " f"]) -> float:
         total = 0.0
         for pair in pairs:
-            shares = probabilities(features(pair.evidence) @ weights)
-            right = pair.right
+            shares, right = shares_of(pair, weights), pair.right
             total -= np.log(max(shares[right].sum() if right.any() else 1 - shares.sum(), 1e-9))
         return float(total + PENALTY * weights[1:] @ weights[1:])
 
@@ -101,41 +102,23 @@ def tables(pairs: Sequence[JudgedPair]) -> Iterator[str]:
     """Yield the weights, the results of each kind, and the reliability of the probabilities."""
     weights = fitted(pairs)
     yield "Weights: " + ", ".join(f"{weight:.2f}" for weight in weights)
-    rows = [["", "pairs", "right map exists", "right", "wrong and silent", "right and flagged"]]
-    predicted, actual = [], []
+    judged = []
     for kind in dict.fromkeys(pair.kind for pair in pairs):
-        own = [pair for pair in pairs if pair.kind == kind]
         others = fitted([pair for pair in pairs if pair.kind != kind])
-        shares = [probabilities(features(pair.evidence) @ others) for pair in own]
-        best = [
-            (of_pair.max(), pair.right[of_pair.argmax()]) for of_pair, pair in zip(shares, own, strict=True)
-        ]
-        numbers = (
-            len(own),
-            sum(pair.right.any() for pair in own),
-            sum(right for _, right in best),
-            sum(not right and share > 0.5 for share, right in best),
-            sum(right and share <= 0.5 for share, right in best),
-        )
-        rows.append([kind, *map(str, numbers)])
-        predicted += [share for share, _ in best]
-        actual += [right for _, right in best]
-    rows.append(["all", *(str(sum(int(row[column]) for row in rows[1:])) for column in range(1, 6))])
-    yield "Each kind is judged by the weights of the other kinds:\n\n" + markdown(rows)
-    chances, rights = np.array(predicted), np.array(actual)
-    groups = [["probability", "maps", "mean probability", "right"]]
-    for low, high in pairwise(GROUPS):
-        own_group = (low <= chances) & ((chances < high) | (high == 1))
-        if own_group.any():
-            figures = f"{chances[own_group].mean():.0%}", f"{rights[own_group].mean():.0%}"
-            groups.append([f"{low:.0%} to {high:.0%}", str(own_group.sum()), *figures])
-    yield "Reliability of the probabilities of the best maps:\n\n" + markdown(groups)
+        for pair in pairs:
+            if pair.kind == kind:
+                shares, right = shares_of(pair, others), pair.right
+                best = shares.argmax()
+                error, probability = float(pair.errors[best, 0]), float(shares[best])
+                judged.append(Judged(kind, error, bool(right[best]), bool(right.any()), probability))
+    counts = markdown(count_table(judged, "right map exists"))
+    yield "Each kind is judged by the weights of the other kinds:\n\n" + counts
+    groups = markdown(reliability_table(judged))
+    yield "Reliability of the probabilities of the best maps:\n\n" + groups
 
 
 def main() -> None:
-    parser = make_parser(__doc__, pairs=8)
-    parser.add_argument("data", metavar="DATA_DIRECTORY", type=Path)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the choice of pairs (default: 0)")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", pairs=8, seed=True)
     parser.add_argument("--maps", metavar="FILE.json", type=Path, help="file in which the evidence is kept")
     parser.add_argument("--output", metavar="FILE.md", type=Path, help="also write the tables to this file")
     options = parser.parse_args()

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TypeVar
+from typing import Any, BinaryIO, Generic, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from jaxsmw.benchmark.datasets import DataPair, open_data_set
 from jaxsmw.benchmark.intervals import mean_interval
 from jaxsmw.benchmark.journal import Journal
 from jaxsmw.benchmark.tables import markdown
+from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
 from jaxsmw.runtime.files import atomic_write, make_directory
 from jaxsmw.runtime.provenance import (
     claimed_directory,
@@ -94,7 +95,7 @@ def unit_area_positions(mesh: Mesh) -> Float64[np.ndarray, "n 3"]:
 
 
 def root_mean_square(
-    carried: Callable[[Float[Array, "s p"]], Float[Array, "s p"]],
+    carried: Callable[[Float[Array, "s p"]], Float[Array | np.ndarray, "s p"]],
     positions: Float[Array, "s 3"],
     wanted: Float[Array, "s 3"],
 ) -> Float[Array, ""]:
@@ -109,20 +110,29 @@ def root_mean_square(
     return jnp.mean(jnp.sqrt(jnp.maximum(squares, 0) + 1e-6))
 
 
-class State(eqx.Module):
+def round_trip(
+    forward: SoftMap | SparseSoftMap, backward: SoftMap | SparseSoftMap, positions: Float[Array, "m 3"]
+) -> Float[Array, ""]:
+    """Return the `root_mean_square` distance of points of X from their images on a round trip via Y."""
+    return root_mean_square(
+        lambda functions: forward.pull_back(backward.pull_back(functions)), positions, positions
+    )
+
+
+class State(eqx.Module, Generic[Model]):
     """The state of a training run, as `train` saves it."""
 
-    model: eqx.Module
+    model: Model
     optimizer: optax.OptState
     step: Int[Array, ""]
     losses: Float[Array, " steps"]
     watched: Float[Array, " records"]
 
 
-class Trained(NamedTuple):
+class Trained(NamedTuple, Generic[Model]):
     """The trained model, the loss of every step, and the mean loss on watched pairs at some `steps`."""
 
-    model: Any
+    model: Model
     losses: Float[np.ndarray, " steps"]
     steps: Int[np.ndarray, " records"]
     watched: Float[np.ndarray, " records"]
@@ -141,7 +151,7 @@ def train(
     directory: Path,
     unit: Callable[[Prepared], Float[Array, ""]] | None = None,
     watched: Sequence[DataPair] = (),
-) -> Trained:
+) -> Trained[Model]:
     """Train a model. Each step uses one pair, which is drawn at random.
 
     The state is saved regularly as `training_NAME.eqx` in `directory`. If that file exists, training
@@ -166,7 +176,7 @@ def train(
         with reading(saved) as stream:
             state = eqx.tree_deserialise_leaves(stream, state)
 
-    def watch(state: State) -> State:
+    def watch(state: State[Model]) -> State[Model]:
         """Record the mean loss on the watched pairs if a record is due at the current step."""
         here = np.flatnonzero(records == int(state.step))
         if not len(here):
@@ -202,12 +212,12 @@ def train(
 # The next two functions are at module level, so JAX compiles them only once for each loss and optimiser.
 @eqx.filter_jit
 def _improve(
-    state: State,
+    state: State[Model],
     pair: Prepared,
     loss: Callable[[Model, Prepared], Float[Array, ""]],
     optimizer: optax.GradientTransformation,
     unit: Callable[[Prepared], Float[Array, ""]] | None,
-) -> State:
+) -> State[Model]:
     value, gradient = eqx.filter_value_and_grad(loss)(state.model, pair)
     change, following = optimizer.update(gradient, state.optimizer)
     losses = state.losses.at[state.step].set(value / (1 if unit is None else unit(pair)))
@@ -289,13 +299,12 @@ def smoothed(values: Float[np.ndarray, " steps"]) -> tuple[np.ndarray, np.ndarra
 
 def parser(description: str, *, output: str, steps: int) -> argparse.ArgumentParser:
     """Return the parser for the arguments of a training script."""
-    made = make_parser(description, output=output)
+    made = make_parser(description, output=output, seed=True)
     made.add_argument("data", type=Path, help="directory that contains faust_r and tosca_r")
     made.add_argument("--steps", type=int, default=steps, help=f"number of training steps (default: {steps})")
     made.add_argument(
         "--test-pairs", type=int, default=40, help="number of test pairs from each data set (default: 40)"
     )
-    made.add_argument("--seed", type=int, default=0, help="seed of the random draws (default: 0)")
     made.add_argument(
         "--quick", action="store_true", help="run 3 steps and 2 test pairs, to check that the script works"
     )

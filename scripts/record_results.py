@@ -16,7 +16,6 @@ same versions of the software, which a JSON file next to OUTPUT states.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import fnmatch
 import hashlib
@@ -43,6 +42,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from common import make_parser
 from recorded_cases import (
     ACCURATE,
     COMMANDS,
@@ -84,8 +84,8 @@ def cases() -> dict[str, Callable[[Path], Row]]:
         source, target = meshes.split(" -> ")
         for name in settings.split():
             found[f"{pair} {name}"] = partial(match, source, target, SETTINGS[name])
-    sampled = {"samples": 150, "starts_on_samples": True}
-    return found | {
+    return {
+        **found,
         "further results": partial(further, FOUR[1], FOUR[0]),
         "collection creatures": partial(collection, FOUR),
         "collection paper": partial(collection, FOUR, preset="paper", template=1, seed=3),
@@ -99,7 +99,9 @@ def cases() -> dict[str, Callable[[Path], Row]]:
         "batch samples": partial(batch, samples=150, batch_size=2),
         "batch partial": partial(batch, partial=True, batch_size=3, stop_when_unchanged=True),
         "batch regression": partial(batch, refiner=FeatureRegression(levels=(20, 30, 40)), iterations=3),
-        "batch registration": partial(batch, refiner=Registration(levels=(20, 40)), iterations=2, **sampled),
+        "batch registration": partial(
+            batch, refiner=Registration(levels=(20, 40)), iterations=2, samples=150, starts_on_samples=True
+        ),
         "vmap": vmapped,
         **{f"command {name}": partial(command, line) for name, line in COMMANDS.items()},
     }
@@ -261,10 +263,11 @@ def without_times(file: Path) -> bytes | list[Row]:
 
 def programs() -> dict[str, Callable[[Path], Row]]:
     """Return the function that traces each program of a stage."""
-    search, last = ACCURATE.search, ACCURATE.stages[-1]
+    search, large, last = ACCURATE.search, ACCURATE.large, ACCURATE.stages[-1]
+    assert search is not None and large is not None
     stages = {
         **{f"{name} {i}": s for name, preset in jaxsmw.PRESETS.items() for i, s in enumerate(preset.stages)},
-        **{f"accurate large {i}": stage for i, stage in enumerate(ACCURATE.large.stages)},
+        **{f"accurate large {i}": stage for i, stage in enumerate(large.stages)},
         "accurate trimmed": last.with_levels(search.trimmed_levels),
         **{f"accurate coarse {i}": last.with_levels(levels) for i, levels in enumerate(search.coarse_levels)},
     }
@@ -284,7 +287,8 @@ def program(stage: Stage, m: int, n: int, part: bool, history: bool, data: Path)
     """Trace a stage for m and n vertices. A partial shape has fewer eigenvectors than the full shape."""
     k, samples = stage.number_of_eigenvectors, stage.number_of_samples
     x, y = outline(stage, m, k - k // 4 if part else k), outline(stage, n, k)
-    traced = eqx.filter_jit(jaxsmw.refine).lower(
+    refine: Any = eqx.filter_jit(jaxsmw.refine)  # its type does not state the method `lower`
+    traced = refine.lower(
         x,
         y,
         jnp.zeros(m, jnp.int32),
@@ -362,9 +366,7 @@ def provenance() -> dict[str, Any]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the chosen cases, and return the exit status."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__)
     parser.add_argument("--data", type=Path, default=Path(), help="directory of the data sets")
     parser.add_argument("--output", type=Path, required=True, help="table of the hashes")
     parser.add_argument("--programs", action="store_true", help="hash the programs of all stages instead")

@@ -329,11 +329,9 @@ def _cell(summary: MethodSummary | None) -> str:
 
 
 def main() -> None:
-    parser = make_parser(__doc__, parts=EXPERIMENTS, output="paper")
-    parser.add_argument("data", type=Path, metavar="DATA_DIRECTORY")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", parts=EXPERIMENTS, output="paper", seed=True)
     parser.add_argument("--sets", nargs="+", metavar="NAME", help="names of data sets to use (default: all)")
     parser.add_argument("--pairs", type=int, help="number of random pairs from each set (default: all)")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--scheduler", metavar="ADDRESS", help="address of a Dask scheduler")
     parser.add_argument(

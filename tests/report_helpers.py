@@ -1,4 +1,4 @@
-"""Meshes and page parsers that the tests of figures and pages share."""
+"""Meshes, and parsers of pages and tables, that the tests of figures and reports share."""
 
 import base64
 import json
@@ -31,6 +31,11 @@ TALL = ellipsoid(0.6, 1.2, 0.3)  # a standing body whose up axis is y
 
 def uniform(mesh: Mesh, *color: float) -> np.ndarray:
     return np.tile(np.array(color, dtype=float), (len(mesh.vertices), 1))
+
+
+def cells(text: str) -> list[list[str]]:
+    """Return the cells of the Markdown tables in a text, by rows."""
+    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if "|" in line]
 
 
 def embedded(page: str) -> dict[str, Any]:

@@ -2,16 +2,13 @@
 
 import ast
 import graphlib
-import sys
 from pathlib import Path
 from typing import get_args
 
+from draw_imports import NAMESPACES, imported_modules
+
 import jaxsmw
 from jaxsmw.choices import PresetName
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
-from draw_imports import NAMESPACES, imported_modules
 
 LIBRARY = Path(jaxsmw.__file__).parent
 # The layers from bottom to top: a layer imports only from itself and from layers before it.

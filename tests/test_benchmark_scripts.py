@@ -3,19 +3,15 @@
 import json
 import sys
 from argparse import Namespace
-from pathlib import Path
 
+import benchmark_batches
+import benchmark_collection
+import benchmark_speed
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from sampled_cases import first_always
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
-import benchmark_batches
-import benchmark_collection
-import benchmark_speed
 
 from jaxsmw.creature import creature
 from jaxsmw.io import write_mesh

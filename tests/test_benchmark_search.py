@@ -1,18 +1,17 @@
 """The tables of the script `benchmark_search` count right, silent and flagged maps."""
 
 import sys
-from pathlib import Path
-
-import numpy as np
-import pytest
-
-from jaxsmw import creature_pair
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
 import benchmark_search
-from benchmark_search import Judged, draw, tables
-from judged_pairs import KnownPair, of_bumpy_bodies, of_creatures
+import learn_judge
+import numpy as np
+import pytest
+from benchmark_search import draw, tables
+from judged_pairs import Judged, KnownPair, of_bumpy_bodies, of_creatures
+from learn_judge import JudgedPair
+from report_helpers import cells
+
+from jaxsmw import creature_pair
 
 pytestmark = pytest.mark.study
 
@@ -24,16 +23,25 @@ RESULTS = [
 ]
 
 
-def cells(text: str) -> list[list[str]]:
-    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if "|" in line]
-
-
 def test_tables_count_right_silent_and_flagged_maps():
     rows = {row[0]: row[1:] for row in cells(tables(RESULTS))}
     assert rows["people"] == ["2", "2", "2", "0", "1", "20.0", "4.0"]
     assert rows["teeth"] == ["2", "0", "1", "1", "0", "250.0", "8.0"]
     assert rows["all"] == ["4", "2", "3", "1", "1", "135.0", "6.0"]
     assert rows["95% to 98%"][:2] == ["1", "97.0%"] and rows["95% to 98%"][2].startswith("100.0% [")
+
+
+def test_the_judge_is_fitted_to_the_evidence_of_other_kinds():
+    """The map of a pair is the more probable one, which is the less deformed one."""
+    evidence = np.array([[0.01, 0.1, 1, 0.01], [1, 0.9, 0, 0.5]])
+    pair, wrong = np.array([[0.01, 0], [0.3, 0.5]]), np.array([[0.2, 0.3], [0.3, 0.5]])
+    pairs = [JudgedPair(kind, evidence, pair) for kind in ("people", "people", "teeth", "jaws")]
+    weights, counts, reliability = learn_judge.tables([*pairs, JudgedPair("jaws", evidence, wrong)])
+    rows = {row[0]: row[1:] for row in cells(counts)}
+    assert rows["people"] == ["2", "2", "2", "0", "0"]
+    assert rows["jaws"] == ["2", "1", "1", "1", "0"]
+    assert rows["all"] == ["5", "4", "4", "1", "0"]
+    assert weights.startswith("Weights: ") and sum(int(row[1]) for row in cells(reliability)[2:]) == 5
 
 
 def test_the_reliability_curve_is_drawn(tmp_path):

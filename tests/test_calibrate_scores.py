@@ -1,20 +1,11 @@
 """The tables of the script `calibrate_scores` are correct for known measurements."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
 from calibrate_scores import Measured, calibration, tables
+from report_helpers import cells
 
 pytestmark = pytest.mark.study
-
-
-def cells(table: str) -> list[list[str]]:
-    return [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines() if "|" in line]
 
 
 def test_tables_summarise_the_measurements():

@@ -10,18 +10,15 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import compare_frames
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from synthetic import bumpy_mesh, random_spectrum
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
-import compare_frames
 from frame_study import measurement, summary, variants
 from frame_study.drawing import draw_forest, draw_heat_maps
 from frame_study.measurement import PairName, Settings
 from frame_study.variants import DEFAULT, UPDATES, Variant
+from synthetic import bumpy_mesh, random_spectrum
 
 import jaxsmw
 from jaxsmw.benchmark.journal import Journal

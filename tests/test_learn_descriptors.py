@@ -1,18 +1,14 @@
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import learn_descriptors
+import learning
 import numpy as np
 import optax
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
-import learn_descriptors
-import learning
 from learn_descriptors import (
     LOSSES,
     DescriptorNetwork,

@@ -1,19 +1,15 @@
 import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import learn_frame
+import learning
 import numpy as np
 import optax
 import pytest
-from synthetic import random_spectrum
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
-import learn_frame
-import learning
 from learn_frame import LOSSES, Sampled, bank_of, like_meyer, load, save, summary
+from synthetic import random_spectrum
 
 from jaxsmw import Meyer, Spectrum
 

@@ -1,15 +1,10 @@
 """Hashes of results are equal in every run, and show which result has changed."""
 
 import dataclasses
-import sys
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
 import record_results
 
 import jaxsmw

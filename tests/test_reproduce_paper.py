@@ -9,11 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import bumpy_mesh
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
 import reproduce_paper
+from synthetic import bumpy_mesh
 
 from jaxsmw.benchmark.datasets import open_data_set
 from jaxsmw.benchmark.opponents.registry import METHODS

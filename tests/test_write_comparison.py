@@ -1,13 +1,9 @@
 """The tables of docs/comparison.md agree with the published errors and with our results."""
 
 import csv
-import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
-
 import write_comparison
 
 ROOT = Path(__file__).parents[1]

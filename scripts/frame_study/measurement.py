@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from common import medians
-from jaxtyping import Array, Float, Float64, Int, Int32, Int64
+from jaxtyping import Float, Float64, Int, Int32, Int64
 
 from frame_study.variants import (
     DEFAULT,
@@ -27,6 +27,7 @@ from frame_study.variants import (
 )
 from jaxsmw import read_mesh
 from jaxsmw.benchmark.journal import Row
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.banks import FilterBank, Meyer
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.refiner import Prepared, Problem, Refiner, State
@@ -184,7 +185,7 @@ def diagnose(
 ) -> Diagnosis:
     problem = refiner.problem(spectrum_x, spectrum_y)
     energy = problem.energy(pointwise_map)
-    condition_number = jnp.asarray(jnp.nan)
+    condition_number: Array = jnp.asarray(jnp.nan)
     if isinstance(refiner.solution, LeastSquares | RegularizedLeastSquares):
         condition_number = problem.energy(start, norm=refiner.solution.norm).condition_number()
     return Diagnosis(energy(functional_map), energy.constant, condition_number)
@@ -376,7 +377,7 @@ def measure_times(data: Path, names: list[PairName], wanted: list[Variant], sett
     **Returns:** Rows of `times.csv`, with median milliseconds.
     """
     banks, filters = _frames(settings.number_of_filters), settings.number_of_filters
-    candidates: dict[Variant, Callable[[], Array]] = {}
+    candidates: dict[Variant, Callable[[], object]] = {}
     rows = []
     for name in names:
         pair = load_pair(data, name, settings)

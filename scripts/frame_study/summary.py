@@ -13,6 +13,7 @@ from frame_study.measurement import INVARIANCE_FRAMES, MOVE, SEARCH, PairName, S
 from frame_study.variants import CONVENTIONS, DEFAULT, GAINS, UPDATES, Variant
 from jaxsmw.benchmark.intervals import CONFIDENCE, RESAMPLES, Interval, mean_interval
 from jaxsmw.benchmark.journal import Row
+from jaxsmw.benchmark.tables import markdown
 from jaxsmw.core.functional_map import Convention
 
 SETTLED = 0.05
@@ -322,8 +323,8 @@ def _updates_within_frames(study: Study) -> str:
     for frame in study.settings.frames:
         cells = []
         for update, reference in contrasts:
-            pair = (Variant(frame, name, "pullback") for name in (update, reference))
-            cells.append(study.contrast(*pair, "both"))
+            variant, base = (Variant(frame, name, "pullback") for name in (update, reference))
+            cells.append(study.contrast(variant, base, "both"))
         rows.append([frame, *cells])
     return _table(["frame", *(f"{update} − {reference}" for update, reference in contrasts)], rows)
 
@@ -339,11 +340,11 @@ def _tightening(study: Study) -> str:
         if f"{frame}, tightened" in study.settings.frames:
             cells = [frame]
             for kind, update, reference_kind, reference in contrasts:
-                pair = (
+                variant, base = (
                     Variant(f"{frame}, {of}" if of else frame, name, "pullback")
                     for of, name in ((kind, update), (reference_kind, reference))
                 )
-                cells.append(study.contrast(*pair, "both"))
+                cells.append(study.contrast(variant, base, "both"))
             rows.append(cells)
     header = [
         f"{kind}, {update} − {reference_kind or 'plain'}" + (f", {reference}" if reference != update else "")
@@ -439,5 +440,4 @@ def _list(*items: str) -> str:
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return markdown([header, *rows]).strip()

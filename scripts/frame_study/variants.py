@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int
+from jaxtyping import Float, Float64
 from scipy.optimize import brentq
 
+from jaxsmw.core.arrays import Array
 from jaxsmw.core.banks import (
     CubicSpline,
     ExponentialWindow,
@@ -35,7 +36,13 @@ from jaxsmw.core.banks import (
     frame_function,
     tighten,
 )
-from jaxsmw.core.functional_map import Convention, WaveletProblem, multiscale_kernel
+from jaxsmw.core.functional_map import (
+    Convention,
+    FunctionalMap,
+    PointwiseMap,
+    WaveletProblem,
+    multiscale_kernel,
+)
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.results import RESULTS
 from jaxsmw.core.solutions.closed_form import (
@@ -47,6 +54,8 @@ from jaxsmw.core.solutions.closed_form import (
 )
 from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
+
+PreparedT = TypeVar("PreparedT")
 
 CONVENTIONS: tuple[Convention, ...] = ("pullback", "pushforward")
 
@@ -190,22 +199,22 @@ class Scaled(FilterBank):
         return self.bank(points, eigenvalues) / jnp.sqrt(height)
 
 
-class Amplified(Solution):
+class Amplified(Solution[PreparedT]):
     """A solution whose functional map is multiplied by a number."""
 
-    solution: Solution
+    solution: Solution[PreparedT]
     gain: Float[Array, ""]
 
-    def prepare(self, problem: WaveletProblem) -> Any:
+    def prepare(self, problem: WaveletProblem) -> PreparedT:
         return self.solution.prepare(problem)
 
     def solve(
         self,
         problem: WaveletProblem,
-        prepared: Any,
-        pointwise_map: Int[Array, " m"],
-        previous: Float[Array, "k_out k_in"] | None,
-    ) -> tuple[Float[Array, "k_out k_in"], RESULTS]:
+        prepared: PreparedT,
+        pointwise_map: PointwiseMap,
+        previous: FunctionalMap | None,
+    ) -> tuple[FunctionalMap, RESULTS]:
         functional_map, result = self.solution.solve(problem, prepared, pointwise_map, previous)
         return self.gain * functional_map, result
 
