@@ -38,9 +38,9 @@ from jaxsmw.runtime.provenance import made_with
 from jaxsmw.runtime.threads import one_blas_thread
 
 # The penalty of large weights, which keeps them finite.
-PENALTY = 0.05
+PENALTY = 0.1
 # The weights from which the fit begins, with the intercept first.
-FIRST = np.array([-1.5, -2.0, -1.0, 0.5, -3.0])
+FIRST = np.array([-1.5, -2.0, -1.0, 0.5, -3.0, -3.0])
 
 
 class JudgedPair(NamedTuple):
