@@ -82,6 +82,7 @@ def test_samples_and_early_stops_give_the_results_of_single_pairs():
         x, y = PAIRS[position]
         alone = refine(spectra[x], spectra[y], starts[position], samples=(samples[x], samples[y]))
         np.testing.assert_array_equal(refined.pointwise_map, alone.pointwise_map)
+    some, its_starts = PAIRS[:2], starts[:2]
     options = dict(refiner=FeatureRegression(), starts_on_samples=True, ends_on_samples=True)
     found = refine_pairs(spectra, some, its_starts, samples=samples, batch_size=2, **options)
     for position, refined in found:

@@ -445,16 +445,23 @@ def test_a_missing_package_is_named_before_any_pair_is_measured(scape, tmp_path,
     assert not (tmp_path / "r").exists()
 
 
-def test_importing_the_benchmark_registers_no_listener():
+@pytest.fixture(scope="module")
+def imported():
+    """What a process prints that imports the benchmark: whether no listener is added, and the files of the modules."""
     script = """if True:
-        import equinox, jax, optimistix
+        import equinox, jax, optimistix, sys
         from jax._src import monitoring
         before = list(monitoring.get_event_duration_listeners())
         import jaxsmw.benchmark.benchmark
         print(monitoring.get_event_duration_listeners() == before)
+        print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'jaxsmw'))
     """
     found = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
-    assert found.stdout == "True\n"
+    return found.stdout.splitlines()
+
+
+def test_importing_the_benchmark_registers_no_listener(imported):
+    assert imported[0] == "True"
 
 
 def test_tables_are_written_although_a_shape_cannot_be_read(scape, tmp_path, monkeypatch, capsys):
@@ -552,12 +559,10 @@ def test_the_first_row_of_a_table_is_its_header():
     assert rows == "| a | b |\n| --- | --- |\n| 1 | 2 |\n"
 
 
-def test_the_digest_covers_all_code_that_results_depend_on():
+def test_the_digest_covers_all_code_that_results_depend_on(imported):
     """The digest prevents results of changed code from being mixed with older results."""
     measured = {path.resolve() for path in measured_code()}
-    script = "import sys, jaxsmw.benchmark.benchmark; print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'jaxsmw'))"
-    found = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
-    loaded = {Path(name).resolve() for name in found.stdout.split()}
+    loaded = {Path(name).resolve() for name in imported[1].split()}
     drawing = {path for path in loaded if path.parent.name == "report"}
     assert len(loaded) > 40 and loaded - drawing <= measured
     assert not {"cli.py", "page.py"} & {path.name for path in measured}

@@ -116,9 +116,9 @@ def test_bad_numbers_of_shapes_are_refused(found):
 
 @pytest.mark.usefixtures("unchecked")
 def test_equal_names_are_numbered_and_numpy_numbers_accepted(meshes):
-    alike = [replace(mesh, name="mesh") for mesh in meshes[:3]]
+    alike = [replace(mesh, name="mesh") for mesh in meshes[:2]]
     collection = match_collection(alike, preset="paper", edges_per_shape=np.int64(2), mirror="no")
-    assert list(collection.names) == ["mesh 0", "mesh 1", "mesh 2"]
+    assert list(collection.names) == ["mesh 0", "mesh 1"]
 
 
 def test_the_template_can_be_chosen(meshes, work):
@@ -241,14 +241,14 @@ def test_a_mesh_whose_matches_all_fail_is_named(meshes, monkeypatch):
 
     def failing(tasks, *arguments):
         for task in tasks:
-            if "shape4" in (task.x.mesh.name, task.y.mesh.name):
+            if "shape2" in (task.x.mesh.name, task.y.mesh.name):
                 yield ArithmeticError(f"{task.x.mesh.name} to {task.y.mesh.name}: failed")
             else:
                 yield from original(iter([task]), *arguments)
 
     monkeypatch.setattr(edges, "match_edges", failing)
-    with pytest.raises(ArithmeticError, match="failed numerically: shape4"):
-        match_collection(meshes, preset="paper", edges_per_shape=2, mirror="no")
+    with pytest.raises(ArithmeticError, match="failed numerically: shape2"):
+        match_collection(meshes[:3], preset="paper", edges_per_shape=2, mirror="no")
 
 
 def test_the_store_keeps_kinds_and_inputs_apart(tmp_path):
@@ -471,14 +471,14 @@ def test_landmarks_in_another_unit_are_refused_before_the_computation(directory,
 
 @pytest.mark.slow
 def test_killed_runs_lose_nothing(directory, tmp_path):
-    """The command is killed three times, whenever it has finished another pair."""
+    """The command is killed twice, whenever it has finished another pair."""
 
     def command(output):
         words = [sys.executable, "-m", "jaxsmw", "collection", directory, "--output", tmp_path / output]
         return [*map(str, words), *OPTIONS, "--quiet"]
 
     work, finished = tmp_path / "killed" / "work", 0
-    for _ in range(3):
+    for _ in range(2):
         process = subprocess.Popen(command("killed"), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         while process.poll() is None and len(list(work.glob("edge-*.npz"))) <= finished:
             time.sleep(0.02)
@@ -667,7 +667,7 @@ def test_a_damaged_summary_and_names_of_any_bytes_do_not_stop_the_results(meshes
     ):
         write_mesh(inputs / os.fsdecode(name), meshes[number])
     for _ in range(2):
-        outcome = run("collection", inputs, "--output", output, *OPTIONS)
+        outcome = run("collection", inputs, "--output", output, *OPTIONS[:-1], "1")
         assert outcome.code == 0, outcome.errors
         summary = (output / "collection.json").read_text("utf-8")
         (output / "collection.json").write_text("[" * 100_000)

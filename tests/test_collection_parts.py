@@ -10,6 +10,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
+from synthetic import bumpy_mesh
 
 from jaxsmw import InputError, creature_pair, match
 from jaxsmw.collection import (
@@ -207,7 +208,7 @@ def test_shapes_without_evidence_for_other_hands_have_one_hand():
 @pytest.mark.filterwarnings("ignore:.*use a finer mesh:UserWarning")
 def test_a_few_pairs_tell_whether_shapes_are_their_own_mirror_images(monkeypatch):
     """If they are not, the hands of all pairs of the graph are compared, and the store keeps the evidence."""
-    shapes, _ = prepare_collection([creature(vertices=500, seed=seed) for seed in range(6)], PRESETS["paper"])
+    shapes, _ = prepare_collection([bumpy_mesh(number=600 + i) for i in range(6)], PRESETS["paper"])
     compared, reports, store = [], [], Store(None)
 
     def compare(store):
@@ -235,7 +236,7 @@ def test_a_few_pairs_tell_whether_shapes_are_their_own_mirror_images(monkeypatch
 
 @pytest.mark.filterwarnings("ignore:.*use a finer mesh:UserWarning")
 def test_evidence_of_hands_is_kept_in_the_store(monkeypatch, tmp_path):
-    shapes, _ = prepare_collection([creature(vertices=500, seed=seed) for seed in range(2)], PRESETS["paper"])
+    shapes, _ = prepare_collection([bumpy_mesh(number=600 + i) for i in range(2)], PRESETS["paper"])
     compared = []
     monkeypatch.setattr(hands, "hand_evidence", lambda reading: compared.append(reading) or 2.5)
     for _ in range(2):

@@ -237,16 +237,18 @@ def test_eigenvalues_are_exact_on_shapes_far_from_weyls_law(length, monkeypatch)
     vertices = (vertices + 0.003 * np.random.default_rng(0).normal(size=vertices.shape)) * [1, length, 1]
     mesh = make_mesh(vertices, faces)
     stiffness, areas = assemble_laplacian(mesh)
-    exact = scipy.linalg.eigh(stiffness.toarray(), np.diag(areas / areas.sum()), eigvals_only=True)
+    mass = np.diag(areas / areas.sum())
+    exact = scipy.linalg.eigh(stiffness.toarray(), mass, eigvals_only=True, subset_by_index=(0, 39))
     eigenvalues = eigenpairs(mesh, 40)[0]
-    np.testing.assert_allclose(eigenvalues, np.maximum(exact[:40], 0), rtol=1e-8, atol=1e-7)
+    np.testing.assert_allclose(eigenvalues, np.maximum(exact, 0), rtol=1e-8, atol=1e-7)
 
 
 @pytest.mark.slow
 def test_an_ordinary_body_does_not_need_arpack(monkeypatch):
     monkeypatch.setattr(eigenbasis, "_arpack", lambda *_: pytest.fail("ARPACK was needed"))
-    stiffness, areas = assemble_laplacian(bumpy_mesh(4))
-    eigenvalues, _, _ = eigenpairs(bumpy_mesh(4), 100)
+    mesh = bumpy_mesh(number=1500)
+    stiffness, areas = assemble_laplacian(mesh)
+    eigenvalues, _, _ = eigenpairs(mesh, 100)
     exact = scipy.linalg.eigh(
         stiffness.toarray(), np.diag(areas / areas.sum()), eigvals_only=True, subset_by_index=(0, 99)
     )

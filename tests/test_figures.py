@@ -34,6 +34,12 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "_BODY_SIZE", (300, 300))
 
 
+@pytest.fixture
+def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draws bodies so small that only the texts of a figure are of use."""
+    monkeypatch.setattr(figures, "_BODY_SIZE", (60, 60))
+
+
 def pixels(figure: Any) -> np.ndarray:
     figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].astype(int)
@@ -266,7 +272,7 @@ def test_short_names_tell_files_of_one_name_apart(names: tuple[str, str], shown:
     assert tuple(short_names(names)) == shown
 
 
-@pytest.mark.usefixtures("small")
+@pytest.mark.usefixtures("tiny")
 def test_titles_are_short_names() -> None:
     names = "/data/s1/left/mesh.off", "/data/s2/left/mesh.off"
     shown = short_names(names)
@@ -277,7 +283,7 @@ def test_titles_are_short_names() -> None:
     assert captions == [f"{name}\n642 vertices" for name in (*shown, shown[0])]
 
 
-@pytest.mark.usefixtures("small")
+@pytest.mark.usefixtures("tiny")
 @pytest.mark.parametrize("difference", [0, 119])
 def test_long_titles_tell_files_apart(difference: int) -> None:
     names = ["".join("ab"[side] if i == difference else "x" for i in range(120)) + ".off" for side in (0, 1)]

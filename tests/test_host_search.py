@@ -1,6 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sampled_cases import first_always
 from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh
 
@@ -161,8 +162,19 @@ def embeddings(spectrum):
     }
 
 
-@pytest.mark.parametrize("name", ["registration", "wavelets"])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    first_always(
+        [
+            ("registration", np.float32),
+            ("registration", np.float64),
+            ("wavelets", np.float32),
+            ("wavelets", np.float64),
+        ],
+        always=3,
+        names=2,
+    ),
+)
 def test_all_methods_and_jax_give_the_same_on_surfaces(spaces, name, dtype, monkeypatch):
     queries, database = (points.astype(dtype) for points in spaces[name])
     exact = brute_force(queries, database)

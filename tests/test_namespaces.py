@@ -114,15 +114,28 @@ def check_that_both_agree(pair, dtype, *, on_samples=False, **settings):
         assert (one.dtype, one.shape) == (other.dtype, other.shape) and not isinstance(one, jax.Array)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", first_always([np.float64, np.float32]))
 @pytest.mark.parametrize("name", first_always(REFINERS, always=5))
 def test_both_namespaces_refine_alike(pair, name, dtype):
     check_that_both_agree(pair, dtype, refiner=REFINERS[name])
 
 
 @pytest.mark.parametrize("dtype", first_always([np.float32, np.float64]))
-@pytest.mark.parametrize("settings", SETTINGS)
-@pytest.mark.parametrize("name", ["filtering", *COARSE_TO_FINE])
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    first_always(
+        [
+            *(("filtering", settings) for settings in SETTINGS),
+            ("regression", "one iteration"),
+            ("regression", "partial"),
+            ("registration", "partial"),
+            *((name, settings) for name in COARSE_TO_FINE for settings in ("three iterations", "stops")),
+            ("registration", "one iteration"),
+        ],
+        always=7,
+        names=2,
+    ),
+)
 def test_both_namespaces_refine_alike_with_all_settings(pair, name, settings, dtype):
     check_that_both_agree(pair, dtype, refiner=REFINERS[name], **SETTINGS[settings])
 
@@ -245,7 +258,7 @@ def test_the_number_of_threads_does_not_change_the_map(pair, name, monkeypatch):
     np.testing.assert_array_equal(*maps)
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_the_number_of_threads_does_not_change_a_match(monkeypatch):
     maps = []
     for threads in (1, 2):

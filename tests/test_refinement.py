@@ -1,5 +1,6 @@
 """The refinement loop has the expected invariances, reports failures, and compiles once for each size."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -37,7 +38,7 @@ def permuted(spectrum: Spectrum, order: np.ndarray) -> Spectrum:
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def pair():
     """A spectrum, a disturbed and shuffled copy, a map with a third of its matches wrong, and the true map."""
     generator = np.random.default_rng(0)
@@ -81,28 +82,44 @@ def test_recovers_a_disturbed_copy(pair, refine):
     assert np.mean(np.asarray(refined.pointwise_map) == truth) > 0.95
 
 
+@pytest.fixture(scope="module")
+def plain_loop(pair):
+    """A function that runs three iterations of a refiner step by step, once for each refiner."""
+    x, y, initial_map, _ = pair
+
+    @functools.cache
+    def run(name):
+        refiner = REFINERS[name]
+        problem = refiner.problem(x, y)
+        t, c = initial_map, None
+        for _ in range(3):
+            if isinstance(refiner.solution, Filtering):
+                kernel = multiscale_kernel(*problem.responses)
+                options = {
+                    "convention": refiner.convention,
+                    "pseudo_inverse": refiner.solution.pseudo_inverse,
+                }
+                c = kernel * encode(t, x, y, **options)
+            elif isinstance(refiner.solution, LeastSquares):
+                c = problem.energy(t, norm=refiner.solution.norm).minimizer()
+            else:
+                c, _ = refiner.solution.solve(problem, None, t, c)
+            t = decode(c, x, y, convention=refiner.convention)
+        return t, c
+
+    return run
+
+
 @pytest.mark.parametrize(
     "name",
     first_always(
         sorted(REFINERS, key=lambda name: name not in ("default", "exact", "regularized")), always=3
     ),
 )
-def test_refine_equals_a_plain_loop(pair, name, refine):
+def test_refine_equals_a_plain_loop(pair, plain_loop, name, refine):
     x, y, initial_map, _ = pair
-    refiner = REFINERS[name]
-    problem = refiner.problem(x, y)
-    t, c = initial_map, None
-    for _ in range(3):
-        if isinstance(refiner.solution, Filtering):
-            kernel = multiscale_kernel(*problem.responses)
-            options = {"convention": refiner.convention, "pseudo_inverse": refiner.solution.pseudo_inverse}
-            c = kernel * encode(t, x, y, **options)
-        elif isinstance(refiner.solution, LeastSquares):
-            c = problem.energy(t, norm=refiner.solution.norm).minimizer()
-        else:
-            c, _ = refiner.solution.solve(problem, None, t, c)
-        t = decode(c, x, y, convention=refiner.convention)
-    refined = refine(x, y, initial_map, refiner=refiner)
+    t, c = plain_loop(name)
+    refined = refine(x, y, initial_map, refiner=REFINERS[name])
     assert refined.result == RESULTS.successful
     np.testing.assert_array_equal(refined.pointwise_map, t)
     np.testing.assert_allclose(refined.functional_map, c, atol=1e-12)

@@ -245,9 +245,12 @@ def test_both_maps_of_a_state_are_recovered_together(pair, refiner, sampled, nam
     samples = to_namespace(samples, namespace)
     prepared = refiner.prepare(Problem(x, y, samples))
     start = initial_map[samples[0]] if sampled else initial_map
-    state, _ = refiner.update(prepared, start, None)
-    state, _ = refiner.update(prepared, *refiner.recover_both(prepared, state))
-    found, completed = refiner.recover_both(prepared, state)
+    update, recover_both = refiner.update, refiner.recover_both
+    if namespace == "jax":
+        update, recover_both = eqx.filter_jit(update), eqx.filter_jit(recover_both)
+    state, _ = update(prepared, start, None)
+    state, _ = update(prepared, *recover_both(prepared, state))
+    found, completed = recover_both(prepared, state)
     np.testing.assert_array_equal(found, refiner.recover(prepared, state))
     assert state.reverse_map is None
     if isinstance(refiner, Registration):

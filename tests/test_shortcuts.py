@@ -5,6 +5,7 @@ from dataclasses import replace
 import igl
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
@@ -38,9 +39,7 @@ def bent_tube(gap: float, *, spacing: float = 0.08, thickness: float = 0.3) -> M
     line = np.stack([np.cos(along), np.sin(along), 0.2 * np.sin(3 * along)], axis=1)
     extent = np.arange(-1.6, 1.6, spacing)
     grid = np.stack(np.meshgrid(extent, extent, extent, indexing="ij"), axis=-1).reshape(-1, 3)[:, ::-1]
-    distance = np.full(len(grid), np.inf)
-    for point in line:
-        np.minimum(distance, np.linalg.norm(grid - point, axis=1), out=distance)
+    distance = KDTree(line).query(grid)[0]
     size = len(extent)
     vertices, faces = igl.marching_cubes(distance - thickness, np.ascontiguousarray(grid), size, size, size)[
         :2
@@ -65,12 +64,16 @@ def separate():
     return bent_tube(0.75)
 
 
+@pytest.fixture(scope="module")
+def cut(fused):
+    return cut_shortcuts(fused)
+
+
 def lost_faces(mesh: Mesh, cut: Mesh) -> np.ndarray:
     return mesh.faces[np.isin(mesh.face_numbers, cut.dropped_faces)]
 
 
-def test_the_contact_is_cut(fused, separate):
-    cut = cut_shortcuts(fused)
+def test_the_contact_is_cut(fused, separate, cut):
     assert handles(fused) == 1
     assert handles(separate) == handles(cut) == 0
     assert np.array_equal(cut.vertices, fused.vertices)
@@ -82,23 +85,25 @@ def test_the_contact_is_cut(fused, separate):
     assert distance.max() < 0.4
 
 
-def test_distances_across_the_contact_become_long(fused, separate):
+def test_distances_across_the_contact_become_long(fused, separate, cut):
     def between_ends(mesh: Mesh) -> float:
         ends = [np.argmin(np.linalg.norm(mesh.vertices - [0.7, y, 0], axis=1)) for y in (0.7, -0.7)]
         return float(geodesic_distances(mesh, ends[:1])[0, ends[1]])
 
     assert between_ends(fused) < 2
-    assert between_ends(cut_shortcuts(fused)) == pytest.approx(between_ends(separate), rel=0.05)
+    assert between_ends(cut) == pytest.approx(between_ends(separate), rel=0.05)
     assert between_ends(separate) > 3
 
 
 @pytest.mark.parametrize("scale", [1e-45, 1e-3, 1e4, 1e45])
-def test_cuts_do_not_depend_on_the_position(fused, scale):
+def test_cuts_do_not_depend_on_the_position(fused, cut, scale):
     turn = Rotation.random(random_state=1).as_matrix()
     moved = replace(fused, vertices=scale * fused.vertices @ turn.T + scale)
-    expected = cut_shortcuts(fused).dropped_faces
-    assert np.array_equal(cut_shortcuts(moved).dropped_faces, expected)
-    assert np.array_equal(cut_shortcuts(fused.mirrored()).dropped_faces, expected)
+    assert np.array_equal(cut_shortcuts(moved).dropped_faces, cut.dropped_faces)
+
+
+def test_mirror_images_have_the_same_cuts(fused, cut):
+    assert np.array_equal(cut_shortcuts(fused.mirrored()).dropped_faces, cut.dropped_faces)
 
 
 def test_inside_out_surfaces_are_cut(fused):
@@ -106,12 +111,12 @@ def test_inside_out_surfaces_are_cut(fused):
     assert handles(cut_shortcuts(inside_out)) == 0
 
 
-def test_the_order_of_vertices_and_faces_does_not_matter(fused):
+def test_the_order_of_vertices_and_faces_does_not_matter(fused, cut):
     random = np.random.default_rng(0)
     order, faces = random.permutation(len(fused.vertices)), random.permutation(len(fused.faces))
     permuted = make_mesh(fused.vertices[order], np.argsort(order)[fused.faces[faces]])
     lost = np.sort(faces[cut_shortcuts(permuted).dropped_faces])
-    assert np.array_equal(lost, cut_shortcuts(fused).dropped_faces)
+    assert np.array_equal(lost, cut.dropped_faces)
 
 
 def test_dropped_faces_of_the_file_stay_dropped(fused):
@@ -149,8 +154,9 @@ def test_porous_surfaces_stay_unchanged(fused, monkeypatch):
     several, many = copies(12), copies(31)
     # Also with few base points, each component has a base point.
     monkeypatch.setattr("jaxsmw.geometry.shortcuts._REACHED", 1)
-    assert len(igl.boundary_loop_all(cut_shortcuts(several).faces)) == 2 * 12
-    assert diagnose(cut_shortcuts(several)).components == 12
+    cut = cut_shortcuts(several)
+    assert len(igl.boundary_loop_all(cut.faces)) == 2 * 12
+    assert diagnose(cut).components == 12
     assert cut_shortcuts(many) is many
 
 
@@ -163,13 +169,13 @@ def test_nonmanifold_surfaces_are_cut(fused):
     assert len(cut_shortcuts(mesh).faces) < len(mesh.faces)
 
 
-def test_components_without_loops_do_no_harm(fused):
+def test_components_without_loops_do_no_harm(fused, cut):
     """All edges of two folded triangles are in the tree of shortest paths."""
     n = len(fused.vertices)
     corners = np.array([[3, 0, 0], [4, 0, 0], [3.5, 1, 0], [3.5, 0.3, 1]])
     faces = np.concatenate([fused.faces, n + np.array([[0, 1, 2], [1, 0, 3]])])
     mesh = make_mesh(np.concatenate([fused.vertices, corners]), faces)
-    assert np.array_equal(cut_shortcuts(mesh).dropped_faces, cut_shortcuts(fused).dropped_faces)
+    assert np.array_equal(cut_shortcuts(mesh).dropped_faces, cut.dropped_faces)
 
 
 SHORT = Stage(FeatureRegression((10, 15, 20)), number_of_descriptors=20)
@@ -240,9 +246,8 @@ def test_pairs_of_a_collection_are_cut(fused, separate):
     assert np.allclose(found.spectrum_x.eigenvalues, direct.spectrum_x.eigenvalues, rtol=1e-4)
 
 
-def test_points_on_a_cut_surface_keep_their_positions(fused):
+def test_points_on_a_cut_surface_keep_their_positions(fused, cut):
     random = np.random.default_rng(0)
-    cut = cut_shortcuts(fused)
     points = SurfacePoints(random.permutation(len(cut.faces)), random.dirichlet(np.ones(3), len(cut.faces)))
     on_fused = points_on_uncut(points, cut, fused)
     assert np.array_equal(fused.faces[on_fused.faces], cut.faces[points.faces])

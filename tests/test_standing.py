@@ -71,7 +71,7 @@ def test_up_is_guessed_in_every_convention(kind: str) -> None:
 
 
 def test_up_does_not_depend_on_vertex_numbers_units_or_unreferenced_vertices() -> None:
-    body = in_convention(creature_pair("quadruped", vertices=1500).source, "-y")
+    body = in_convention(creature_pair("quadruped", vertices=800).source, "-y")
     stray = np.concatenate([body.vertices, [[50.0, -9, 7]]])
     for same in (
         renumbered(body)[0],
