@@ -75,21 +75,21 @@ hypothesis.settings.load_profile("default")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option that chooses a tenth of the tests with the marker `sampled`."""
+    """Add the option that chooses a twentieth of the tests with the marker `sampled`."""
     parser.addoption(
         "--sample",
         metavar="COMMIT",
-        help="run only a tenth of the tests marked `sampled`, which a hash chooses",
+        help="run only a twentieth of the tests marked `sampled`, which a hash chooses",
     )
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep every tenth test with the marker `sampled`, from a start that the option `--sample` chooses."""
+    """Keep every twentieth test with the marker `sampled`, from a start that the option `--sample` chooses."""
     commit = config.getoption("sample")
     if commit is None:
         return
     sampled = [item for item in items if item.get_closest_marker("sampled")]
-    left_out = [item for i, item in enumerate(sampled) if (i + zlib.crc32(commit.encode())) % 10]
+    left_out = [item for i, item in enumerate(sampled) if (i + zlib.crc32(commit.encode())) % 20]
     remaining = set(map(id, items)) - set(map(id, left_out))
     items[:] = [item for item in items if id(item) in remaining]
     config.hook.pytest_deselected(items=left_out)

@@ -1,4 +1,4 @@
-"""Parametrizations of which CI always runs the first cases, and another tenth of all other cases for each commit."""
+"""Parametrizations of which CI always runs the first cases, and another twentieth of all other cases for each commit."""
 
 from collections.abc import Iterable
 from typing import Any

@@ -14,7 +14,7 @@ def checked(function: Callable[..., Any]) -> Callable[..., Any]:
 
     jaxtyping passes functions of which only the signature matters: they do nothing, or return an argument. For a
     function inside another function, jaxtyping passes them again whenever the outer function runs. Without this
-    cache, `beartype` would compile the same checks each time, which takes 6 % of the test time.
+    cache, `beartype` would compile the same checks each time.
     """
     key = (function.__module__, function.__qualname__, str(inspect.signature(function)))
     if key not in _checks:
