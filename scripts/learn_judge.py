@@ -40,7 +40,7 @@ from jaxsmw.runtime.threads import one_blas_thread
 # The penalty of large weights, which keeps them finite.
 PENALTY = 0.1
 # The weights from which the fit begins, with the intercept first.
-FIRST = np.array([-1.5, -2.0, -1.0, 0.5, -3.0, -3.0])
+FIRST = np.array([-6.0, -3.0, 0.5, -3.0, -3.0, 1.0])
 
 
 class JudgedPair(NamedTuple):
@@ -75,9 +75,10 @@ def judged_pair(known: KnownPair) -> JudgedPair:
 
 def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
     """Return what the log-odds depend on linearly, in the order of `Evidence`, with the intercept first."""
-    deformation, *others, discontinuity, uncovered = evidence.T
-    columns = np.log(deformation + 0.01), *others, np.sqrt(discontinuity), np.sqrt(uncovered)
-    return np.stack((np.ones(len(evidence)), *columns), axis=1)
+    deformation, in_place, discontinuity, uncovered, agreement = evidence.T
+    torn, missing = np.sqrt(discontinuity), np.sqrt(uncovered)
+    columns = np.ones(len(evidence)), np.log(deformation + 0.01), in_place, torn, missing, agreement
+    return np.stack(columns, axis=1)
 
 
 def shares_of(pair: JudgedPair, weights: Float[np.ndarray, " f"]) -> Float[np.ndarray, " c"]:

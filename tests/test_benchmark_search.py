@@ -33,7 +33,7 @@ def test_tables_count_right_silent_and_flagged_maps():
 
 def test_the_judge_is_fitted_to_the_evidence_of_other_kinds():
     """The map of a pair is the more probable one, which is the less deformed one."""
-    evidence = np.array([[0.01, 0.1, 1, 0.01, 0.0], [1, 0.9, 0, 0.5, 0.3]])
+    evidence = np.array([[0.01, 1, 0.01, 0.0, 1.0], [1, 0, 0.5, 0.3, 0.1]])
     pair, wrong = np.array([[0.01, 0], [0.3, 0.5]]), np.array([[0.2, 0.3], [0.3, 0.5]])
     pairs = [JudgedPair(kind, evidence, pair) for kind in ("people", "people", "teeth", "jaws")]
     weights, counts, reliability = learn_judge.tables([*pairs, JudgedPair("jaws", evidence, wrong)])

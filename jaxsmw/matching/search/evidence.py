@@ -13,8 +13,8 @@ from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _DISSIMILARITY, _IN_PLACE = -3.7, -3.6, -2.3, 1.3
-_DISCONTINUITY, _UNCOVERED = -4.2, -2.8
+_INTERCEPT, _DEFORMATION, _IN_PLACE, _DISCONTINUITY = -6.4, -3.4, 1.3, -6.3
+_UNCOVERED, _AGREEMENT = -3.4, 1.3
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
@@ -35,46 +35,48 @@ class Evidence(NamedTuple):
     """What shows whether a map is right, measured on the samples.
 
     A map that is right has a right reverse map, in which each sample of Y has the sample of X whose match is
-    nearest. Deformation and discontinuity are means over the map and its reverse map.
+    nearest. Deformation and discontinuity are means over the map and its reverse map. If one shape is a part
+    of the other, they are those of the map.
 
     **Attributes:**
 
     - `deformation`: how far the map is from a rigid motion around each sample, from 0 to 1; see
       `deformation`.
-    - `dissimilarity`: the mean squared difference between the SHOT descriptors of samples and of their
-      matches, divided by its mean for random matches. It is 0 for congruent shapes.
     - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
     - `discontinuity`: the share of neighbouring samples whose matches are far apart; see `discontinuity`.
-    - `uncovered`: the share of Y's area, from 0 to 1, that is far from all matches.
+    - `uncovered`: the share of Y's area, from 0 to 1, that is far from all matches, less the share that has
+      no counterpart on a partial X.
+    - `agreement`: the share of X's area, from 0 to 1, on which the map agrees with the map of the first
+      start. It is 0 for maps of the other hand.
     """
 
     deformation: float
-    dissimilarity: float
     in_place: bool
     discontinuity: float
     uncovered: float
+    agreement: float
 
     @classmethod
     def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
         """Measure a map of samples (s,)."""
-        x, y = reading.x, reading.y
+        x, y, pair = reading.x, reading.y, reading.prepared.pair
+        share_x, share_y = (min(pair.areas) / area if pair.partial else 1.0 for area in pair.areas)
+        of_x = deformation(x, y, matches)
+        areas_x = _overlapping_areas(x, of_x, share_x)
+        deformed, torn = [areas_x @ of_x], [discontinuity(x, y, matches, areas_x)]
         to_matches = y.distances[:, matches]
-        ways = (x, y, matches), (y, x, to_matches.argmin(axis=1))
-        deformations = [deformation(*way) for way in ways]
-        areas_x, areas_y = _overlapping_areas(reading, *deformations)
-        of_x, of_y = (spectrum.descriptors for spectrum in reading.spectra.both)
-        dissimilarity = 1.0  # as for random matches
-        if of_x is not None and of_y is not None:
-            # The descriptors are principal components of variance 1.
-            differences = ((np.asarray(of_x) - np.asarray(of_y)[matches]) ** 2).mean(axis=1) / 2
-            dissimilarity = float(areas_x @ differences)
+        if not pair.partial:  # a part and its whole have no reverse map
+            reverse = to_matches.argmin(axis=1)
+            deformed.append(y.areas @ deformation(y, x, reverse))
+            torn.append(discontinuity(y, x, reverse, y.areas))
+        uncovered = float(y.areas @ (to_matches.min(axis=1) > _COVERED))
         offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         return cls(
-            deformation=float(areas_x @ deformations[0] + areas_y @ deformations[1]) / 2,
-            dissimilarity=dissimilarity,
+            deformation=float(np.mean(deformed)),
             in_place=bool(areas_x @ offsets < _NEAR * y.unit) and not x.mirrored,
-            discontinuity=sum(discontinuity(*way) for way in ways) / 2,
-            uncovered=float(areas_y @ (to_matches.min(axis=1) > _COVERED)),
+            discontinuity=float(np.mean(torn)),
+            uncovered=max(0.0, uncovered - (1 - share_y)),
+            agreement=reading.agreement(matches),
         )
 
     @property
@@ -83,14 +85,14 @@ class Evidence(NamedTuple):
         return float(
             _INTERCEPT
             + _DEFORMATION * np.log(self.deformation + _LEAST)
-            + _DISSIMILARITY * self.dissimilarity
             + _IN_PLACE * self.in_place
             + _DISCONTINUITY * np.sqrt(self.discontinuity)
             + _UNCOVERED * np.sqrt(self.uncovered)
+            + _AGREEMENT * self.agreement
         )
 
 
-NO_EVIDENCE = Evidence(np.inf, np.inf, in_place=False, discontinuity=1.0, uncovered=1.0)
+NO_EVIDENCE = Evidence(np.inf, in_place=False, discontinuity=1.0, uncovered=1.0, agreement=0.0)
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 
@@ -109,34 +111,29 @@ def probabilities(log_odds: Sequence[float]) -> Float[np.ndarray, " c"]:
 
 
 def _overlapping_areas(
-    reading: Reading, of_x: Float[np.ndarray, " s"], of_y: Float[np.ndarray, " t"]
-) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " t"]]:
-    """Return the areas of the samples of X and of Y that count, each with the sum 1.
+    side: Proxy, deformations: Float[np.ndarray, " s"], share: float
+) -> Float[np.ndarray, " s"]:
+    """Return the areas of the samples of a shape that count, with the sum 1.
 
-    If one shape is a part of the other, only the least deformed patches of the larger shape count, with the
-    area of the smaller shape in total.
+    If the other shape is a part of this one, only the least deformed patches count, on a share of the area.
     """
-    pair = reading.prepared.pair
-    areas = []
-    for side, deformations, area in zip((reading.x, reading.y), (of_x, of_y), pair.areas, strict=True):
-        share = min(pair.areas) / area if pair.partial else 1.0
-        order = np.argsort(deformations, kind="stable")
-        before = np.cumsum(side.areas[order]) - side.areas[order]
-        counted = np.zeros(len(side.areas))
-        counted[order] = np.where(before < share, side.areas[order], 0)
-        areas.append(counted / counted.sum())
-    return areas[0], areas[1]
+    order = np.argsort(deformations, kind="stable")
+    before = np.cumsum(side.areas[order]) - side.areas[order]
+    counted = np.zeros(len(side.areas))
+    counted[order] = np.where(before < share, side.areas[order], 0)
+    return counted / counted.sum()
 
 
-def discontinuity(source: Proxy, target: Proxy, matches: SampleMap) -> float:
+def discontinuity(source: Proxy, target: Proxy, matches: SampleMap, areas: Float[np.ndarray, " s"]) -> float:
     """Measure how much a map tears neighbouring samples apart, as where exchanged limbs begin.
 
     **Returns:** The share of the neighbouring pairs of source samples whose matches are far apart along the
-    surface of the target, from 0 to 1. A pair counts by the product of the areas of its samples.
+    surface of the target, from 0 to 1. A pair counts by the product of the `areas` of its samples (s,).
     """
-    pairs, weights = source.neighbours
-    first, second = matches[pairs]
-    return float(weights @ (target.distances[first, second] > _FAR))
+    first, second = source.neighbours
+    weights = areas[first] * areas[second]
+    torn = target.distances[matches[first], matches[second]] > _FAR
+    return float(weights @ torn / max(weights.sum(), np.finfo(float).tiny))
 
 
 def deformation(source: Proxy, target: Proxy, matches: SampleMap) -> Float[np.ndarray, " s"]:

@@ -124,11 +124,6 @@ class Proxy:
         return weights / weights.sum(axis=1, keepdims=True)
 
     @functools.cached_property
-    def neighbours(self) -> tuple[Int64[np.ndarray, "2 p"], Float[np.ndarray, " p"]]:
-        """The pairs of neighbouring samples, and their weights, which have the sum 1.
-
-        The weight of a pair is proportional to the product of the areas of its samples.
-        """
-        pairs = np.array(np.nonzero(np.triu(self.distances < _NEIGHBOURS, 1)))
-        weights = self.areas[pairs].prod(axis=0)
-        return pairs, weights / max(weights.sum(), np.finfo(float).tiny)
+    def neighbours(self) -> Int64[np.ndarray, "2 p"]:
+        """The pairs of neighbouring samples, one in each column."""
+        return np.array(np.nonzero(np.triu(self.distances < _NEIGHBOURS, 1)))

@@ -31,12 +31,12 @@ _STAGES = (
 # The number of the best maps that are mended in each round, and the number of rounds.
 _MENDED, _ROUNDS = 4, 2
 # Two maps are different if they differ on at least this share of the area.
-DIFFERENT_AREA = 0.05
+DIFFERENT_AREA = 0.02
 # Faults on less than the first share or more than the second share of the area are not mended. From the third
 # share of reversed area on, a map is tried for the other hand.
 _SMALL, _LARGE, _MOSTLY = 0.002, 0.5, 0.4
 # The evidence of opposite hands for two shapes that are nearly their own mirror images.
-SAME_HAND = -1.5
+SAME_HAND = -2.5
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,11 +31,13 @@ class Reading:
 
     - `prepared`: the `PreparedPair`. Its attributes `mirrored` and `pair.partial` tell how the pair is read.
     - `x`, `y`: the proxies of X (s samples) and of Y (t samples), in `Pair.units_of_length`.
+    - `first`: the map of the first start on the samples (s,). None if there is no such map.
     """
 
     prepared: PreparedPair
     x: Proxy
     y: Proxy
+    first: SampleMap | None = None
 
     @classmethod
     def of(cls, prepared: PreparedPair) -> Reading:
@@ -47,11 +49,16 @@ class Reading:
             made.distances  # noqa: B018 (both shapes side by side)
             return made
 
-        return cls(prepared, *side_by_side(proxy, *enumerate(prepared.pair.units_of_length)))
+        x, y = side_by_side(proxy, *enumerate(prepared.pair.units_of_length))
+        return cls(prepared, x, y)
 
     def mirror(self) -> Reading:
         """Return the reading in which X has the other hand."""
-        return Reading(self.prepared.mirror(), self.x.mirror(), self.y)
+        return Reading(self.prepared.mirror(), self.x.mirror(), self.y, self.first)
+
+    def with_first(self, pointwise_map: Int64[np.ndarray, " m"]) -> Reading:
+        """Return the reading for which a map X -> Y (m,) is the map of the first start."""
+        return replace(self, first=self.reduced(pointwise_map))
 
     def is_asymmetric(self) -> bool:
         """Return whether both shapes differ from their own mirror images, as teeth do, but people do not.
@@ -113,6 +120,15 @@ class Reading:
     def difference(self, first: SampleMap, second: SampleMap) -> float:
         """Return the share of X's area, from 0 to 1, on which two maps of samples differ."""
         return float(self.x.areas @ (self.y.distances[first, second] > _DIFFERENT))
+
+    def agreement(self, matches: SampleMap) -> float:
+        """Return the share of X's area, from 0 to 1, on which a map of samples agrees with the first map.
+
+        The first map is that of the other hand if X is mirrored. The two maps are then not compared.
+        """
+        if self.first is None or self.x.mirrored:
+            return 0.0
+        return 1 - self.difference(self.first, matches)
 
 
 # The radii of SHOT, in units of 0.06, and the least mean asymmetry of asymmetric shapes. (Entry R23)

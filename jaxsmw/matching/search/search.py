@@ -83,8 +83,9 @@ def search(
 
     **Returns:** Maps that differ from each other, the most probable first.
     """
-    reading = Reading.of(prepared)
-    first = Judged.of(reading, outcome or run(preset.before_final, prepared.spectra, start))
+    outcome = outcome or run(preset.before_final, prepared.spectra, start)
+    reading = Reading.of(prepared).with_first(outcome.pointwise_map)
+    first = Judged.of(reading, outcome)
     settings = preset.search
     if settings is None:
         return [first]
@@ -95,7 +96,7 @@ def search(
     certain = _ends_the_search(first, settings) and not both_hands
     readings = [reading]
     if hypotheses and not certain:
-        readings += _as_parts(reading)
+        readings += [part.with_first(first.pointwise_map) for part in _as_parts(reading)]
     if both_hands:
         readings = [hand for one in readings for hand in (one, one.mirror())]
     for number in range(_ROUNDS):
