@@ -606,6 +606,17 @@ def test_other_maps_are_written_beside_the_map(run, pair, tmp_path, monkeypatch,
         file = directory / f"{root}_alternative_{number}{suffix}"
         np.testing.assert_array_equal(read_pointwise_map(file, *meshes), other.pointwise_map)
 
+    # A later run removes the alternatives of earlier runs, but no other file, and no file that it reads.
+    first, second, similar = (f"{root}_alternative_{number}{suffix}" for number in ("1", "2", "01"))
+    (directory / similar).touch()
+    outcome = run(*call, "--output", directory / name, "--init", f"map:{directory / first}")
+    assert {path.name for path in directory.iterdir()} == {name, first, similar}
+    assert f"removed {directory / second}" in outcome.errors
+    others = ()
+    outcome = run(*call, "--output", directory / name, "--alternatives", 3)
+    assert {path.name for path in directory.iterdir()} == {name, similar}
+    assert "no other map was found" in outcome.errors
+
 
 def test_the_expected_error_is_written(run, pair, tmp_path):
     call = ["match", pair / "x.off", pair / "y.ply", "--output", tmp_path / "map.txt", *SMALL]
