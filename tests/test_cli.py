@@ -452,6 +452,10 @@ def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
         ("the robust Laplacian (laplacian='robust').", "the robust Laplacian (--laplacian robust)."),
         ('set mirror="no"; if', "set --mirror no; if"),
         ("scale=1.5.ply: pass index_base=1.", "scale=1.5.ply: pass --index-base 1."),
+        ("Set partial=True and scale=\"unknown\" to", "Set --partial and --scale unknown to"),
+        ("(see Correspondence.alternatives)", "(see match --alternatives 3)"),
+        ("that jaxsmw.report.summary.write_report writes", "that --report DIR writes"),
+        ("landmarks with init=landmarks.", "landmarks with --init landmarks:FILE."),
     ],
 )  # fmt: skip
 def test_messages_of_the_library_name_options(message, expected):
