@@ -371,8 +371,8 @@ def summarize(
     if correspondence.mirrored:
         facts["source mirrored"] = "yes"
     if correspondence.pair.partial:
-        scale = correspondence.pair.scale
-        facts["matched as partial shapes"] = f"yes, source lengths multiplied by {scale:.4g}"
+        facts["matched as partial shapes"] = "yes"
+        facts["source lengths multiplied by"] = f"{correspondence.pair.scale:.4g}"
     for name, error in errors.items():
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"
