@@ -452,6 +452,10 @@ def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
         ("the robust Laplacian (laplacian='robust').", "the robust Laplacian (--laplacian robust)."),
         ('set mirror="no"; if', "set --mirror no; if"),
         ("scale=1.5.ply: pass index_base=1.", "scale=1.5.ply: pass --index-base 1."),
+        ("Set partial=True and scale=\"unknown\" to", "Set --partial and --scale unknown to"),
+        ("(see Correspondence.alternatives)", "(see match --alternatives 3)"),
+        ("that jaxsmw.report.summary.write_report writes", "that --report DIR writes"),
+        ("landmarks with init=landmarks.", "landmarks with --init landmarks:FILE."),
     ],
 )  # fmt: skip
 def test_messages_of_the_library_name_options(message, expected):
@@ -605,6 +609,17 @@ def test_other_maps_are_written_beside_the_map(run, pair, tmp_path, monkeypatch,
     for number, other in enumerate(others, 1):
         file = directory / f"{root}_alternative_{number}{suffix}"
         np.testing.assert_array_equal(read_pointwise_map(file, *meshes), other.pointwise_map)
+
+    # A later run removes the alternatives of earlier runs, but no other file, and no file that it reads.
+    first, second, similar = (f"{root}_alternative_{number}{suffix}" for number in ("1", "2", "01"))
+    (directory / similar).touch()
+    outcome = run(*call, "--output", directory / name, "--init", f"map:{directory / first}")
+    assert {path.name for path in directory.iterdir()} == {name, first, similar}
+    assert f"removed {directory / second}" in outcome.errors
+    others = ()
+    outcome = run(*call, "--output", directory / name, "--alternatives", 3)
+    assert {path.name for path in directory.iterdir()} == {name, similar}
+    assert "no other map was found" in outcome.errors
 
 
 def test_the_expected_error_is_written(run, pair, tmp_path):

@@ -81,8 +81,8 @@ def _check_results(
 ) -> None:
     """Check that the summary and the page state the results of the match."""
     assert list(summary) == [
-        "settings", "result", "backend", "distortion", "suspicious", "wrong_probability", "alternatives",
-        "errors", "seconds", "provenance",
+        "settings", "result", "backend", "partial", "scale", "distortion", "suspicious", "wrong_probability",
+        "alternatives", "errors", "seconds", "provenance",
     ]  # fmt: skip
     assert summary["settings"] == {"seed": 3}
     assert summary["distortion"] == pytest.approx(1, abs=1e-3) and summary["suspicious"] is False
@@ -101,6 +101,10 @@ def _check_results(
     assert facts["probability of a wrong map"] == percentage(summary["wrong_probability"])
     assert facts["time, total"] == f"{sum(found.seconds.values()):.2f} s"
     judged = summarize(replace(found, distortion=1.3, probability=0.8), {})
+    assert (summary["partial"], summary["scale"]) == (False, 1.0)
+    part = replace(found.pair, partial=True, scale=2.0)
+    told = {"matched as partial shapes": "yes", "source lengths multiplied by": "2"}
+    assert not told.keys() & facts.keys() and told.items() <= summarize(replace(found, pair=part), {}).items()
     assert judged["probability of a wrong map"] == "20 %" and judged["distortion (1 is none)"] == "1.30"
     # The page shows the refined and the initial map in the convention of the refiner.
     refined, initial = embedded(page)["maps"]
@@ -122,8 +126,8 @@ def test_the_report_shows_other_maps_that_could_be_right(found: Correspondence, 
     assert [one["name"] for one in shown] == [
         "refined",
         "initial",
-        "other 1: turned by 180° (30 %)",
-        "other 2: mirrored (below 1 %)",
+        "other 1: turned by 180° (probability 30 %)",
+        "other 2: mirrored (probability below 1 %)",
     ]
     # The second alternative is the initial map, and the first is neither map.
     assert shown[3]["map"] == shown[1]["map"] != shown[2]["map"]

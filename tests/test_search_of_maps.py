@@ -15,6 +15,7 @@ from jaxsmw import Mesh, creature_pair, make_mesh, match
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.geometry.shot import mirrored_descriptors, shot_descriptors
+from jaxsmw.matching.advice import advice
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
@@ -377,6 +378,15 @@ def test_a_wrong_map_is_reported_with_what_could_be_done(pair):
     ):
         found = match(mesh_x, mesh_y, preset="paper", init=upside_down(mesh_x, truth))
     assert found.suspicious and found.wrong_probability() == 1 - found.probability > 0.5
+
+
+def test_a_recognised_part_is_reported_with_all_settings_that_say_so(pair):
+    mesh_x, mesh_y, truth = pair
+    found = match(mesh_x, mesh_y, preset="paper", init=truth, mirror="no")
+    for scale, cure in ((1.0, "Set partial=True to say so"), (2.0, 'partial=True and scale="unknown" to')):
+        part = replace(found, pair=replace(found.pair, partial=True, scale=scale))
+        text, *_ = advice(part, partial=False)
+        assert cure in text and not list(advice(part, partial=True))
 
 
 @pytest.mark.filterwarnings("ignore:.*the map is wrong as a whole:UserWarning")

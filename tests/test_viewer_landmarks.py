@@ -836,7 +836,10 @@ def test_help_opens_and_closes(browser: Any, page_file: Path, width: int) -> Non
     assert box["x"] >= 0 and box["x"] + box["width"] <= width and box["height"] <= 740
     assert page.run("const d = arguments[0]; return d.scrollWidth - d.clientWidth", dialog) == 0
     text = dialog.text
-    for option in ("--partial", "--weld", "--init landmarks:SOURCE_FILE,TARGET_FILE", "--mirror", "unit"):
+    for option in (
+        "--alternatives 3", "--partial", "--scale unknown", "--weld", "--mirror", "unit",
+        "--init landmarks:SOURCE_FILE,TARGET_FILE",
+    ):  # fmt: skip
         assert option in text
     page.mouse().send_keys(Keys.ESCAPE).perform()
     assert not dialog.is_displayed()

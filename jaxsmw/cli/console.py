@@ -59,6 +59,13 @@ _ARGUMENT = re.compile(
     r"(?:True|([01])(?!\.?\w)|([\"'])(\w+)\3)"
 )
 
+# What a message names in words of Python, and the options that do the same.
+_NAMES = {
+    "Correspondence.alternatives": "match --alternatives 3",
+    "init=landmarks": "--init landmarks:FILE",
+    "jaxsmw.report.summary.write_report": "--report DIR",
+}
+
 # An argument for a number that an option without the first words sets.
 _SIZE = re.compile(r"\bnumber_of_(eigenvectors|samples)\b")
 
@@ -70,6 +77,8 @@ def with_options(message: str) -> str:
         value = argument[2] or argument[4]
         return f"--{argument[1].replace('_', '-')}" + (f" {value}" if value else "")
 
+    for name, words in _NAMES.items():
+        message = message.replace(name, words)
     return _SIZE.sub(r"--\1", _ARGUMENT.sub(option, message))
 
 

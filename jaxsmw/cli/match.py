@@ -143,7 +143,7 @@ def _check(options: argparse.Namespace) -> None:
         if file and Path(file).suffix.lower() in (".npy", ".mat"):
             raise InputError(f"{file}: {contents} written as text: choose another suffix, such as .txt.")
     alternatives = [_alternative_file(options.output, k + 1) for k in range(options.alternatives or 0)]
-    inputs = [options.source, options.target, *init_files, *(options.ground_truth or ())]
+    inputs = _inputs(options)
     check_inputs(*inputs)
     check_outputs(
         inputs,
@@ -156,6 +156,11 @@ def _check(options: argparse.Namespace) -> None:
     for file in filter(None, (options.output, options.one_to_one)):
         check_map_name(file)
     import jaxsmw.matching.match  # noqa: F401 (imported here because loading is timed separately)
+
+
+def _inputs(options: argparse.Namespace) -> list[str]:
+    """Return all files that the command reads."""
+    return [options.source, options.target, *options.init.files, *(options.ground_truth or ())]
 
 
 def _write_files(
@@ -173,6 +178,9 @@ def _write_files(
         with stopwatch.step("writing"):
             write_pointwise_map(file, other.pointwise_map)
         report_written(file)
+    _remove_earlier_alternatives(options, len(correspondence.alternatives[: options.alternatives or 0]))
+    if options.alternatives and not correspondence.alternatives:
+        report_progress("alternatives: no other map was found that could be right")
     if options.one_to_one:
         with stopwatch.step("one-to-one map", announced=True):
             maps["one-to-one"] = one_to_one = correspondence.one_to_one()
@@ -193,6 +201,16 @@ def _alternative_file(output: str, number: int) -> str:
     """Return the name of the file of an alternative map, beside the output."""
     root, suffix = os.path.splitext(output)
     return f"{root}_alternative_{number}{suffix}"
+
+
+def _remove_earlier_alternatives(options: argparse.Namespace, written: int) -> None:
+    """Remove alternatives that an earlier run wrote beside the same output, except inputs of this run."""
+    read = {os.path.realpath(file) for file in _inputs(options)}
+    for number in range(written + 1, _MOST_ALTERNATIVES + 1):
+        file = _alternative_file(options.output, number)
+        if os.path.isfile(file) and os.path.realpath(file) not in read:
+            os.remove(file)
+            report_progress(f"removed {file}, which an earlier run has written")
 
 
 def _write_points(options: argparse.Namespace, correspondence: Correspondence, points: SurfacePoints) -> None:

@@ -26,10 +26,13 @@ def _recognition(correspondence: Correspondence) -> str:
     """Say that one shape was matched as a part of the other."""
     pair = correspondence.pair
     (_, part), (_, whole) = sorted(zip(pair.areas, (mesh.name for mesh in pair.meshes), strict=True))
-    unit = "" if pair.scale == 1 else f" (lengths on the source are multiplied by {pair.scale:.3g})"
+    unit = cure = ""
+    if pair.scale != 1:
+        unit = f" (lengths on the source are multiplied by {pair.scale:.3g})"
+        cure = ' and scale="unknown"'
     return (
-        f"{part} looks like a part of {whole}: they were matched with partial=True{unit}. Set partial=True "
-        "to say so."
+        f"{part} looks like a part of {whole}: they were matched with partial=True{unit}. Set partial=True"
+        f"{cure} to say so."
     )
 
 
@@ -51,10 +54,10 @@ def _suspicion(correspondence: Correspondence) -> str:
     )
     if others:
         listed = "; ".join(f"{other.difference} ({percentage(other.probability)})" for other in others)
-        text += f" Other maps that could be right are in the attribute alternatives: {listed}."
-    cures = ["give a few landmarks as the initial map"]
+        text += f" Other maps could be right (see Correspondence.alternatives): {listed}."
+    cures = ["give a few landmarks as the initial map with init=landmarks"]
     if correspondence.origin == "landmarks":
-        cures = ["give more landmarks"]
+        cures = ["give more landmarks with init=landmarks"]
     if correspondence.preset.search is None:
         cures.insert(0, 'use preset="accurate", which searches for the right map')
     if pair.partial and pair.scale == 1:
@@ -62,6 +65,6 @@ def _suspicion(correspondence: Correspondence) -> str:
     if not pair.partial:
         cures.append("set partial=True if one mesh is a part of the other")
     return (
-        f"{text} Look at the map with the option --report or, in Python, with "
-        f"jaxsmw.report.summary.write_report. If it is wrong, {', or '.join(cures)}."
+        f"{text} Look at the map on the page that jaxsmw.report.summary.write_report writes. If it is "
+        f"wrong, {', or '.join(cures)}."
     )

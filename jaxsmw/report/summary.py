@@ -148,6 +148,8 @@ def write_report(
         "settings": dict(settings or {}),
         "result": summarize(correspondence, errors, steps),
         "backend": correspondence.backend,
+        "partial": correspondence.pair.partial,
+        "scale": correspondence.pair.scale,
         "distortion": correspondence.distortion,
         "suspicious": correspondence.suspicious,
         "wrong_probability": correspondence.wrong_probability(),
@@ -174,7 +176,7 @@ def _shown_maps(correspondence: Correspondence, errors: Mapping[str, GeodesicErr
     encoded = _encoded(initial_map, *spectra, convention)
     expected = {EXPECTED_ERROR: correspondence.expected_error()}
     others = {
-        f"other {number}: {other.difference} ({percentage(other.probability)})": _shown_map(
+        f"other {number}: {other.difference} (probability {percentage(other.probability)})": _shown_map(
             other.pointwise_map, _encoded(other.pointwise_map, *spectra, convention), None, convention
         )
         for number, other in enumerate(correspondence.alternatives, 1)
@@ -368,6 +370,9 @@ def summarize(
     }
     if correspondence.mirrored:
         facts["source mirrored"] = "yes"
+    if correspondence.pair.partial:
+        facts["matched as partial shapes"] = "yes"
+        facts["source lengths multiplied by"] = f"{correspondence.pair.scale:.4g}"
     for name, error in errors.items():
         facts[f"mean error, {name} map"] = f"{error.mean:.4f} √area"
         facts[f"error at most 0.05, {name} map"] = f"{error.within[0.05]:.1%}"

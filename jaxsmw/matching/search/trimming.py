@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Int64
 
+from jaxsmw.choices import Backend
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, connected_components, extend_to_unreferenced
@@ -139,7 +140,8 @@ def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage) -> Prepare
     """
     sizes = Sizes(stage.number_of_eigenvectors, number_of_samples=stage.number_of_samples or 0)
     laplacian, eigensolver = prepared.laplacian, prepared.eigensolver
-    shapes = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver)
+    backend: Backend = "numpy" if prepared.spectra.on_host else "jax"
+    shapes = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver, backend=backend)
     # The first trim changes the descriptors near the new boundary. Later trims hardly change them.
     kept = (
         replace(shape, spectrum=_with_columns_of(before.spectrum, shape.spectrum))
