@@ -13,8 +13,8 @@ from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _IN_PLACE, _DISCONTINUITY = -6.4, -3.4, 1.3, -6.3
-_UNCOVERED, _AGREEMENT = -3.4, 1.3
+_INTERCEPT, _DEFORMATION, _IN_PLACE, _DISCONTINUITY = -6.6, -3.5, 1.4, -6.7
+_UNCOVERED, _AGREEMENT = -3.1, 1.3
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
@@ -35,8 +35,9 @@ class Evidence(NamedTuple):
     """What shows whether a map is right, measured on the samples.
 
     A map that is right has a right reverse map, in which each sample of Y has the sample of X whose match is
-    nearest. Deformation and discontinuity are means over the map and its reverse map. If one shape is a part
-    of the other, they are those of the map.
+    nearest. The deformation is the mean over the map and its reverse map. The discontinuity is that of the
+    map that tears less: the right map tears a surface that is fused with itself, but its reverse map does
+    not. If one shape is a part of the other, both are those of the map.
 
     **Attributes:**
 
@@ -74,7 +75,7 @@ class Evidence(NamedTuple):
         return cls(
             deformation=float(np.mean(deformed)),
             in_place=bool(areas_x @ offsets < _NEAR * y.unit) and not x.mirrored,
-            discontinuity=float(np.mean(torn)),
+            discontinuity=min(torn),
             uncovered=max(0.0, uncovered - (1 - share_y)),
             agreement=reading.agreement(matches),
         )
