@@ -125,14 +125,13 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
-    init_files = options.init.files
     check_method(options)
     check_evaluation(options)
     searches = preset_name(options) == "accurate"
     refuse_without(options, "--preset accurate", searches, "alternatives")
     refuse_without(options, "--partial", options.partial, "scale", "overlap")
     refuse_without(options, "--report", bool(options.report), "up")
-    reads_indices = bool(options.ground_truth or init_files)
+    reads_indices = bool(options.ground_truth or options.init.files)
     refuse_without(options, "--ground-truth or a file of --init", reads_indices, "index_base")
     points, expected, overlap = options.surface_points, options.expected_error, options.overlap
     if points and Path(points).suffix != ".baryc_gt":
@@ -173,13 +172,14 @@ def _write_files(
     with stopwatch.step("writing"):
         write_pointwise_map(options.output, correspondence.pointwise_map)
     report_written(options.output)
-    for number, other in enumerate(correspondence.alternatives[: options.alternatives or 0], 1):
+    others = correspondence.alternatives[: options.alternatives or 0]
+    for number, other in enumerate(others, 1):
         file = _alternative_file(options.output, number)
         with stopwatch.step("writing"):
             write_pointwise_map(file, other.pointwise_map)
         report_written(file)
-    _remove_earlier_alternatives(options, len(correspondence.alternatives[: options.alternatives or 0]))
-    if options.alternatives and not correspondence.alternatives:
+    _remove_earlier_alternatives(options, len(others))
+    if options.alternatives and not others:
         report_progress("alternatives: no other map was found that could be right")
     if options.one_to_one:
         with stopwatch.step("one-to-one map", announced=True):
