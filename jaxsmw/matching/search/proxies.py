@@ -7,7 +7,7 @@ import functools
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial.distance import cdist
 
@@ -113,6 +113,13 @@ class Proxy:
             straight = cdist(self.positions, self.positions)
             distances = np.where(np.isfinite(distances), distances, straight)
         return distances
+
+    @functools.cached_property
+    def on_boundary(self) -> Bool[np.ndarray, " s"]:
+        """Whether a sample's region touches the boundary of the surface."""
+        on_boundary = np.zeros(len(self.mesh.vertices))
+        on_boundary[self.mesh.boundary_edges.ravel()] = 1
+        return np.bincount(self.samples.nearest, on_boundary, len(self.areas)) > 0
 
     @functools.cached_property
     def patches(self) -> Float[np.ndarray, "s s"]:
