@@ -180,9 +180,9 @@ def edge_lengths(
     return before, after
 
 
-# The largest detour of a vertex in the overlap, in `Pair.units_of_length`. (Entry R39 of
-# docs/research_log.md)
-_LARGEST_DETOUR = 0.04
+# A vertex with this detour, in `Pair.units_of_length`, is in the overlap with a probability of one half. The
+# odds fall with this power of the detour. (Entry R39 of docs/research_log.md)
+_EVEN_DETOUR, _POWER = 0.04, 1.5
 
 
 def detours(
@@ -197,19 +197,19 @@ def detours(
     return np.linalg.norm(offsets, axis=1) / pair.units_of_length[0]
 
 
-def overlap(
+def overlap_probability(
     pair: Pair, pointwise_map: Int64[np.ndarray, " m"], reverse_map: Int64[np.ndarray, " n"]
-) -> Bool[np.ndarray, " m"]:
-    """Predict which vertices of X have a counterpart on Y.
+) -> Float[np.ndarray, " m"]:
+    """Predict how probably each vertex of X has a counterpart on Y.
 
-    A vertex without a counterpart still has a match, for example at the boundary of Y. The reverse map does
-    not lead from this match back to the vertex. A vertex is therefore in the overlap if its detour is small.
-    The prediction is wrong where a part of X without a counterpart is matched to a part of Y without a
-    counterpart.
+    Each vertex receives a match, even if the other shape lacks its true point. The match is then, for
+    example, at the boundary of Y, and the reverse map does not lead from there back to the vertex. A vertex
+    with a small detour is therefore probably in the overlap. The prediction is wrong where a part of X
+    without a counterpart is matched to a part of Y without a counterpart.
 
-    **Returns:** A mask (m,), True for the vertices in the overlap.
+    **Returns:** The probabilities (m,), from 0 to 1.
     """
-    return detours(pair, pointwise_map, reverse_map) <= _LARGEST_DETOUR
+    return 1 / (1 + (detours(pair, pointwise_map, reverse_map) / _EVEN_DETOUR) ** _POWER)
 
 
 def expected_error(

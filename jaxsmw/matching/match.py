@@ -22,8 +22,8 @@ from jaxsmw.choices import (
     Mirror,
     Scale,
 )
-from jaxsmw.errors import check_choice
-from jaxsmw.geometry.mesh import Mesh, MeshLike
+from jaxsmw.errors import InputError, check_choice
+from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.advice import advice
 from jaxsmw.matching.correspondence import Correspondence
@@ -36,6 +36,7 @@ from jaxsmw.matching.search.search import search
 from jaxsmw.matching.search.trimming import match_trimmed
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
 from jaxsmw.matching.starts import check_initial_map, make_start
+from jaxsmw.matching.template import join
 from jaxsmw.runtime.memory import release_freed_memory
 from jaxsmw.runtime.progress import Step, no_step, timed
 from jaxsmw.runtime.threads import one_blas_thread
@@ -51,6 +52,7 @@ def match(
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
     scale: float | Scale = 1.0,
+    template: Mesh | MeshLike | None = None,
     mirror: Mirror = DEFAULT_MIRROR,
     history: bool = False,
     backend: Backend = DEFAULT_BACKEND,
@@ -92,6 +94,10 @@ def match(
       default is False, for two full shapes. `Correspondence.overlap` predicts which vertices have a
       counterpart on the other mesh.
     - `scale`: see `Pair.make`. Full shapes are always scaled to the same area.
+    - `template`: a full shape of the same kind of body, in the unit of length of Y, for two partial shapes
+      that share only a region. Both are matched to the template as its parts, and through it to each other;
+      see `jaxsmw.matching.template`. The default is None, to match X to Y directly. A template makes
+      `partial` True.
     - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. If they are, the
       mirror image of X is matched instead of X. Whether X is mirrored or not, entry i of the map is the match
       of vertex i of X.
@@ -118,6 +124,39 @@ def match(
     """
     check_choice(mirror, Mirror, "a mirror setting")
     check_choice(backend, Backend, "a backend")
+    if template is not None:
+        if not isinstance(init, str):
+            raise InputError(
+                "an initial map from X to Y cannot be used with a template: leave out the one or the other."
+            )
+        to_template = functools.partial(
+            match,
+            mesh_y=as_mesh(template, "template"),
+            preset=preset,
+            init=init,
+            laplacian=laplacian,
+            eigensolver=eigensolver,
+            partial=True,
+            mirror=mirror,
+            backend=backend,
+        )
+        x, y = as_mesh(mesh_x, "source mesh"), as_mesh(mesh_y, "target mesh")
+        seconds: dict[str, float] = {}
+        with timed("source to template", seconds):
+            x_to_template = to_template(x, scale=scale)
+        with timed("target to template", seconds):
+            y_to_template = to_template(y, scale="unknown" if isinstance(scale, str) else 1.0)
+        method = choose_preset(preset)
+        with timed("source to target", seconds), one_blas_thread():
+            joined = join(
+                x_to_template,
+                y_to_template,
+                method.with_history() if history else method,
+                laplacian=laplacian,
+                eigensolver=eigensolver,
+                backend=backend,
+            )
+        return replace(joined, seconds=seconds)
     pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
     adapts = isinstance(preset, str | Preset)
     method = choose_preset(preset)
@@ -131,7 +170,7 @@ def match(
     automatic = isinstance(init, str) and init == "auto"
     first_init = check_initial_map(pair, DEFAULT_INITIAL_MAP if automatic else init)
 
-    seconds: dict[str, float] = {}
+    seconds = {}
     step = functools.partial(timed, seconds=seconds)
     release_freed_memory()
     # Searches and preparation use all cores, for which threads of the linear algebra would only wait.
