@@ -172,7 +172,11 @@ def _changes(options: argparse.Namespace) -> list[str]:
 
 
 def match_meshes(
-    options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh, stopwatch: Stopwatch
+    options: argparse.Namespace,
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    stopwatch: Stopwatch,
+    template: Mesh | None = None,
 ) -> Correspondence:
     """Match two meshes with the options of a command, and print their scale and hand if unknown.
 
@@ -198,6 +202,7 @@ def match_meshes(
             eigensolver=options.eigensolver,
             partial=getattr(options, "partial", False),
             scale=scale or 1.0,
+            template=template,
             mirror=options.mirror,
             backend=options.backend,
         )

@@ -63,7 +63,7 @@ def overlapping_alignments(x: Oriented, y: Oriented, number: int) -> list[Alignm
     for rotation in _rotations():
         turned = x._replace(positions=of_x).moved(Alignment(rotation, np.zeros(3)))
         product = (smoothed * np.conj(_transformed(turned, cell))).sum(axis=0)
-        overlaps = np.fft.irfftn(product, (_CELLS,) * 3)
+        overlaps = np.fft.irfftn(product, (_CELLS,) * 3, axes=(0, 1, 2))
         for _ in range(_OFFSETS):
             best = np.array(np.unravel_index(overlaps.argmax(), overlaps.shape))
             offset = ((best + _CELLS // 2) % _CELLS - _CELLS // 2) * cell
