@@ -153,7 +153,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         type=int,
         choices=get_args(IndexBase),
         help="number of the first vertex in map, landmark and ground-truth files (default: 1 in .mat, "
-        ".vts, .baryc_gt and two-column ground-truth files, and 0 in all other files)",
+        ".baryc_gt, two .vts and two-column ground-truth files, and 0 in all other files)",
     )
 
 

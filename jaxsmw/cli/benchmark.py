@@ -27,8 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "data",
         metavar="DATASET_DIRECTORY",
         type=path,
-        help="directory of a data set in its published layout: FAUST, SCAPE, TOSCA, a SHREC set or a "
-        "remeshed set",
+        help="directory of a data set in its published layout: FAUST, SCAPE, TOSCA, a SHREC set, "
+        "PARTIALSMAL, CP2P24 or a remeshed set",
     )
     parser.add_argument(
         "--methods",

@@ -27,7 +27,14 @@ import numpy as np
 from jaxtyping import Int64
 
 from jaxsmw.benchmark.datasets import DataPair
-from jaxsmw.benchmark.opponents.base import MOST_SAMPLES, Method, MethodInput, PointwiseMap, successful
+from jaxsmw.benchmark.opponents.base import (
+    MOST_SAMPLES,
+    Measured,
+    Method,
+    MethodInput,
+    PointwiseMap,
+    successful,
+)
 from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
@@ -71,8 +78,8 @@ class PublishedMaps(Method):
         assert pair.meshes is not None
         return read_published_map(self.directory, pair.names, pair.meshes)
 
-    def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
-        return self(pair), np.nan
+    def measure(self, pair: MethodInput) -> Measured:
+        return Measured(self(pair), np.nan)
 
     def check(self, pairs: Sequence[DataPair]) -> None:
         """Raise `InputError` if the directory has no map for a pair."""
@@ -139,11 +146,11 @@ class Matched(Method):
     def __call__(self, pair: MethodInput) -> PointwiseMap:
         return self._match(pair).pointwise_map
 
-    def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
+    def measure(self, pair: MethodInput) -> Measured:
         with recomputing():
             result = self._match(pair)
         own_steps = (t for step, t in result.seconds.items() if step not in _SHARED_STEPS)
-        return result.pointwise_map, sum(own_steps)
+        return Measured(result.pointwise_map, sum(own_steps), result)
 
     def _match(self, pair: MethodInput) -> Correspondence:
         assert pair.meshes is not None
