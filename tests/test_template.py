@@ -7,20 +7,16 @@ import pytest
 from scipy.spatial import KDTree
 
 from jaxsmw import Registration, Stage, creature_pair, make_mesh, match
-from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.creature import creature
 from jaxsmw.errors import InputError
-from jaxsmw.matching.correspondence import Correspondence, Overlap
+from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.pair import Pair
-from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.stages import Preset
-from jaxsmw.matching.template import _composed, _overlap
+from jaxsmw.matching.template import _composed
 
-QUICK = Preset(
-    repeated=(Stage(FeatureRegression((10, 20, 30)), number_of_descriptors=20),),
-    final=(Stage(Registration((30, 60))),),
-    search=SearchSettings(),
-)
+# Without a search, the maps of parts to the template are often wrong.
+QUICK = Preset(repeated=(Stage(Registration((30, 60))),))
+rough = pytest.mark.filterwarnings("ignore:.*wrong as a whole")
 
 
 def cut(mesh, kept):
@@ -51,7 +47,7 @@ def parts():
 def joined(parts):
     x, y, _ = parts
     template = creature("quadruped", vertices=1200, seed=0)
-    return match(x, y, template=template, preset=QUICK)
+    return match(x, y, template=template)
 
 
 def test_parts_are_matched_in_the_region_that_they_share(parts, joined):
@@ -59,7 +55,7 @@ def test_parts_are_matched_in_the_region_that_they_share(parts, joined):
     shared = true >= 0
     assert 0.2 < shared.mean() < 0.8
     errors = np.linalg.norm(y.vertices[joined.pointwise_map] - y.vertices[true], axis=1)[shared]
-    assert np.median(errors) < 0.06 * y.area**0.5 and joined.probability > 0.5
+    assert np.median(errors) < 0.05 * y.area**0.5 and joined.probability > 0.5
     mask_x, mask_y = joined.overlap()
     assert (mask_x & shared).sum() > 0.7 * (mask_x | shared).sum()
     assert len(mask_y) == len(y.vertices) and 0.1 < mask_y.mean() < 0.9
@@ -87,25 +83,6 @@ def test_points_are_matched_where_they_meet_on_the_template():
     )
 
 
-def test_the_overlap_is_what_both_shapes_cover(joined):
-    template = creature("quadruped", vertices=600, seed=0)
-    n = len(template.vertices)
-
-    class Part:
-        """A match to the template that covers some of its vertices."""
-
-        def __init__(self, covered):
-            self.pointwise_map, self.covered = np.flatnonzero(covered), covered.astype(float)
-
-        def overlap_probabilities(self):
-            return Overlap(np.ones(len(self.pointwise_map)), self.covered)
-
-    low, high = np.arange(n) < 0.7 * n, np.arange(n) > 0.4 * n
-    shared = _overlap(Part(low), Part(high))
-    np.testing.assert_array_equal(shared.masks[0], high[low])
-    np.testing.assert_array_equal(shared.masks[1], low[high])
-
-
 @pytest.mark.slow
 def test_parts_that_share_nothing_are_said_to_share_nothing(parts):
     """The head and the tail have no common region, so the map is not refined there."""
@@ -114,7 +91,7 @@ def test_parts_that_share_nothing_are_said_to_share_nothing(parts):
     head, _ = cut(whole, length > np.quantile(length, 0.55))
     tail, _ = cut(whole, length < np.quantile(length, 0.4))
     with pytest.warns(UserWarning, match="share too small a region"):
-        found = match(head, tail, template=whole, preset=QUICK)
+        found = match(head, tail, template=whole)
     assert found.overlap()[0].mean() < 0.05
 
 
@@ -124,6 +101,7 @@ def test_maps_of_a_pair_cannot_be_used_with_a_template(parts):
         match(x, y, template=x, init=np.zeros(len(x.vertices), int))
 
 
+@rough
 def test_scales_to_the_template_are_divided(parts, monkeypatch):
     """Lengths on X are doubled, so the scale of X to Y and to the template is one half."""
     seen = []
@@ -136,6 +114,5 @@ def test_scales_to_the_template_are_divided(parts, monkeypatch):
     x, y, _ = parts
     monkeypatch.setattr(Pair, "make", classmethod(record))
     double = replace(x, vertices=2 * x.vertices)
-    quick = replace(QUICK, search=None)
-    found = match(double, y, template=creature("quadruped", vertices=800, seed=0), scale=0.5, preset=quick)
+    found = match(double, y, template=creature("quadruped", vertices=800, seed=0), scale=0.5, preset=QUICK)
     assert seen == [0.5, 1.0] and found.pair.scale == 0.5

@@ -65,7 +65,9 @@ def join(
     if x_to_template.mirrored != y_to_template.mirrored:
         prepared = prepared.mirror()
     if stage.number_of_descriptors:
-        prepared = prepared.describe(stage.number_of_descriptors)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the given meshes have already caused the same warnings
+            prepared = prepared.describe(stage.number_of_descriptors)
     stage = prepared.usable(Preset((stage,))).stages[0]
     nearest = extend_to_unreferenced(prepared.pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
     outcome = run([stage], prepared.spectra, Start(nearest[initial_map]))
