@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
+from jaxsmw.choices import Template
 from jaxsmw.cli.arguments import (
     add_partial,
     add_paths,
@@ -91,9 +92,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_paths(
         parser,
         {
-            "--template FILE": "a full shape of the same kind of body, in the target's unit of length, for "
-            "two partial shapes that share only a region: both are matched to it, and through it to each "
-            "other",
+            "--template FILE": "for two partial shapes that share only a region: a full shape of the same "
+            "kind of body, to which both are matched, and through it to each other; a mesh file in the "
+            f"target's unit of length, or {' or '.join(get_args(Template))} for a built-in body",
         },
     )
     add_method(parser)
@@ -107,7 +108,7 @@ def run(options: argparse.Namespace) -> None:
     with stopwatch.step("loading"):
         _check(options)
     with stopwatch.step("reading"):
-        files = [options.source, options.target, *filter(None, [options.template])]
+        files = [options.source, options.target, *_template_file(options)]
         mesh_x, mesh_y, *template = read_meshes(*files, weld=options.weld)
         truth = None
         if options.ground_truth:
@@ -116,7 +117,8 @@ def run(options: argparse.Namespace) -> None:
         from jaxsmw.geometry.assignment import check_one_to_one
 
         check_one_to_one(len(mesh_x.referenced_indices), len(mesh_y.referenced_indices))
-    correspondence = match_meshes(options, mesh_x, mesh_y, stopwatch, *template)
+    whole = template[0] if template else options.template
+    correspondence = match_meshes(options, mesh_x, mesh_y, stopwatch, whole)
     maps = _write_files(options, correspondence, stopwatch)
     expected = estimate_error(correspondence, stopwatch)
     if options.expected_error:
@@ -176,8 +178,14 @@ def _check(options: argparse.Namespace) -> None:
 
 def _inputs(options: argparse.Namespace) -> list[str]:
     """Return all files that the command reads."""
-    template = [options.template] if options.template else []
-    return [options.source, options.target, *template, *options.init.files, *(options.ground_truth or ())]
+    files = [options.source, options.target, *_template_file(options)]
+    return [*files, *options.init.files, *(options.ground_truth or ())]
+
+
+def _template_file(options: argparse.Namespace) -> list[str]:
+    """Return the file of the template, in a list that is empty if there is none."""
+    is_file = options.template and options.template not in get_args(Template)
+    return [options.template] if is_file else []
 
 
 def _write_files(

@@ -20,6 +20,7 @@ from jaxsmw.choices import (
     Mirror,
     PresetName,
     Scale,
+    Template,
 )
 from jaxsmw.cli.arguments import add_eigenproblem, add_values, option_of, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
@@ -176,7 +177,7 @@ def match_meshes(
     mesh_x: Mesh,
     mesh_y: Mesh,
     stopwatch: Stopwatch,
-    template: Mesh | None = None,
+    template: Mesh | Template | None = None,
 ) -> Correspondence:
     """Match two meshes with the options of a command, and print their scale and hand if unknown.
 

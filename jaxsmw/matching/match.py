@@ -21,6 +21,7 @@ from jaxsmw.choices import (
     MatchInit,
     Mirror,
     Scale,
+    Template,
 )
 from jaxsmw.errors import InputError, check_choice
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
@@ -36,7 +37,7 @@ from jaxsmw.matching.search.search import search
 from jaxsmw.matching.search.trimming import match_trimmed
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
 from jaxsmw.matching.starts import check_initial_map, make_start
-from jaxsmw.matching.template import join
+from jaxsmw.matching.template import join, scales_to_template
 from jaxsmw.runtime.memory import release_freed_memory
 from jaxsmw.runtime.progress import Step, no_step, timed
 from jaxsmw.runtime.threads import one_blas_thread
@@ -52,7 +53,7 @@ def match(
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
     scale: float | Scale = 1.0,
-    template: Mesh | MeshLike | None = None,
+    template: Mesh | MeshLike | Template | None = None,
     mirror: Mirror = DEFAULT_MIRROR,
     history: bool = False,
     backend: Backend = DEFAULT_BACKEND,
@@ -94,10 +95,13 @@ def match(
       default is False, for two full shapes. `Correspondence.overlap` predicts which vertices have a
       counterpart on the other mesh.
     - `scale`: see `Pair.make`. Full shapes are always scaled to the same area.
-    - `template`: a full shape of the same kind of body, in the unit of length of Y, for two partial shapes
-      that share only a region. Both are matched to the template as its parts, and through it to each other;
-      see `jaxsmw.matching.template`. The default is None, to match X to Y directly. A template makes
-      `partial` True.
+    - `template`: a full shape of the same kind of body, for two partial shapes that share only a region. Both
+      are matched to the template as its parts, and through it to each other; see docs/how_it_works.md. A
+      template makes `partial` True. The default is None, to match X to Y directly.
+
+        - a mesh in the unit of length of Y.
+        - `"quadruped"`, `"biped"`: a built-in synthetic body. Its scale is estimated.
+
     - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. If they are, the
       mirror image of X is matched instead of X. Whether X is mirrored or not, entry i of the map is the match
       of vertex i of X.
@@ -129,9 +133,11 @@ def match(
             raise InputError(
                 "an initial map from X to Y cannot be used with a template: leave out the one or the other."
             )
+        x, y = as_mesh(mesh_x, "source mesh"), as_mesh(mesh_y, "target mesh")
+        whole, scale_x, scale_y = scales_to_template(x, y, template, scale)
         to_template = functools.partial(
             match,
-            mesh_y=as_mesh(template, "template"),
+            mesh_y=whole,
             preset=preset,
             init=init,
             laplacian=laplacian,
@@ -140,12 +146,11 @@ def match(
             mirror=mirror,
             backend=backend,
         )
-        x, y = as_mesh(mesh_x, "source mesh"), as_mesh(mesh_y, "target mesh")
         seconds: dict[str, float] = {}
         with timed("source to template", seconds):
-            x_to_template = to_template(x, scale=scale)
+            x_to_template = to_template(x, scale=scale_x)
         with timed("target to template", seconds):
-            y_to_template = to_template(y, scale="unknown" if isinstance(scale, str) else 1.0)
+            y_to_template = to_template(y, scale=scale_y)
         method = choose_preset(preset)
         with timed("source to target", seconds), one_blas_thread():
             joined = join(

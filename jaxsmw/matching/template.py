@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Int64
 from scipy.spatial import KDTree
 
-from jaxsmw.choices import Backend, Eigensolver, Laplacian
-from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced
+from jaxsmw.choices import Backend, Eigensolver, Laplacian, Scale, Template
+from jaxsmw.creature import creature
+from jaxsmw.errors import InputError, check_choice
+from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, extend_to_unreferenced
+from jaxsmw.geometry.scale import estimate_scale
 from jaxsmw.matching.correspondence import Correspondence, Overlap
 from jaxsmw.matching.executor import run
 from jaxsmw.matching.outcome import Start
@@ -23,6 +25,36 @@ from jaxsmw.matching.stages import Preset, Sizes, Stage
 # Beside positions in units of the square root of the template's area, normals have this weight. It keeps the
 # two sides of a thin part apart.
 _NORMALS = 0.1
+
+
+# The number of vertices of a built-in template.
+_VERTICES = 3000
+
+
+def scales_to_template(
+    mesh_x: Mesh, mesh_y: Mesh, template: Mesh | MeshLike | Template, scale: float | Scale
+) -> tuple[Mesh, float | Scale, float | Scale]:
+    """Return the template, and the scales of X and of Y to the template; see `Pair.make`.
+
+    A built-in template has no unit of length. Both scales are then estimated (`estimate_scale`). If the scale
+    of X to Y is known, the mean of both estimates is used, weighted by their support.
+
+    **Arguments:**
+
+    - `mesh_x`, `mesh_y`, `template`, `scale`: see `jaxsmw.match`.
+
+    **Raises:** `InputError` if the template is not a mesh or a name, or if no scale can be estimated.
+    """
+    if not isinstance(template, str):
+        return as_mesh(template, "template"), scale, "unknown" if isinstance(scale, str) else 1.0
+    check_choice(template, Template, "a template")
+    whole = creature(template, vertices=_VERTICES)
+    of_x, of_y = (estimate_scale(mesh, whole) for mesh in (mesh_x, mesh_y))
+    if isinstance(scale, str):
+        return whole, of_x.scale, of_y.scale
+    logarithms, supports = np.log([of_x.scale / scale, of_y.scale]), [of_x.support, of_y.support]
+    unit = float(np.exp(np.average(logarithms, weights=supports)))
+    return whole, scale * unit, unit
 
 
 def join(
