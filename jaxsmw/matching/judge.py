@@ -182,7 +182,7 @@ def edge_lengths(
 
 # A vertex with this detour, in `Pair.units_of_length`, is in the overlap with a probability of one half. The
 # odds fall with this power of the detour. (Entry R39 of docs/research_log.md)
-_EVEN_DETOUR, _POWER = 0.04, 1.5
+_EVEN_DETOUR, _POWER = 0.025, 2
 
 
 def detours(
@@ -205,11 +205,15 @@ def overlap_probability(
     Each vertex receives a match, even if the other shape lacks its true point. The match is then, for
     example, at the boundary of Y, and the reverse map does not lead from there back to the vertex. A vertex
     with a small detour is therefore probably in the overlap. The prediction is wrong where a part of X
-    without a counterpart is matched to a part of Y without a counterpart.
+    without a counterpart is matched to a part of Y without a counterpart. On coarse meshes, detours are
+    compared with the mean length of the edges, because no match is more exact.
 
     **Returns:** The probabilities (m,), from 0 to 1.
     """
-    return 1 / (1 + (detours(pair, pointwise_map, reverse_map) / _EVEN_DETOUR) ** _POWER)
+    sides = zip(pair.meshes, pair.units_of_length, strict=True)
+    edges = [float(mesh.lengths(mesh.edges).mean()) / unit for mesh, unit in sides]
+    even = max(_EVEN_DETOUR, *edges)
+    return 1 / (1 + (detours(pair, pointwise_map, reverse_map) / even) ** _POWER)
 
 
 def expected_error(
