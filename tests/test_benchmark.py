@@ -171,6 +171,18 @@ def test_pairs_are_drawn_by_the_seed_or_read_from_a_list(scape, tmp_path):
         choose_pairs(data_set, str(tmp_path / "list.txt"), 0)
 
 
+def test_a_template_makes_a_method_for_partial_shapes(tmp_path):
+    file = tmp_path / "whole.off"
+    write_mesh(file, bumpy_mesh(1))
+    methods = find_methods(["accurate:quadruped", f"accurate:{file}"])
+    assert list(methods) == ["accurate:quadruped", "accurate:whole.off"]
+    assert all(
+        method.partial_only and "through the template" in method.reference for method in methods.values()
+    )
+    with pytest.raises(InputError, match=r"missing\.off"):
+        find_methods([f"accurate:{tmp_path / 'missing.off'}"])
+
+
 def test_unknown_methods_and_initial_maps_are_refused(tmp_path):
     with refused("'magic'", "method", "initial, mwp"):
         find_methods(["mwp", "magic"])
