@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.geometry.mesh import connected_components, extend_from
+from jaxsmw.geometry.mesh import Mesh, connected_components, extend_from
 from jaxsmw.geometry.sampling import coarse_edges
 from jaxsmw.matching.outcome import StageRun
 from jaxsmw.matching.pair import Pair
@@ -182,7 +182,12 @@ def edge_lengths(
 
 # A vertex with this detour, in `Pair.units_of_length`, is in the overlap with a probability of one half. The
 # odds fall with this power of the detour. (Entry R39 of docs/research_log.md)
-_EVEN_DETOUR, _POWER = 0.025, 2
+_EVEN_DETOUR, _POWER = 0.02, 2
+# A detour of zero counts like this share of the even detour.
+_LEAST = 0.1
+# The log-odds are averaged over neighbourhoods of about this radius, in the same units, by at most this
+# number of averages over neighbouring vertices.
+_SMOOTHED, _MOST_AVERAGES = 0.04, 20
 
 
 def detours(
@@ -206,14 +211,28 @@ def overlap_probability(
     example, at the boundary of Y, and the reverse map does not lead from there back to the vertex. A vertex
     with a small detour is therefore probably in the overlap. The prediction is wrong where a part of X
     without a counterpart is matched to a part of Y without a counterpart. On coarse meshes, detours are
-    compared with the mean length of the edges, because no match is more exact.
+    compared with the mean length of the edges, because no match is more exact. The log-odds are averaged over
+    small neighbourhoods.
 
     **Returns:** The probabilities (m,), from 0 to 1.
     """
     sides = zip(pair.meshes, pair.units_of_length, strict=True)
-    edges = [float(mesh.lengths(mesh.edges).mean()) / unit for mesh, unit in sides]
-    even = max(_EVEN_DETOUR, *edges)
-    return 1 / (1 + (detours(pair, pointwise_map, reverse_map) / even) ** _POWER)
+    edge, edge_y = (float(mesh.lengths(mesh.edges).mean()) / unit for mesh, unit in sides)
+    far = detours(pair, pointwise_map, reverse_map) / max(_EVEN_DETOUR, edge, edge_y)
+    log_odds = -_POWER * np.log(far + _LEAST)
+    for _ in range(min(round((_SMOOTHED / edge) ** 2), _MOST_AVERAGES)):
+        log_odds = _averaged(pair.mesh_x, log_odds)
+    return 1 / (1 + np.exp(-log_odds))
+
+
+def _averaged(mesh: Mesh, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Return the mean value of each vertex and its neighbours."""
+    first, second = mesh.edges.T
+    sums, numbers = values.copy(), np.ones(len(values))
+    for vertices, others in ((first, second), (second, first)):
+        sums += np.bincount(vertices, values[others], len(values))
+        numbers += np.bincount(vertices, minlength=len(values))
+    return sums / numbers
 
 
 def expected_error(

@@ -179,21 +179,21 @@ def _kept(mesh: Mesh, mask: Bool[np.ndarray, " n"]) -> Mesh:
 
 def _alternatives(x_to_template: Correspondence, y_to_template: Correspondence) -> tuple[Alternative, ...]:
     """Return the maps that result if one of the two maps to the template is replaced by an alternative."""
-    template, (of_x, of_y) = x_to_template.mesh_y, (x_to_template, y_to_template)
+    template, map_x, map_y = x_to_template.mesh_y, x_to_template.pointwise_map, y_to_template.pointwise_map
     found = [
         Alternative(
-            _composed(template, other.pointwise_map, of_y.pointwise_map),
-            other.probability * of_y.probability,
-            f"{other.difference} (source to template)",
+            _composed(template, other.pointwise_map, map_y),
+            other.probability * y_to_template.probability,
+            f"source on the template: {other.difference}",
         )
-        for other in of_x.alternatives
+        for other in x_to_template.alternatives
     ]
     found += [
         Alternative(
-            _composed(template, of_x.pointwise_map, other.pointwise_map),
-            other.probability * of_x.probability,
-            f"{other.difference} (target to template)",
+            _composed(template, map_x, other.pointwise_map),
+            other.probability * x_to_template.probability,
+            f"target on the template: {other.difference.replace('the source', 'the target')}",
         )
-        for other in of_y.alternatives
+        for other in y_to_template.alternatives
     ]
     return tuple(sorted(found, key=lambda other: -other.probability))
