@@ -40,19 +40,20 @@ class Oriented(NamedTuple):
         return Oriented(motion.apply(self.positions), self.normals @ motion.rotation.T, self.areas)
 
 
-def overlapping_alignments(x: Oriented, y: Oriented, number: int) -> list[Alignment]:
+def overlapping_alignments(x: Oriented, y: Oriented, number: int, *, dense: bool = True) -> list[Alignment]:
     """Return rigid motions that lay the surface x over the surface y, those with the largest overlap first.
 
     The overlap is the inner product of the two surfaces as currents (Vaillant, Glaunès, "Surface matching via
     currents", 2005): the sum of a Gaussian of the distance times the product of the normals, over all pairs
     of points. Surfaces of opposite orientation cancel each other. Parts without a counterpart count nothing,
-    so the overlap needs no guess of their extent. For each of 300 rotations, a fast Fourier transform gives
-    the overlap at all offsets at once.
+    so the overlap needs no guess of their extent. For each of several rotations, a fast Fourier transform
+    gives the overlap at all offsets at once.
 
     **Arguments:**
 
     - `x`, `y`: the surfaces, in a unit of length in which the larger one has an area of about 1.
     - `number`: the largest number of motions. They differ from each other.
+    - `dense`: whether all 300 rotations are tried, or only the 60 rotations of an icosahedron.
     """
     middles = x.positions.mean(axis=0), y.positions.mean(axis=0)
     of_x, of_y = (side.positions - middle for side, middle in zip((x, y), middles, strict=True))
@@ -60,7 +61,7 @@ def overlapping_alignments(x: Oriented, y: Oriented, number: int) -> list[Alignm
     cell = 2 * reach / _CELLS
     smoothed = _transformed(y._replace(positions=of_y), cell) * _gaussian(cell)
     found: list[tuple[float, Alignment]] = []
-    for rotation in _rotations():
+    for rotation in _rotations(dense):
         turned = x._replace(positions=of_x).moved(Alignment(rotation, np.zeros(3)))
         product = (smoothed * np.conj(_transformed(turned, cell))).sum(axis=0)
         overlaps = np.fft.irfftn(product, (_CELLS,) * 3, axes=(0, 1, 2))
@@ -86,8 +87,10 @@ def _different(motions: list[Alignment], points: Float[np.ndarray, "s 3"], numbe
     return [motion for motion, _ in kept]
 
 
-def _rotations() -> Float[np.ndarray, "r 3 3"]:
-    turns = [np.eye(3), *Rotation.from_rotvec(_TURN * _DIAGONALS).as_matrix()]
+def _rotations(dense: bool) -> Float[np.ndarray, "r 3 3"]:
+    turns = [np.eye(3)]
+    if dense:
+        turns += [*Rotation.from_rotvec(_TURN * _DIAGONALS).as_matrix()]
     icosahedral = Rotation.create_group("I").as_matrix()
     return np.array([rotation @ turn for rotation in icosahedral for turn in turns])
 

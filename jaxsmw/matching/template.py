@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from jaxsmw.choices import Backend, Eigensolver, Laplacian, Scale, Template
 from jaxsmw.creature import creature
 from jaxsmw.errors import InputError, check_choice
+from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, extend_to_unreferenced
 from jaxsmw.geometry.scale import estimate_scale
 from jaxsmw.matching.correspondence import Correspondence, Overlap
@@ -20,6 +21,9 @@ from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair, prepare
 from jaxsmw.matching.search.alternatives import Alternative
+from jaxsmw.matching.search.fitting import fitted_scale
+from jaxsmw.matching.search.proxies import Proxy
+from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset, Sizes, Stage
 
 # Beside positions in units of the square root of the template's area, normals have this weight. It keeps the
@@ -36,8 +40,9 @@ def scales_to_template(
 ) -> tuple[Mesh, float | Scale, float | Scale]:
     """Return the template, and the scales of X and of Y to the template; see `Pair.make`.
 
-    A built-in template has no unit of length. Both scales are then estimated (`estimate_scale`). If the scale
-    of X to Y is known, the mean of both estimates is used, weighted by their support.
+    The scale to a built-in template is unknown. Estimates from similar points (`estimate_scale`) are the
+    starting points of estimates from fits (`fitted_scale`). If the scale of X to Y is known, both parts are
+    fitted together.
 
     **Arguments:**
 
@@ -50,10 +55,18 @@ def scales_to_template(
     check_choice(template, Template, "a template")
     whole = creature(template, vertices=_VERTICES)
     of_x, of_y = (estimate_scale(mesh, whole) for mesh in (mesh_x, mesh_y))
+    x, y, proxy = (
+        Proxy(PreparedShape.of(mesh, compute_spectrum(mesh, 1)), 1.0) for mesh in (mesh_x, mesh_y, whole)
+    )
     if isinstance(scale, str):
-        return whole, of_x.scale, of_y.scale
+        scale_x, scale_y = (
+            estimate.scale * fitted_scale([(part, proxy, estimate.scale)])
+            for part, estimate in ((x, of_x), (y, of_y))
+        )
+        return whole, scale_x, scale_y
     logarithms, supports = np.log([of_x.scale / scale, of_y.scale]), [of_x.support, of_y.support]
     unit = float(np.exp(np.average(logarithms, weights=supports)))
+    unit *= fitted_scale([(x, proxy, scale * unit), (y, proxy, unit)])
     return whole, scale * unit, unit
 
 

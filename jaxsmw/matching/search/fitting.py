@@ -7,15 +7,18 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
-from scipy.spatial import KDTree
 
 from jaxsmw.geometry.alignment import PatchMotions, patch_motions
 from jaxsmw.geometry.currents import Oriented, overlapping_alignments
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.matching.search.proxies import Proxy
+from jaxsmw.runtime.threads import side_by_side
 
 # The number of samples that are moved, of rigid motions, of fits that go on, and of resulting fits.
-_MOVED, _MOTIONS, _CONTINUED, _FITS = 400, 40, 14, 6
+_MOVED, _MOTIONS, _CONTINUED, _FITS = 400, 40, 14, 4
+# The numbers of motions and of fits that go on if only the scale is wanted, and the factors that are tried.
+_FEW_MOTIONS, _FEW_CONTINUED = 16, 5
+_FACTORS = (0.7, 0.83, 1.0, 1.2, 1.44)
 # The radii of the patches that move rigidly, in units of the square root of the area: first in rough fits of
 # all motions, then in the fits that go on. An infinite radius moves the shape as a whole.
 _ROUGH = (np.inf, np.inf, np.inf, np.inf, 0.6, 0.6)
@@ -49,7 +52,7 @@ class Fit(NamedTuple):
         return features(self.positions, self.normals)
 
 
-def fits(moving: Proxy, fixed: Proxy) -> Iterator[Fit]:
+def fits(moving: Proxy, fixed: Proxy, *, thorough: bool = True) -> Iterator[Fit]:
     """Yield different fits of a shape to another one, of which it may be a part, those of least cost first.
 
     The fits start from rigid motions with large overlap (`overlapping_alignments`). In each iteration, every
@@ -57,27 +60,63 @@ def fits(moving: Proxy, fixed: Proxy) -> Iterator[Fit]:
     the mean motion of the patches around it. The patches shrink, so the shape first moves as a whole, and
     then bends at its joints. Matches at a boundary hardly count, because parts without a counterpart gather
     there (Turk, Levoy, "Zippered polygon meshes from range images", 1994).
+
+    **Arguments:**
+
+    - `moving`, `fixed`: the proxies of both shapes, in the same unit of length.
+    - `thorough`: whether many motions are tried, or only a few.
     """
     fitting = _Fitting(moving, fixed)
     target = Oriented(fixed.positions, fixed.normals, fixed.areas)
-    motions = overlapping_alignments(
-        Oriented(fitting.positions, fitting.normals, fitting.areas), target, _MOTIONS
-    )
-    starts = [(motion.apply(fitting.positions), fitting.normals @ motion.rotation.T) for motion in motions]
+    surface = Oriented(fitting.positions, fitting.normals, fitting.areas)
+    number, continued = (_MOTIONS, _CONTINUED) if thorough else (_FEW_MOTIONS, _FEW_CONTINUED)
+    motions = overlapping_alignments(surface, target, number, dense=thorough)
+    starts = (surface.moved(motion)[:2] for motion in motions)
     rough = sorted((fitting.run(start, _ROUGH, 0) for start in starts), key=lambda fit: fit.cost)
     kept: list[Fit] = []
     for fit in rough:
         squares = (((fit.positions - other.positions) ** 2).sum(axis=1).mean() for other in kept)
-        if len(kept) < _CONTINUED and all(square > _DIFFERENT_ROUGH**2 for square in squares):
+        if len(kept) < continued and all(square > _DIFFERENT_ROUGH**2 for square in squares):
             kept.append(fit)
     fine = [fitting.run((fit.positions, fit.normals), _FINE, len(_ROUGH)) for fit in kept]
     yielded: list[Int64[np.ndarray, " s"]] = []
     for fit in sorted(fine, key=lambda fit: fit.cost):
-        matches = fitting.nearest(fit)[1]
+        matches = fitting.nearest(fit)[0]
         apart = (fitting.areas @ (fixed.distances[matches, other] > _FAR) for other in yielded)
         if len(yielded) < _FITS and all(share > _DIFFERENT_AREA * fitting.areas.sum() for share in apart):
             yielded.append(matches)
             yield fitting.everywhere(fit)
+
+
+def fitted_scale(pairs: Sequence[tuple[Proxy, Proxy, float]]) -> float:
+    """Return the factor by which lengths on parts are multiplied, so that the parts fit their whole shapes.
+
+    The factor minimises the sum of the costs of the best fits of all parts, with few motions, over
+    `_FACTORS`. A parabola through the least cost and its two neighbours gives the factor more exactly.
+
+    **Arguments:**
+
+    - `pairs`: for each part, its proxy, the proxy of the whole shape, and an estimate of the factor, by which
+      `_FACTORS` are multiplied. Both proxies are in the coordinates of their meshes.
+
+    **Returns:** The factor relative to the estimates.
+    """
+
+    def cost(factor: float) -> float:
+        total = 0.0
+        for part, whole, estimate in pairs:
+            unit = whole.mesh.area**0.5
+            sides = part.in_unit(unit / (estimate * factor)), whole.in_unit(unit)
+            total += next(iter(fits(*sides, thorough=False))).cost
+        return total
+
+    costs = np.array(side_by_side(cost, *_FACTORS))
+    best = int(np.clip(costs.argmin(), 1, len(costs) - 2))
+    logarithms = np.log(_FACTORS)
+    curvature, slope, _ = np.polyfit(logarithms[best - 1 : best + 2], costs[best - 1 : best + 2], 2)
+    if curvature <= 0:
+        return float(_FACTORS[costs.argmin()])
+    return float(np.exp(np.clip(-slope / (2 * curvature), logarithms[best - 1], logarithms[best + 1])))
 
 
 class _Fitting:
@@ -95,14 +134,18 @@ class _Fitting:
         self.areas = np.bincount(nearest, areas, len(self.rows))
         self.on_boundary = np.bincount(nearest, moving.on_boundary, len(self.rows)) > 0
         self.features = features(fixed.positions, fixed.normals)
-        self.tree = KDTree(self.features)
+        self.fixed_features = self.features.astype(np.float32)
         among_moved = moving.distances[np.ix_(self.rows, self.rows)]
         self.patches = {radius: _patches(among_moved, self.areas, radius) for radius in {*_ROUGH, *_FINE}}
         self.around_all = _patches(moving.distances[:, self.rows], self.areas, _FINE[-1])
 
-    def nearest(self, fit: Fit) -> tuple[Float[np.ndarray, " s"], Int64[np.ndarray, " s"]]:
-        """Return the distances to the nearest points of the fixed shape, and their rows."""
-        return self.tree.query(fit.features)
+    def nearest(self, fit: Fit) -> tuple[Int64[np.ndarray, " s"], Int64[np.ndarray, " t"]]:
+        """Return the nearest fixed point of each moved point, and vice versa."""
+        # In single precision, a matrix product takes less time than a tree of so few points.
+        moved = fit.features.astype(np.float32)
+        products = moved @ self.fixed_features.T
+        lengths, fixed_lengths = (0.5 * np.sum(rows**2, axis=1) for rows in (moved, self.fixed_features))
+        return (products - fixed_lengths).argmax(axis=1), (products - lengths[:, None]).argmax(axis=0)
 
     def run(
         self,
@@ -126,8 +169,9 @@ class _Fitting:
     def _motions(self, fit: Fit, radius: float, tolerance: float) -> PatchMotions:
         """Return the rigid motion of each patch, from the given positions towards the matches."""
         features, size = fit.features, len(self.rows)
-        far, matches = self.tree.query(features)
-        far_back, matches_back = KDTree(features).query(self.features)
+        matches, matches_back = self.nearest(fit)
+        far = np.linalg.norm(features - self.features[matches], axis=1)
+        far_back = np.linalg.norm(features[matches_back] - self.features, axis=1)
         weights = self.areas * _weights(far, tolerance, self.fixed.on_boundary[matches])
         back = self.fixed_areas * _weights(far_back, tolerance, self.on_boundary[matches_back])
         present = _PRESENT * self.areas
@@ -141,7 +185,8 @@ class _Fitting:
 
     def _cost(self, fit: Fit) -> float:
         """Return the logarithms of the mean deformation of patches and of the mean distance, added."""
-        far, matches = self.nearest(fit)
+        matches, _ = self.nearest(fit)
+        far = np.linalg.norm(fit.features - self.features[matches], axis=1)
         shares = self.areas / self.areas.sum()
         goals = self.fixed.positions[matches], self.fixed.normals[matches]
         motions = patch_motions(self.patches[_JUDGED], self.positions, self.normals, *goals)

@@ -40,6 +40,8 @@ def by_descriptors(reading: Reading) -> Iterator[SampleMap]:
 
 def by_alignment(reading: Reading) -> Iterator[SampleMap]:
     """Align X rigidly with Y in several ways, and match samples that are near and have similar SHOT."""
+    if reading.prepared.pair.partial:  # see `by_fits`
+        return
     x, y = reading.x, reading.y
     shot = _shot_squares(reading)
     for motion in alignments(x.positions, y.positions, _ALIGNMENTS):

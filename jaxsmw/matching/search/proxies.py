@@ -73,6 +73,17 @@ class Proxy:
         mirrored.mirrored = not self.mirrored
         return mirrored
 
+    def in_unit(self, unit: float) -> Proxy:
+        """Return the proxy in another unit of length."""
+        factor = self.unit / unit
+        other = copy.copy(self)
+        other.unit, other.positions, other._shot = unit, factor * self.positions, {}
+        # Everything that depends on distances is computed again.
+        for name in ("patches", "neighbours"):
+            vars(other).pop(name, None)
+        vars(other)["distances"] = factor * self.distances
+        return other
+
     def shot(self, radius: int) -> Float[np.ndarray, "s 352"]:
         """Return SHOT at the samples, with a radius in units of 0.06, in `unit`.
 
