@@ -30,6 +30,9 @@ EDGES_PER_SHAPE = 4
 Scale = Literal["unknown"]
 """The name of a scale of a partial pair that must be estimated; see `jaxsmw.match`."""
 
+Template = Literal["quadruped", "biped"]
+"""The names of built-in full shapes through which two partial shapes can be matched; see `jaxsmw.match`."""
+
 Laplacian = Literal["auto", "cotangent", "robust"]
 """The discretizations of the Laplacian; see `jaxsmw.compute_spectrum`."""
 

@@ -29,7 +29,8 @@ from jaxsmw import InputError
 from jaxsmw.benchmark import measurement
 from jaxsmw.benchmark.benchmark import Results, run_benchmark
 from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
-from jaxsmw.benchmark.measurement import CURVE, FIGURES, Settings
+from jaxsmw.benchmark.journal import Journal
+from jaxsmw.benchmark.measurement import CURVE, FIGURES, OPTIONAL_FIGURES, RESULT_COLUMNS, Settings
 from jaxsmw.benchmark.opponents.base import Method, MethodInput
 from jaxsmw.benchmark.opponents.registry import METHODS, PEERS, find_methods
 from jaxsmw.benchmark.tables import _introduction, latex_table, markdown, markdown_table, summarize_methods
@@ -168,6 +169,18 @@ def test_pairs_are_drawn_by_the_seed_or_read_from_a_list(scape, tmp_path):
     (tmp_path / "list.txt").write_text("mesh002 mesh002\n")
     with pytest.raises(InputError, match="has no ground truth for mesh002 to mesh002"):
         choose_pairs(data_set, str(tmp_path / "list.txt"), 0)
+
+
+def test_a_template_makes_a_method_for_partial_shapes(tmp_path):
+    file = tmp_path / "whole.off"
+    write_mesh(file, bumpy_mesh(1))
+    methods = find_methods(["accurate:quadruped", f"accurate:{file}"])
+    assert list(methods) == ["accurate:quadruped", "accurate:whole.off"]
+    assert all(
+        method.partial_only and "through the template" in method.reference for method in methods.values()
+    )
+    with pytest.raises(InputError, match=r"missing\.off"):
+        find_methods([f"accurate:{tmp_path / 'missing.off'}"])
 
 
 def test_unknown_methods_and_initial_maps_are_refused(tmp_path):
@@ -522,6 +535,31 @@ def test_tables_summarise_the_rows():
     assert all(line.count("&") == 9 for line in latex.splitlines()[2:] if "&" in line)
 
 
+def test_tables_show_the_overlap_of_two_parts():
+    rows = [
+        row("x", "accurate", 0.01) | {"overlap_source": "0.6", "overlap_target": "0.8"},
+        row("x", "mwp", 0.02) | {"overlap_source": "nan", "overlap_target": "nan"},
+    ]
+    seconds = {"seconds_spectrum": "2", "seconds_descriptors": "3"}
+    summaries = summarize_methods(Results(rows, {"x": seconds, "y": seconds}, {}))
+    assert summaries["accurate"].overlap == pytest.approx(0.7) and np.isnan(summaries["mwp"].overlap)
+    header, _, accurate, mwp = markdown_table(summaries).splitlines()
+    at = header.split(" | ").index("overlap IoU")
+    assert [line.split(" | ")[at] for line in (accurate, mwp)] == ["70.0%", "—"]
+    assert "overlap IoU & " in latex_table(summaries)
+    assert "overlap" not in markdown_table({"mwp": summaries["mwp"]})
+
+
+def test_stored_results_of_older_versions_are_read():
+    files = sorted((Path(__file__).parent.parent / "docs" / "results").rglob("results.csv"))
+    assert len(files) > 20
+    for file in files:
+        journal = Journal(
+            file, ["source", "target", "method"], RESULT_COLUMNS, optional=OPTIONAL_FIGURES, read_only=True
+        )
+        assert journal.rows and float(journal.rows[0]["mean"]) > 0
+
+
 class Slow(Method):
     """A method that sleeps, compiles a program in each run, and counts its runs."""
 
@@ -547,7 +585,7 @@ def test_times_exclude_compilation(monkeypatch):
         method = Slow(seconds)
         with measurement._compilation_seconds() as compilation:
             began = time.perf_counter()
-            _, measured = measurement._timed(name, method, pair)
+            measured = measurement._timed(name, method, pair).seconds
             elapsed = time.perf_counter() - began
         assert method.runs == runs
         assert sum(compilation) > 0
@@ -572,7 +610,7 @@ def test_the_digest_covers_all_code_that_results_depend_on(imported):
 @pytest.mark.parametrize(("target", "share"), [("b", "1 of 2 pairs"), ("c", "1 given pairs")])
 def test_the_summary_says_whether_pairs_belong_to_the_list_of_the_data_set(target, share):
     """The list of a remeshed set contains pairs of one class only, but a given list may contain others."""
-    pairs = [SimpleNamespace(names=("a", name)) for name in ("b", "d")]
+    pairs = [SimpleNamespace(names=("a", name), both_partial=False) for name in ("b", "d")]
     results = SimpleNamespace(rows=[{"source": "a", "target": target, "machine": "a machine"}], failures=[])
     data_set = SimpleNamespace(pairs=pairs, layout="a set")
     assert _introduction(data_set, results, Settings("shot")).startswith(share)

@@ -13,11 +13,11 @@ from synthetic import bumpy_mesh
 from test_shortcuts import bent_tube
 
 from jaxsmw import Correspondence, Mesh, creature_pair, geodesic_error, make_mesh, match, read_mesh
-from jaxsmw.benchmark.datasets import DataPair
-from jaxsmw.benchmark.measurement import FIGURES, Settings, measure_pair, measure_shape
+from jaxsmw.benchmark.datasets import DataPair, open_data_set
+from jaxsmw.benchmark.measurement import FIGURES, OPTIONAL_FIGURES, Settings, measure_pair, measure_shape
 from jaxsmw.benchmark.opponents.baselines import _SHARED_STEPS, Unrefined
 from jaxsmw.benchmark.opponents.registry import METHODS
-from jaxsmw.evaluation import coverage
+from jaxsmw.evaluation import coverage, overlap_scores
 from jaxsmw.io.meshes import write_mesh
 from jaxsmw.runtime.cache import cached
 
@@ -115,6 +115,7 @@ def test_the_method_accurate_gives_the_map_of_match(case, tmp_path):
         coverage(meshes[1], found.pointwise_map),
     )
     assert [float(row[name]) for name in FIGURES] == pytest.approx(expected, abs=1e-7)
+    assert float(row["probability"]) == pytest.approx(found.probability, abs=1e-7)
     assert row["result"] == "successful" and float(row["seconds"]) > 0
 
 
@@ -132,7 +133,7 @@ def test_the_seconds_leave_out_steps_whose_results_all_methods_share(monkeypatch
     monkeypatch.setattr("jaxsmw.benchmark.opponents.baselines.match", matched)
     pair = SimpleNamespace(meshes=(None, None), init="auto", spectra=SimpleNamespace(partial=False))
     for _ in range(2):
-        _, seconds = METHODS["accurate"].measure(pair)
+        seconds = METHODS["accurate"].measure(pair).seconds
         assert seconds == 7
     assert len(calls) == 2
 
@@ -154,3 +155,24 @@ def test_shapes_that_are_too_coarse_for_descriptors_are_measured(tmp_path):
     write_mesh(tmp_path / "x.off", bumpy_mesh(2))
     (row,) = measure_shape(("x", tmp_path / "x.off"), 20)
     assert float(row["seconds_descriptors"]) >= 0
+
+
+@pytest.mark.slow
+def test_the_overlap_of_two_real_parts_is_measured(shared):
+    data_set = open_data_set(shared / "data" / "partial_smal")
+    pair = data_set.known_pairs["cuts_19_cow_04", "cuts_9_dog_01"]
+    methods = {name: METHODS[name] for name in ("initial", "accurate")}
+    initial, accurate = measure_pair((pair, methods), Settings(evaluated_points=100), 100)
+    assert {initial[name] for name in OPTIONAL_FIGURES} == {"nan"} != initial["mean"]
+    meshes = [read_mesh(path) for path in pair.meshes]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        matched = match(*meshes, partial=True)
+    scores = list(map(overlap_scores, matched.overlap(), pair.true_overlap(*meshes)))
+    expected = (
+        *(score.intersection_over_union for score in scores),
+        np.mean([score.balanced_accuracy for score in scores]),
+        matched.probability,
+    )
+    assert [float(accurate[name]) for name in OPTIONAL_FIGURES] == pytest.approx(expected, abs=1e-7)
+    assert float(accurate["overlap_source"]) > 0.3 and float(accurate["overlap_target"]) > 0.3

@@ -62,6 +62,28 @@ def partial(directory: Path) -> None:
     put(directory / "cuts" / "cuts_cat_shape_1.baryc_gt_sym", "3 0.5 0.5 0\n" * 20)
 
 
+A, B, C = "cuts_1_cat_01", "cuts_2_dog_03", "cuts_0_cow_10"
+# The last ten vertices of A correspond to the first ten of B, and the last five of A to the last five of C.
+OVERLAPS = {
+    (A, B): [-1] * 10 + list(range(10)),
+    (A, C): [-1] * 15 + list(range(15, 20)),
+    (B, A): list(range(10, 20)) + [-1] * 10,
+}
+
+
+def two_parts(directory: Path) -> None:
+    for name in (A, B, C):
+        put(directory / "shapes" / f"{name}.off")
+    for (x, y), lines in OVERLAPS.items():
+        put(directory / "maps" / f"{x}_{y}.vts", column(lines))
+
+
+def two_cuts(directory: Path) -> None:
+    for name in ("cat-01", "cat-02"):
+        put(directory / "off" / f"{name}.off")
+    put(directory / "maps" / "cat-01_cat-02.map", column(OVERLAPS[A, B] + [1] * 11 + [0] * 9))
+
+
 def topology(directory: Path) -> None:
     for number in range(3):
         put(directory / f"kid{number:02}.off")
@@ -88,6 +110,8 @@ LAYOUTS = {
     "a remeshed set": (remeshed, [("cat1", "cat2"), ("cat1", "cat10"), ("cat2", "cat1"), ("cat2", "cat10")]),
     "SHREC'19 humans": (shrec19, [("1", "2"), ("2", "10")]),
     "SHREC'16 partial": (partial, [("cuts_cat_shape_1", "cat"), ("holes_cat_shape_1", "cat")]),
+    "PARTIALSMAL": (two_parts, [(A, C), (A, B), (B, A)]),
+    "CP2P24": (two_cuts, [("cat-01", "cat-02")]),
     "SHREC'16 topology": (topology, [("kid01", "kid00"), ("kid02", "kid00")]),
     "FAUST registrations": (faust, [("tr_reg_000", "tr_reg_002"), ("tr_reg_000", "tr_reg_011")]),
     "SCAPE": (scape, [("mesh000", "mesh001"), ("mesh000", "mesh002"), ("mesh001", "mesh000")]),
@@ -122,6 +146,11 @@ def test_layouts_are_recognised_and_their_ground_truth_is_read(tmp_path, layout)
             assert truth.targets.tolist() == list(range(19, -1, -1))
         elif layout == "SHREC'16 partial":
             assert isinstance(truth.targets, SurfacePoints) and set(truth.targets.faces.tolist()) == {1}
+        elif layout in ("PARTIALSMAL", "CP2P24"):
+            lines = np.array(OVERLAPS[pair.names if layout == "PARTIALSMAL" else (A, B)])
+            assert truth.source_vertices.tolist() == np.flatnonzero(lines >= 0).tolist()
+            assert truth.targets.tolist() == lines[lines >= 0].tolist()
+            assert pair.partial and pair.both_partial
         elif layout == "SHREC'16 topology":
             assert (truth.source_vertices.tolist(), truth.targets.tolist()) == ([0, 1], [2, 3])
         else:
@@ -129,6 +158,59 @@ def test_layouts_are_recognised_and_their_ground_truth_is_read(tmp_path, layout)
     if layout in ("SCAPE", "SHREC'19 humans"):
         with pytest.raises(InputError, match="no mirrored ground truth"):
             pair.ground_truth(*meshes, mirrored=True)
+
+
+def test_the_overlap_of_two_parts_comes_from_the_most_reliable_file(tmp_path):
+    two_parts(tmp_path / "parts")
+    two_cuts(tmp_path / "cuts")
+    mesh = make_mesh(VERTICES, FACES)
+    masks = {pair.names: pair.true_overlap(mesh, mesh) for pair in open_data_set(tmp_path / "parts").pairs}
+    for names, lines in OVERLAPS.items():
+        assert (masks[names][0] == (np.array(lines) >= 0)).all()
+    assert np.flatnonzero(masks[A, B][1]).tolist() == list(range(10))  # from the reverse file
+    assert np.flatnonzero(masks[A, C][1]).tolist() == list(range(15, 20))  # from the targets
+    (pair,) = open_data_set(tmp_path / "cuts").pairs
+    assert np.flatnonzero(pair.true_overlap(mesh, mesh)[1]).tolist() == list(range(11))
+    partial(tmp_path / "full")
+    pair = open_data_set(tmp_path / "full").pairs[0]
+    assert not pair.both_partial and pair.true_overlap(mesh, mesh) is None
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ([-1] * 19 + [20], r"line 20: 20 is not one of the vertices of .* 0 to 19"),
+        ([-1] * 19 + [-2], r"line 20: -2 is not one of the vertices of"),
+        ([-1] * 18 + [0], "has 19 lines, but needs one for each of the 20 vertices"),
+        ([-1] * 20, "is -1 on every line, so .* do not overlap: remove this pair"),
+        ([*range(1, 20), 20], "line 20: 20 is not one of .*1-based"),
+    ],
+)
+def test_bad_ground_truth_of_two_parts_is_refused_in_one_sentence(tmp_path, lines, message):
+    two_parts(tmp_path)
+    file = tmp_path / "maps" / f"{A}_{B}.vts"
+    put(file, column(lines))
+    pair = open_data_set(tmp_path).known_pairs[A, B]
+    with pytest.raises(InputError, match=message) as caught:
+        pair.ground_truth(*map(read_mesh, pair.meshes))
+    assert str(file) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_bad_masks_of_two_parts_are_refused(tmp_path):
+    two_cuts(tmp_path)
+    file = tmp_path / "maps" / "cat-01_cat-02.map"
+    (pair,) = open_data_set(tmp_path).pairs
+    meshes = [read_mesh(path) for path in pair.meshes]
+    put(file, column(OVERLAPS[A, B] + [1] * 19 + [3]))
+    with refused(str(file), "line 40", "3 is neither 0 nor 1"):
+        pair.true_overlap(*meshes)
+    put(file, column(OVERLAPS[A, B]))
+    with refused(str(file), "has 20 lines", "needs 20", "then 20"):
+        pair.true_overlap(*meshes)
+    two_parts(tmp_path / "parts")
+    put(tmp_path / "parts" / "maps" / f"{B}_{A}.vts", column([0] * 19))
+    with refused(f"{B}_{A}.vts", "has 19 lines"):
+        open_data_set(tmp_path / "parts").known_pairs[A, B].true_overlap(*meshes)
 
 
 def test_lists_of_pairs_replace_the_pairs_of_the_layout(tmp_path):
@@ -143,6 +225,10 @@ def test_lists_of_pairs_replace_the_pairs_of_the_layout(tmp_path):
     shrec19(tmp_path / "other")
     put(tmp_path / "other" / "PAIRS_list_SHREC19_connectivity.txt", "2,10\n")
     assert names(open_data_set(tmp_path / "other")) == [("2", "10")]
+    two_parts(tmp_path / "parts")
+    put(tmp_path / "parts" / "test_pairs.txt", f"{B} {A}\n")
+    parts = open_data_set(tmp_path / "parts")
+    assert names(parts) == [(B, A)] and {pair.names for pair in parts.others} == {(A, B), (A, C)}
     put(tmp_path / "list.txt", "cat1 cat2\ncat1 horse\n")
     with pytest.raises(InputError, match="line 2: 'horse' is not one of the shapes"):
         read_pairs(tmp_path / "list.txt", ["cat1", "cat2"])
@@ -183,6 +269,13 @@ BREAKAGES = {
         lambda d: (partial(d), (d / "cuts" / "cuts_cat_shape_1.baryc_gt").unlink()),
         "cuts_cat_shape_1.baryc_gt: the ground truth of .* is missing",
     ),
+    "two parts without a mesh": (
+        lambda d: (two_parts(d), (d / "shapes" / f"{C}.off").unlink()), f"{A}_{C}.vts: is not named after two meshes"
+    ),
+    "two listed parts without truth": (
+        lambda d: (two_parts(d), put(d / "test_pairs.txt", f"{B} {C}")), f"{B}_{C}.vts: the ground truth of .* is missing"
+    ),
+    "two halves": (lambda d: (two_parts(d / "test"), two_parts(d / "train")), r"several data sets \(test, train\)"),
     "no kid00": (lambda d: (topology(d), (d / "kid00.off").unlink()), "no kid00"),
     "one shape": (lambda d: put(d / "cat0.off"), "no two of its shapes form a pair"),
     "a listed pair without truth": (
@@ -251,6 +344,7 @@ REAL = {
     "tosca_nonisometric": ("a remeshed set", 45),
     "tosca": ("TOSCA", None),
     "shrec16_partial": ("SHREC'16 partial", 56),
+    "partial_smal": ("PARTIALSMAL", 60),
     "shrec16_topology": ("SHREC'16 topology", 15),
 }
 
@@ -264,7 +358,7 @@ def test_real_data_sets_are_recognised(shared, name):
     assert pairs is None or len(data_set.pairs) == pairs
     for pair in data_set.pairs[:1] + data_set.pairs[-1:]:
         truth = pair.ground_truth(read_mesh(pair.source_file), read_mesh(pair.target_file))
-        assert len(truth.source_vertices) > 500
+        assert len(truth.source_vertices) > 400
 
 
 def test_importing_data_sets_and_protocols_loads_no_heavy_module():

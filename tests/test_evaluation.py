@@ -13,9 +13,10 @@ from jaxsmw import InputError, make_mesh, read_mesh
 from jaxsmw.evaluation.ground_truth import (
     GroundTruth,
     read_ground_truth,
+    read_true_overlap,
     write_ground_truth,
 )
-from jaxsmw.evaluation.metrics import GeodesicError, coverage, geodesic_error
+from jaxsmw.evaluation.metrics import GeodesicError, OverlapScores, coverage, geodesic_error, overlap_scores
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.io.maps import read_landmarks, read_pointwise_map, write_pointwise_map
@@ -47,6 +48,28 @@ class TestReading:
         paths = write("x.vts", "4\n1\n1\n"), write("y.vts", "9\r\n2\r\n3\r\n\r\n")
         truth = read_ground_truth(paths, X, Y)
         assert truth.source_vertices.tolist() == [3, 0, 0] and truth.targets.tolist() == [8, 1, 2]
+
+    def test_vertices_without_a_counterpart_are_left_out(self, write):
+        for path in (write("x_y.vts", "8\n-1\n0\n-1\n"), write("x_y.map", "8\n-1\n0\n-1\n")):
+            truth = read_ground_truth(path, X, Y)
+            assert truth.source_vertices.tolist() == [0, 2] and truth.targets.tolist() == [8, 0]
+        truth = read_ground_truth(write("x_y.vts", "9\n-1\n1\n-1\n"), X, Y, index_base=1)
+        assert truth.source_vertices.tolist() == [0, 2] and truth.targets.tolist() == [8, 0]
+        truth = read_ground_truth(write("x_y.vts", "8\n1\n0\n2\n"), X, Y, index_base=0)
+        assert truth.targets.tolist() == [8, 1, 0, 2]
+        with pytest.raises(InputError, match="line 2: -1 is not one of the vertices of mesh_y"):
+            read_ground_truth(write("truth.txt", "8\n-1\n0\n1\n"), X, Y)
+
+    def test_gaps_between_true_points_are_closed(self, write):
+        mesh = make_mesh(*grid_mesh(7, 7), name="fine")
+        corners = [16, 18, 30, 32]  # the square between them has side 2
+        path = write("x_y.vts", "".join(f"{corner}\n" for corner in corners))
+        mask_x, mask_y = read_true_overlap(path, X, mesh)
+        assert mask_x.all() and mask_y[corners].all()
+        square = [16, 17, 18, 23, 24, 25, 30, 31, 32]
+        assert mask_y[24] and set(np.flatnonzero(mask_y)) <= set(square)
+        reverse = write("y_x.vts", "-1\n" * 48 + "3\n")
+        assert np.flatnonzero(read_true_overlap(path, X, mesh, reverse=reverse)[1]).tolist() == [48]
 
     def test_pair_with_other_suffixes_counts_from_0(self, write):
         paths = write("x.txt", "3\n0\n0\n"), write("y.txt", "8\n1\n2\n")
@@ -311,6 +334,27 @@ class TestBadFiles:
             with pytest.raises(InputError, match="not a pointwise map"):
                 write_pointwise_map(tmp_path / "a.map", nonsense)
         assert not list(tmp_path.iterdir())
+
+
+class TestOverlapScores:
+    def test_closed_forms(self):
+        predicted, true = np.array([1, 1, 0, 0, 0], bool), np.array([1, 0, 1, 0, 0], bool)
+        assert overlap_scores(predicted, true) == pytest.approx((1 / 3, (1 / 2 + 2 / 3) / 2))
+        assert overlap_scores(true, true) == OverlapScores(1, 1)
+        assert overlap_scores(~true, true) == OverlapScores(0, 0)
+        # Without vertices outside the overlap, or inside it, only the other share counts.
+        everything, nothing = np.ones(5, bool), np.zeros(5, bool)
+        assert overlap_scores(predicted, everything) == pytest.approx((0.4, 0.4))
+        assert overlap_scores(predicted, nothing) == pytest.approx((0, 0.6))
+        assert overlap_scores(nothing, nothing) == OverlapScores(1, 1)
+
+    @pytest.mark.parametrize(
+        ("predicted", "true"),
+        [([True], [True, False]), ([1, 0], [True, False]), ([], []), ([[True]], [[True]]), ([0.5], [0.5])],
+    )
+    def test_other_arrays_are_refused(self, predicted, true):
+        with refused("overlap", "two Boolean masks"):
+            overlap_scores(predicted, true)
 
 
 class TestGeodesicError:

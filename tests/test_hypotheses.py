@@ -14,8 +14,8 @@ from jaxsmw.matching.search.proxies import Proxy
 from jaxsmw.matching.shape import PreparedShape
 
 
-def reduced(mesh):
-    return Proxy(PreparedShape.of(mesh, compute_spectrum(mesh, 4)), mesh.area**0.5)
+def reduced(mesh, unit=None):
+    return Proxy(PreparedShape.of(mesh, compute_spectrum(mesh, 4)), unit or mesh.area**0.5)
 
 
 def ends_of(mesh):

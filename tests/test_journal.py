@@ -54,6 +54,17 @@ def test_tables_with_wrong_columns_or_values_are_refused(tmp_path):
     assert path.read_text() == "name,value\na,1\n"
 
 
+def test_files_of_older_versions_may_lack_optional_columns(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("name\na\n")
+    assert Journal(path, ["name"], COLUMNS, optional=["value"]).rows == [{"name": "a"}]
+    with refused("line 1: is not the header name,value"):
+        Journal(path, ["name"], COLUMNS)
+    path.write_text("name,other\na,1\n")
+    with refused("line 1: is not the header name,value"):
+        Journal(path, ["name"], COLUMNS, optional=["value"])
+
+
 def test_unreadable_and_unwritable_files_are_named(tmp_path):
     (tmp_path / "table.csv").mkdir()
     with refused("table.csv", "cannot be read", "Is a directory"):

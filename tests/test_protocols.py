@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from test_datasets import column, partial, put, shrec19, topology, tosca
+from test_datasets import A, C, column, partial, put, shrec19, topology, tosca, two_cuts, two_parts
 
 from jaxsmw import InputError, read_mesh
 from jaxsmw.benchmark import open_data_set, protocol_pairs
@@ -51,6 +51,8 @@ CASES = {
     "topkids": (topology, 2, ("kid01", "kid00"), "kid03"),
     "shrec16-cuts": (partial, 1, ("cuts_cat_shape_1", "cat"), "holes_cat_shape_1"),
     "shrec16-holes": (partial, 1, ("holes_cat_shape_1", "cat"), "cuts_cat_shape_1"),
+    "partial-smal": (two_parts, 3, (A, C), "cat"),
+    "cp2p24": (two_cuts, 1, ("cat-01", "cat-02"), "cat"),
     "tosca": (tosca, 4, ("cat0", "cat1"), "cat2"),
     "dt4d-intra": (characters, 2, ("crypto/Walk001", "crypto/Walk002"), "pumpkinhulk/Walk001"),
     "dt4d-inter": (characters, 2, ("crypto/Walk001", "ortiz/Walk001"), "pumpkinhulk/Walk001"),
@@ -161,5 +163,6 @@ def test_real_data_sets_have_the_layouts_of_their_protocols(shared):
     parts = open_data_set(shared / "data" / "shrec16_partial")
     assert len(protocol_pairs("shrec16-cuts", parts)) == 32
     assert len(protocol_pairs("shrec16-holes", parts)) == 24
+    assert len(protocol_pairs("partial-smal", open_data_set(shared / "data" / "partial_smal"))) == 60
     with pytest.raises(InputError, match="tr_reg_080"):
         protocol_pairs("faust-r", open_data_set(shared / "data" / "faust_r"))

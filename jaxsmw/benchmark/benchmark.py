@@ -18,6 +18,7 @@ from tqdm import tqdm
 from jaxsmw.benchmark.datasets import DataPair, DataSet, first_three
 from jaxsmw.benchmark.journal import Journal, Row
 from jaxsmw.benchmark.measurement import (
+    OPTIONAL_FIGURES,
     RESULT_COLUMNS,
     SHAPE_COLUMNS,
     Settings,
@@ -128,7 +129,8 @@ class _Store:
         self.files = {
             name: file for pair in pairs for name, file in zip(pair.names, pair.meshes, strict=True)
         }
-        self.results = Journal(output / "results.csv", ["source", "target", "method"], RESULT_COLUMNS)
+        key = ["source", "target", "method"]
+        self.results = Journal(output / "results.csv", key, RESULT_COLUMNS, optional=OPTIONAL_FIGURES)
         self.shapes = Journal(output / "shapes.csv", ["shape"], SHAPE_COLUMNS)
         own = data_set.shapes
         if strangers := [row["shape"] for row in self.shapes.rows if row["shape"] not in own]:

@@ -18,6 +18,9 @@ from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Bool
+
     from jaxsmw.evaluation.ground_truth import GroundTruth
     from jaxsmw.geometry.mesh import Mesh
 
@@ -34,7 +37,9 @@ class DataPair:
       i of Y.
     - `mirrored_truth`: the files of a ground truth in which left and right are exchanged; None without one.
     - `index_base`: the index of the first vertex in these files, 0 or 1; None for the default of the format.
-    - `partial`: whether X is a part of the full shape Y. Their meshes then have the same unit of length.
+    - `partial`: whether X or both are parts of full shapes. Their meshes then have the same unit of length.
+    - `both_partial`: whether both are parts. `truth` is then one file, as `read_true_overlap` reads it.
+    - `reverse_truth`: if both are parts, the file of the ground truth from Y to X; None without one.
     """
 
     source: str
@@ -45,6 +50,8 @@ class DataPair:
     mirrored_truth: tuple[Path, ...] | None = None
     index_base: IndexBase | None = None
     partial: bool = False
+    both_partial: bool = False
+    reverse_truth: Path | None = None
 
     @property
     def name(self) -> str:
@@ -90,6 +97,22 @@ class DataPair:
                 "set vertex i of one shape corresponds to vertex i of the other: use the original mesh files."
             )
         return GroundTruth.of_all_vertices(np.arange(m))
+
+    def true_overlap(
+        self, mesh_x: Mesh, mesh_y: Mesh
+    ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]] | None:
+        """Read the overlap of two parts with `jaxsmw.evaluation.read_true_overlap`.
+
+        **Returns:** A mask of the vertices of X (m,) and a mask of the vertices of Y (n,), True for vertices
+        with a counterpart on the other part; None unless both shapes are parts.
+
+        **Raises:** `InputError` if a file cannot be read or does not fit the meshes.
+        """
+        from jaxsmw.evaluation.ground_truth import read_true_overlap
+
+        if not self.both_partial:
+            return None
+        return read_true_overlap(self.truth[0], mesh_x, mesh_y, reverse=self.reverse_truth)
 
 
 @dataclass(frozen=True)
@@ -146,6 +169,12 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
     - **SHREC'16 partial** (Cosmo et al. 2016): `null/` contains the full shapes, and `cuts/` or `holes/`
       contain the partial shapes. In each pair a partial shape is the source, and its full shape is the
       target.
+    - **PARTIALSMAL** (Ehm et al. 2024): `shapes/` contains parts of animals, and `maps/` contains a file
+      `A_B.vts` for each pair of two parts. Line i contains the vertex of B that corresponds to the i-th
+      vertex of A, counted from 0, or -1 if B lacks this point.
+    - **CP2P24** (Xie et al. 2025): `off/` contains cuts of SHREC'16 partial, and `maps/` contains a file
+      `A_B.map` for each pair of two cuts. Its first lines are those of PARTIALSMAL. Then a line for each
+      vertex of B is 1 if the vertex has a counterpart on A, and otherwise 0.
     - **SHREC'16 topology** (Lähner et al. 2016): the mesh `kid00` is the target of all pairs. The sources are
       the other meshes `kidNN`, each with a file `kidNN_ref.txt`.
     - **DeformingThings4D** (remeshed characters, DT4D-H; Magnet et al. 2022): one folder (`off/`, …) contains
@@ -156,6 +185,8 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
       or one of its folders contains the meshes, and there is no ground-truth file. Vertex i of one shape
       corresponds to vertex i of every other shape. In TOSCA, vertices correspond only between shapes of the
       same class, such as `cat0` and `cat1`.
+
+    PARTIALSMAL and CP2P24 circulate in two halves, for training and for tests, each in its own directory.
 
     A data set can contain a list of pairs: a file `test_pairs.txt` or `PAIRS_list_….txt` with two names per
     line. The attribute `pairs` of the result then contains the listed pairs. Without a list, `pairs` contains
@@ -432,6 +463,51 @@ def _partial(directory: Path) -> _Pairs | None:
     return pairs, []
 
 
+def _two_parts(folder: str, suffix: str) -> Callable[[Path], _Pairs | None]:
+    """Return a function that opens a data set of pairs of two parts, with ground truth in `maps/`."""
+
+    def open_layout(directory: Path) -> _Pairs | None:
+        files = sorted((directory / "maps").glob(f"*_*{suffix}"), key=lambda file: _natural(file.stem))
+        shapes = _meshes(directory / folder)
+        if not files or not shapes:
+            return None
+        truths = {_two_names(file, shapes, directory / folder): file for file in files}
+
+        def pair(x: str, y: str) -> DataPair:
+            if (x, y) not in truths:
+                raise InputError(
+                    f"{directory / 'maps' / f'{x}_{y}{suffix}'}: the ground truth of a listed pair is "
+                    "missing: add the file, or remove the pair from the list."
+                )
+            return DataPair(
+                x,
+                y,
+                shapes[x],
+                shapes[y],
+                (truths[x, y],),
+                index_base=0,
+                partial=True,
+                both_partial=True,
+                reverse_truth=truths.get((y, x)),
+            )
+
+        return _listed_first(pair, _listed_pairs(directory, shapes), truths)
+
+    return open_layout
+
+
+def _two_names(file: Path, shapes: Mapping[str, Path], folder: Path) -> tuple[str, str]:
+    """Return the names of the two shapes in the name of a file A_B. The names may contain underscores."""
+    words = file.stem.split("_")
+    for split in range(1, len(words)):
+        x, y = "_".join(words[:split]), "_".join(words[split:])
+        if x in shapes and y in shapes:
+            return x, y
+    raise InputError(
+        f"{file}: is not named after two meshes in {folder}: add the missing mesh, or remove the file."
+    )
+
+
 def _topology(directory: Path) -> _Pairs | None:
     shapes = _mesh_folder(directory, re.compile(r"kid\d+"))
     if not shapes:
@@ -513,6 +589,8 @@ LAYOUTS = {
     "a remeshed set": Layout("off/NAME.off with corres/NAME.vts", _remeshed),
     "SHREC'19 humans": Layout("NAME.obj with FARMgt_txt/NAME_NAME.txt", _shrec19),
     "SHREC'16 partial": Layout("null/ with cuts/ or holes/", _partial),
+    "PARTIALSMAL": Layout("shapes/NAME.off with maps/NAME_NAME.vts", _two_parts("shapes", ".vts")),
+    "CP2P24": Layout("off/NAME.off with maps/NAME_NAME.map", _two_parts("off", ".map")),
     "SHREC'16 topology": Layout("kid00.off with kidNN_ref.txt", _topology),
     "DeformingThings4D": Layout("off/CLASS/NAME.off with corres/CLASS/NAME.vts", _characters),
     "FAUST registrations": Layout("tr_reg_NNN.ply", _identical(r"tr_reg_\d{3}")),

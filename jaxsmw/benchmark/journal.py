@@ -6,7 +6,7 @@ import csv
 import io
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,15 +34,23 @@ class Journal:
     - `path`: the file, which need not exist yet.
     - `key`: the names of the key columns. If two rows have the same key, the second row is ignored.
     - `columns`: the required columns. If None, the file may have any columns besides the key columns.
+    - `optional`: those of the columns that a file of an older version may lack.
     - `read_only`: whether an unfinished line is not removed, but ignored with a warning.
 
     **Raises:** `InputError` if the file cannot be read, or does not contain a table with these columns.
     """
 
     def __init__(
-        self, path: Path, key: Sequence[str], columns: Columns | None = None, *, read_only: bool = False
+        self,
+        path: Path,
+        key: Sequence[str],
+        columns: Columns | None = None,
+        *,
+        optional: Collection[str] = (),
+        read_only: bool = False,
     ):
         self.path = path
+        self._optional = optional
         self.key = tuple(key)
         self._fields: list[str] = [] if columns is None else list(columns)
         self._rows: dict[tuple[str, ...], Row] = {}
@@ -125,7 +133,7 @@ class Journal:
         except (UnicodeDecodeError, csv.Error) as error:
             raise InputError(f"{self.path}: is not a table of results ({error}): {_CURE}.") from error
         _, header = lines[0]
-        if columns and header != self._fields:
+        if columns and header != [name for name in columns if name in header or name not in self._optional]:
             raise self._fault(1, f"is not the header {','.join(self._fields)}")
         if len(set(header)) < len(header) or not set(self.key) <= set(header):
             raise self._fault(1, f"is not a header with the columns {', '.join(self.key)}")

@@ -13,20 +13,27 @@ from typing import Any, get_args
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxsmw.benchmark.datasets import DataPair
 from jaxsmw.benchmark.journal import Row
-from jaxsmw.benchmark.opponents.base import Method, MethodInput
+from jaxsmw.benchmark.opponents.base import Measured, Method, MethodInput
 from jaxsmw.benchmark.opponents.baselines import PublishedMaps, read_published_map
 from jaxsmw.choices import DEFAULT_MATCH_INIT, MatchInit
 from jaxsmw.errors import InputError
 from jaxsmw.evaluation.ground_truth import GroundTruth
-from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, THRESHOLDS, coverage, geodesic_error
+from jaxsmw.evaluation.metrics import (
+    LARGEST_THRESHOLD,
+    THRESHOLDS,
+    coverage,
+    geodesic_error,
+    overlap_scores,
+)
 from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.io.meshes import read_mesh
+from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.pair import Pair
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.runtime.provenance import machine
@@ -46,6 +53,15 @@ FIGURES = (
 """The statistics of a map that are stored in addition to its correspondence quality curve.
 
 Geodesic errors and thresholds are in units of the square root of the area of Y.
+"""
+
+
+OPTIONAL_FIGURES = ("overlap_source", "overlap_target", "balanced_accuracy", "probability")
+"""The statistics of a map that older files lack, and that are NaN for methods that do not predict them.
+
+For pairs of two parts, `overlap_source` and `overlap_target` are the intersection over union of the predicted
+and the true overlap, and `balanced_accuracy` is its mean over both parts; see
+`jaxsmw.evaluation.overlap_scores`. `probability` is the attribute of `Correspondence`.
 """
 
 
@@ -69,6 +85,7 @@ RESULT_COLUMNS: dict[str, Callable[[str], Any]] = {
     "seconds": float,
     "truth": str,
     **dict.fromkeys(FIGURES, float),
+    **dict.fromkeys(OPTIONAL_FIGURES, float),
     "curve": read_curve,
 }
 """A dictionary from the name of each column of `results.csv` to the function that parses its values.
@@ -182,6 +199,7 @@ def measure_pair(
     truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
     if settings.mirrored:
         truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
+    true_overlap = data.true_overlap(mesh_x, mesh_y)
     init: Any = settings.init
     if not settings.is_named:
         init = read_published_map(Path(settings.init), data.names, (mesh_x, mesh_y))
@@ -195,9 +213,11 @@ def measure_pair(
     rows = []
     for name, method in methods.items():
         try:
-            pointwise_map, seconds = _timed(name, method, pair)
-            ending = "successful"
-            figures = _evaluate(mesh_y, pointwise_map[: len(mesh_x.vertices)], truths, settings)
+            measured = _timed(name, method, pair)
+            seconds, ending = measured.seconds, "successful"
+            pointwise_map = np.asarray(measured.pointwise_map)[: len(mesh_x.vertices)]
+            figures = _evaluate(mesh_y, pointwise_map, truths, settings)
+            figures |= _evaluate_prediction(measured.correspondence, true_overlap)
         except ArithmeticError as error:
             seconds, ending, figures = np.nan, str(error), _NO_FIGURES
         identity = {"source": data.source, "target": data.target, "method": name, "machine": machine()}
@@ -205,19 +225,19 @@ def measure_pair(
     return rows
 
 
-def _timed(name: str, method: Method, pair: MethodInput) -> tuple[Int[np.ndarray, " m"], float]:
-    """Run a method, and return its map and its seconds without compilation; see `Method.measure`."""
+def _timed(name: str, method: Method, pair: MethodInput) -> Measured:
+    """Run a method, and return what it has measured, without the seconds of compilation."""
     for _ in range(2):
         with _compilation_seconds() as compilation, one_blas_thread():
-            pointwise_map, seconds = method.measure(pair)
-            seconds -= sum(compilation)
+            measured = method.measure(pair)
+        measured = measured._replace(seconds=measured.seconds - sum(compilation))
         warm = name in _warm and not compilation
         _warm.add(name)
         # The first run of a method takes longer, for example because of imports, so the method runs a second
         # time. In a long first run, the time for imports is negligible.
-        if warm or seconds > _LONG:
+        if warm or measured.seconds > _LONG:
             break
-    return np.asarray(pointwise_map), seconds
+    return measured
 
 
 # A run that takes longer than this number of seconds is long.
@@ -243,7 +263,10 @@ def _compilation_seconds() -> Iterator[list[float]]:
 
 
 # The statistics of a method that failed.
-_NO_FIGURES = dict.fromkeys(("truth", *FIGURES), "nan") | {"curve": " ".join(["nan"] * len(CURVE))}
+_NO_FIGURES = {
+    **dict.fromkeys(("truth", *FIGURES, *OPTIONAL_FIGURES), "nan"),
+    "curve": " ".join(["nan"] * len(CURVE)),
+}
 
 
 def _evaluate(
@@ -274,3 +297,19 @@ def _evaluate(
         **{name: f"{value:.7f}" for name, value in zip(FIGURES, figures, strict=True)},
         "curve": " ".join(f"{share:.5f}" for share in curve),
     }
+
+
+def _evaluate_prediction(
+    correspondence: Correspondence | None,
+    true_overlap: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]] | None,
+) -> Row:
+    """Return `OPTIONAL_FIGURES`, by which the predictions of a method are judged."""
+    figures = dict.fromkeys(OPTIONAL_FIGURES, np.nan)
+    if correspondence is not None:
+        figures["probability"] = correspondence.probability
+        if true_overlap is not None:
+            source, target = map(overlap_scores, correspondence.overlap(), true_overlap)
+            figures["overlap_source"] = source.intersection_over_union
+            figures["overlap_target"] = target.intersection_over_union
+            figures["balanced_accuracy"] = (source.balanced_accuracy + target.balanced_accuracy) / 2
+    return {name: f"{value:.7f}" for name, value in figures.items()}

@@ -135,6 +135,10 @@ def _test_characters(same: bool) -> Callable[[DataSet], list[DataPair]]:
     return choose
 
 
+def _listed(data_set: DataSet) -> list[DataPair]:
+    return list(data_set.pairs)
+
+
 _REMESHED, _CHARACTERS = ("a remeshed set",), ("DeformingThings4D",)
 _REN = "https://github.com/llorz/SGA18_orientation_BCICP_dataset"
 _CAO = "https://github.com/dongliangcao/Unsupervised-Learning-of-Robust-Spectral-Shape-Matching"
@@ -175,7 +179,7 @@ PROTOCOLS: dict[str, Protocol] = {
     ),
     "topkids": Protocol(
         ("SHREC'16 topology",),
-        lambda data_set: list(data_set.pairs),
+        _listed,
         "SHREC'16 topology",
         "every shape kidNN to kid00",
         "Lähner 2016, Eisenberger 2020 (smooth shells), Cao 2023 (ULRSSM)",
@@ -196,6 +200,22 @@ PROTOCOLS: dict[str, Protocol] = {
         "every shape with holes to its full shape (200 in the test set)",
         "Cosmo 2016, Attaiki 2021 (DPFM)",
         "https://www.dais.unive.it/~shrec2016/",
+    ),
+    "partial-smal": Protocol(
+        ("PARTIALSMAL",),
+        _listed,
+        "the test half of PARTIALSMAL with shapes/ and maps/",
+        "every pair of two parts with ground truth (100 in the test half), or the listed pairs",
+        "Ehm 2024, Xie 2025 (EchoMatch)",
+        "https://github.com/vikiehm/gc-ppsm",
+    ),
+    "cp2p24": Protocol(
+        ("CP2P24",),
+        _listed,
+        "the test half of CP2P24 with off/ and maps/",
+        "every pair of two cuts with ground truth",
+        "Xie 2025 (EchoMatch)",
+        "https://huggingface.co/datasets/xieyizheng/CP2P24",
     ),
     "tosca": Protocol(
         ("TOSCA", "a remeshed set"),

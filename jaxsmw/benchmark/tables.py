@@ -34,6 +34,8 @@ class MethodSummary(NamedTuple):
       confidence interval; NaN for `REFERENCE` itself.
     - `within`, `area_under_curve`, `coverage`: the means over all pairs of the share of points with an error
       of at most 0.05, of the area under the correspondence quality curve, and of the coverage.
+    - `overlap`: the mean over all pairs and both shapes of the intersection over union of the predicted and
+      the true overlap; NaN for methods that predict no overlap, and for data sets without pairs of parts.
     - `seconds`: the median time in seconds from the initial map to the result; NaN for published maps.
     - `pipeline_seconds`: the same with the precomputation of both shapes.
     - `failures`: the number of pairs on which the method failed.
@@ -46,6 +48,7 @@ class MethodSummary(NamedTuple):
     within: float
     area_under_curve: float
     coverage: float
+    overlap: float
     seconds: float
     pipeline_seconds: float
     failures: int
@@ -76,6 +79,7 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
             within=_mean(_column(good, "within_0.05")),
             area_under_curve=_mean(_column(good, "area_under_curve")),
             coverage=_mean(_column(good, "coverage")),
+            overlap=_mean((_column(good, "overlap_source") + _column(good, "overlap_target")) / 2),
             seconds=_median(seconds),
             pipeline_seconds=_median(seconds + precomputing),
             failures=len(own) - len(good),
@@ -94,7 +98,7 @@ def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
 
 
 def _column(rows: Sequence[Row], name: str) -> Float64[np.ndarray, " r"]:
-    return np.array([float(row[name]) for row in rows])
+    return np.array([float(row.get(name, "nan")) for row in rows])
 
 
 def _mean(values: Float64[np.ndarray, " r"]) -> float:
@@ -115,23 +119,32 @@ def _text(form: str, value: float) -> str:
     return "—" if np.isnan(value) else form.format(value)
 
 
-_COLUMNS: tuple[tuple[str, Callable[[MethodSummary], str]], ...] = (
+_Columns = tuple[tuple[str, Callable[[MethodSummary], str]], ...]
+_COLUMNS: _Columns = (
     ("mean error", lambda s: _text("{:.1f}", s.mean)),
     ("median", lambda s: _text("{:.1f}", s.median)),
     (f"minus {REFERENCE}", lambda s: str(s.difference)),
     ("within 0.05", lambda s: _text("{:.1%}", s.within)),
     ("area under curve", lambda s: _text("{:.3f}", s.area_under_curve)),
     ("coverage", lambda s: _text("{:.1%}", s.coverage)),
+    ("overlap IoU", lambda s: _text("{:.1%}", s.overlap)),
     ("refinement, s", lambda s: _text("{:.2f}", s.seconds)),
     ("with precomputation, s", lambda s: _text("{:.2f}", s.pipeline_seconds)),
     ("failed", lambda s: str(s.failures)),
 )
 
 
+def _columns(summaries: Mapping[str, MethodSummary]) -> _Columns:
+    """Return the columns of a table, without that of the overlap if no method predicts one."""
+    predicted = any(np.isfinite(summary.overlap) for summary in summaries.values())
+    return tuple(column for column in _COLUMNS if predicted or column[0] != "overlap IoU")
+
+
 def markdown_table(summaries: Mapping[str, MethodSummary]) -> str:
     """Return a Markdown table with one row for each method in `summaries`."""
-    header = ["method", *(title for title, _ in _COLUMNS)]
-    rows = [[name, *(text(summary) for _, text in _COLUMNS)] for name, summary in summaries.items()]
+    columns = _columns(summaries)
+    header = ["method", *(title for title, _ in columns)]
+    rows = [[name, *(text(summary) for _, text in columns)] for name, summary in summaries.items()]
     return markdown([header, *rows])
 
 
@@ -148,10 +161,11 @@ _LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
     """Return a LaTeX table (with booktabs) with one row for each method. The smallest mean error is bold."""
     best = min((s.mean for s in summaries.values() if np.isfinite(s.mean)), default=np.nan)
-    lines = [r"\begin{tabular}{l" + "r" * len(_COLUMNS) + "}", r"\toprule"]
-    lines += [" & ".join(["method", *(title for title, _ in _COLUMNS)]) + r" \\", r"\midrule"]
+    columns = _columns(summaries)
+    lines = [r"\begin{tabular}{l" + "r" * len(columns) + "}", r"\toprule"]
+    lines += [" & ".join(["method", *(title for title, _ in columns)]) + r" \\", r"\midrule"]
     for name, summary in summaries.items():
-        cells = [cell.translate(_LATEX) for cell in (name, *(text(summary) for _, text in _COLUMNS))]
+        cells = [cell.translate(_LATEX) for cell in (name, *(text(summary) for _, text in columns))]
         if summary.mean == best:
             cells[1] = rf"\textbf{{{cells[1]}}}"
         lines.append(" & ".join(cells) + r" \\")
@@ -204,6 +218,11 @@ def _introduction(data_set: DataSet, results: Results, settings: Settings) -> st
         f"Times are medians over the pairs, without compilation, on {machines}. Each local worker process "
         "uses one core.",
     ]
+    if any(pair.both_partial for pair in data_set.pairs):
+        sentences.append(
+            "Both shapes of a pair are parts, and errors are measured in their true overlap. The column "
+            "'overlap IoU' contains the intersection over union of the predicted and the true overlap."
+        )
     if results.failures:
         sentences.append(f"{len(results.failures)} shapes or pairs could not be measured.")
     return " ".join(sentences)

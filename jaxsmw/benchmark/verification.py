@@ -15,7 +15,7 @@ import numpy as np
 from jaxsmw.benchmark.benchmark import run_benchmark
 from jaxsmw.benchmark.datasets import DataPair, DataSet
 from jaxsmw.benchmark.journal import Journal, Row
-from jaxsmw.benchmark.measurement import RESULT_COLUMNS, Settings
+from jaxsmw.benchmark.measurement import OPTIONAL_FIGURES, RESULT_COLUMNS, Settings
 from jaxsmw.benchmark.opponents.base import Method
 from jaxsmw.choices import MatchInit
 from jaxsmw.errors import InputError
@@ -78,7 +78,8 @@ class StoredResults:
         if not path.is_file():
             raise InputError(f"{path}: is not a file: give the results.csv of a benchmark.")
         self.path = path
-        journal = Journal(path, ["source", "target", "method"], RESULT_COLUMNS, read_only=True)
+        key = ["source", "target", "method"]
+        journal = Journal(path, key, RESULT_COLUMNS, optional=OPTIONAL_FIGURES, read_only=True)
         self.rows: list[Row] = journal.rows
         if not self.rows:
             raise InputError(f"{path}: contains no results: give the results.csv of a benchmark.")

@@ -153,7 +153,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         type=int,
         choices=get_args(IndexBase),
         help="number of the first vertex in map, landmark and ground-truth files (default: 1 in .mat, "
-        ".vts, .baryc_gt and two-column ground-truth files, and 0 in all other files)",
+        ".baryc_gt, two .vts and two-column ground-truth files, and 0 in all other files)",
     )
 
 
@@ -174,8 +174,8 @@ def add_partial(parser: argparse.ArgumentParser, *, with_scale: bool) -> None:
         parser.add_argument(
             "--scale",
             type=_scale,
-            help="with --partial: the number by which lengths on the source are multiplied to become lengths "
-            "in the target's unit, or unknown to estimate this number (default: 1, for the same unit of "
+            help="for partial shapes: the number by which lengths on the source are multiplied to become "
+            "lengths in the target's unit, or unknown to estimate it (default: 1, for the same unit of "
             "length)",
         )
 

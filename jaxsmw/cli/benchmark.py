@@ -9,7 +9,7 @@ from typing import get_args
 
 from jaxsmw.benchmark.opponents.registry import METHODS, PEERS
 from jaxsmw.benchmark.protocols import PROTOCOLS
-from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MATCH_INIT, MatchInit
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MATCH_INIT, MatchInit, Template
 from jaxsmw.cli.arguments import add_paths, add_processes, add_seed, option_of, path, whole_number
 from jaxsmw.cli.console import report_progress, show
 from jaxsmw.cli.interruption import announce_consequence, quiet_children
@@ -27,8 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "data",
         metavar="DATASET_DIRECTORY",
         type=path,
-        help="directory of a data set in its published layout: FAUST, SCAPE, TOSCA, a SHREC set or a "
-        "remeshed set",
+        help="directory of a data set in its published layout: FAUST, SCAPE, TOSCA, a SHREC set, "
+        "PARTIALSMAL, CP2P24 or a remeshed set",
     )
     parser.add_argument(
         "--methods",
@@ -38,7 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="methods to measure (default: all methods that suit the pairs): "
         f"{', '.join(METHODS)}; {', '.join(PEERS)} if these libraries are installed. For a method of another "
         "program, give the directory of its maps, in files named X_Y.map. "
-        "cpd and smooth-shells take 20 to 30 seconds per pair. pfm matches partial shapes only",
+        "cpd and smooth-shells take 20 to 30 seconds per pair. pfm matches partial shapes only. "
+        "accurate:TEMPLATE is accurate through a template, which is a mesh file or one of "
+        f"{', '.join(get_args(Template))}",
     )
     pairs = parser.add_mutually_exclusive_group()
     pairs.add_argument(

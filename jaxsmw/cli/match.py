@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
+from jaxsmw.choices import Template
 from jaxsmw.cli.arguments import (
     add_partial,
     add_paths,
@@ -65,8 +66,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--expected-error FILE": "write to this file the expected error of each match, one per line: an "
             "estimate of the geodesic error without ground truth, divided by the square root of the target's "
             "area",
-            "--overlap FILE": "with --partial: write to this file a line for each source vertex, 1 if the "
-            "vertex has a counterpart on the target and 0 if not",
+            "--overlap FILE": "with --partial or --template: write to this file a line for each source "
+            "vertex, the probability that the vertex has a counterpart on the target; the probabilities of "
+            "the target's vertices are written beside it, for example to overlap_target.txt",
             "--one-to-one FILE": "write to this file a map in which no two source vertices share a target "
             "vertex, in the formats of --output; use this map only for meshes with the same triangulation, "
             "because it is much less accurate for other meshes",
@@ -87,6 +89,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser, required=False, purpose="true map, for errors of the map before and after refinement"
     )
     add_partial(parser, with_scale=True)
+    add_paths(
+        parser,
+        {
+            "--template FILE": "for two partial shapes that share only a region: a full shape of the same "
+            "kind of body, to which both are matched, and through it to each other; a mesh file in the "
+            f"target's unit of length, or {' or '.join(get_args(Template))} for a built-in body",
+        },
+    )
     add_method(parser)
     add_reading(parser)
     add_evaluation(parser)
@@ -98,7 +108,8 @@ def run(options: argparse.Namespace) -> None:
     with stopwatch.step("loading"):
         _check(options)
     with stopwatch.step("reading"):
-        mesh_x, mesh_y = read_meshes(options.source, options.target, weld=options.weld)
+        files = [options.source, options.target, *_template_file(options)]
+        mesh_x, mesh_y, *template = read_meshes(*files, weld=options.weld)
         truth = None
         if options.ground_truth:
             truth = read_truth(options.ground_truth, mesh_x, mesh_y, index_base=options.index_base)
@@ -106,7 +117,8 @@ def run(options: argparse.Namespace) -> None:
         from jaxsmw.geometry.assignment import check_one_to_one
 
         check_one_to_one(len(mesh_x.referenced_indices), len(mesh_y.referenced_indices))
-    correspondence = match_meshes(options, mesh_x, mesh_y, stopwatch)
+    whole = template[0] if template else options.template
+    correspondence = match_meshes(options, mesh_x, mesh_y, stopwatch, whole)
     maps = _write_files(options, correspondence, stopwatch)
     expected = estimate_error(correspondence, stopwatch)
     if options.expected_error:
@@ -129,7 +141,13 @@ def _check(options: argparse.Namespace) -> None:
     check_evaluation(options)
     searches = preset_name(options) == "accurate"
     refuse_without(options, "--preset accurate", searches, "alternatives")
-    refuse_without(options, "--partial", options.partial, "scale", "overlap")
+    are_parts = options.partial or bool(options.template)
+    refuse_without(options, "--partial or --template", are_parts, "scale", "overlap")
+    if options.template and options.init.files:
+        raise InputError(
+            "--template: cannot be used with a file of --init, which refers to source and target: leave out "
+            "the one or the other."
+        )
     refuse_without(options, "--report", bool(options.report), "up")
     reads_indices = bool(options.ground_truth or options.init.files)
     refuse_without(options, "--ground-truth or a file of --init", reads_indices, "index_base")
@@ -142,11 +160,12 @@ def _check(options: argparse.Namespace) -> None:
         if file and Path(file).suffix.lower() in (".npy", ".mat"):
             raise InputError(f"{file}: {contents} written as text: choose another suffix, such as .txt.")
     alternatives = [_alternative_file(options.output, k + 1) for k in range(options.alternatives or 0)]
+    beside = _beside(overlap, "target") if overlap else None
     inputs = _inputs(options)
     check_inputs(*inputs)
     check_outputs(
         inputs,
-        files=[options.output, points, options.one_to_one, expected, overlap, *alternatives],
+        files=[options.output, points, options.one_to_one, expected, overlap, beside, *alternatives],
         report=options.report,
         texture=options.texture,
     )
@@ -159,7 +178,14 @@ def _check(options: argparse.Namespace) -> None:
 
 def _inputs(options: argparse.Namespace) -> list[str]:
     """Return all files that the command reads."""
-    return [options.source, options.target, *options.init.files, *(options.ground_truth or ())]
+    files = [options.source, options.target, *_template_file(options)]
+    return [*files, *options.init.files, *(options.ground_truth or ())]
+
+
+def _template_file(options: argparse.Namespace) -> list[str]:
+    """Return the file of the template, in a list that is empty if there is none."""
+    is_file = options.template and options.template not in get_args(Template)
+    return [options.template] if is_file else []
 
 
 def _write_files(
@@ -199,8 +225,13 @@ def _write_files(
 
 def _alternative_file(output: str, number: int) -> str:
     """Return the name of the file of an alternative map, beside the output."""
-    root, suffix = os.path.splitext(output)
-    return f"{root}_alternative_{number}{suffix}"
+    return _beside(output, f"alternative_{number}")
+
+
+def _beside(file: str, what: str) -> str:
+    """Return the name of a further file beside a file, such as `map_target.txt` beside `map.txt`."""
+    root, suffix = os.path.splitext(file)
+    return f"{root}_{what}{suffix}"
 
 
 def _remove_earlier_alternatives(options: argparse.Namespace, written: int) -> None:
@@ -230,10 +261,12 @@ def _write_points(options: argparse.Namespace, correspondence: Correspondence, p
 
 
 def _write_overlap(file: str, correspondence: Correspondence, stopwatch: Stopwatch) -> None:
-    """Write which source vertices have a counterpart on the target, and print the shares of both areas."""
+    """Write the probabilities that vertices have a counterpart, and print the shares of both areas."""
     with stopwatch.step("overlap"):
-        mask_x, mask_y = correspondence.overlap()
-        _write_numbers(file, mask_x, "%d")
+        probabilities = correspondence.overlap_probabilities()
+        _write_numbers(file, probabilities.of_x, "%.3f")
+        _write_numbers(_beside(file, "target"), probabilities.of_y, "%.3f")
+    mask_x, mask_y = probabilities.masks
     share_x, share_y = correspondence.mesh_x.average(mask_x), correspondence.mesh_y.average(mask_y)
     show(
         f"overlap:     {share_x:.0%} of the source's area and {share_y:.0%} of the target's area have a "

@@ -34,7 +34,8 @@ def add_ground_truth(parser: argparse.ArgumentParser, *, required: bool, purpose
         required=required,
         help=f"{purpose}: a file with one target vertex per line, a file with a source and a target vertex "
         "per line, a .baryc_gt file, or two .vts files (source first). Two other files are read like .vts "
-        "files: line i of both contains the vertices of the same point",
+        "files: line i of both contains the vertices of the same point. For two partial shapes, one .vts or "
+        ".map file with -1 for source vertices without a counterpart",
     )
 
 

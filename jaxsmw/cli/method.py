@@ -20,6 +20,7 @@ from jaxsmw.choices import (
     Mirror,
     PresetName,
     Scale,
+    Template,
 )
 from jaxsmw.cli.arguments import add_eigenproblem, add_values, option_of, whole_number
 from jaxsmw.cli.banks import add_bank, bounds_unless_tight, make_bank
@@ -172,7 +173,11 @@ def _changes(options: argparse.Namespace) -> list[str]:
 
 
 def match_meshes(
-    options: argparse.Namespace, mesh_x: Mesh, mesh_y: Mesh, stopwatch: Stopwatch
+    options: argparse.Namespace,
+    mesh_x: Mesh,
+    mesh_y: Mesh,
+    stopwatch: Stopwatch,
+    template: Mesh | Template | None = None,
 ) -> Correspondence:
     """Match two meshes with the options of a command, and print their scale and hand if unknown.
 
@@ -198,6 +203,7 @@ def match_meshes(
             eigensolver=options.eigensolver,
             partial=getattr(options, "partial", False),
             scale=scale or 1.0,
+            template=template,
             mirror=options.mirror,
             backend=options.backend,
         )

@@ -1,4 +1,13 @@
-from .ground_truth import GroundTruth, read_ground_truth
-from .metrics import GeodesicError, coverage, geodesic_error
+from .ground_truth import GroundTruth, read_ground_truth, read_true_overlap
+from .metrics import GeodesicError, OverlapScores, coverage, geodesic_error, overlap_scores
 
-__all__ = ["GeodesicError", "GroundTruth", "coverage", "geodesic_error", "read_ground_truth"]
+__all__ = [
+    "GeodesicError",
+    "GroundTruth",
+    "OverlapScores",
+    "coverage",
+    "geodesic_error",
+    "overlap_scores",
+    "read_ground_truth",
+    "read_true_overlap",
+]

@@ -1,9 +1,9 @@
-"""Measures of the quality of a pointwise map: geodesic errors, their statistics, and coverage."""
+"""Measures of the quality of a map: geodesic errors, their statistics, coverage, and predicted overlaps."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -178,3 +178,45 @@ def coverage(mesh_y: Mesh, pointwise_map: ArrayLike) -> float:
     matched = np.zeros(len(mesh_y.vertices), bool)
     matched[image] = True
     return float(mesh_y.average(matched))
+
+
+class OverlapScores(NamedTuple):
+    """Two measures of the quality of a predicted overlap, as `overlap_scores` returns them.
+
+    Vertices count equally, whatever their area.
+
+    **Attributes:**
+
+    - `intersection_over_union`: the number of vertices in both masks, divided by the number of vertices in at
+      least one mask. It is 1 if both masks are empty.
+    - `balanced_accuracy`: the mean of two shares: of the vertices in the true overlap, the share that is in
+      the predicted overlap, and of the other vertices, the share that is not. If one of these sets is empty,
+      the other share alone.
+    """
+
+    intersection_over_union: float
+    balanced_accuracy: float
+
+
+def overlap_scores(predicted: ArrayLike, true: ArrayLike) -> OverlapScores:
+    """Compare a predicted overlap with the true overlap on one of two partial shapes.
+
+    **Arguments:**
+
+    - `predicted`, `true`: Boolean masks of the vertices (n,), True for vertices with a counterpart on the
+      other shape. `Correspondence.overlap` predicts such masks.
+
+    **Returns:** An `OverlapScores`.
+
+    **Raises:** `InputError` if the masks are not Boolean, are empty or differ in length.
+    """
+    predicted, true = np.asarray(predicted), np.asarray(true)
+    fit = predicted.shape == true.shape and true.ndim == 1 and len(true) > 0
+    if not fit or {predicted.dtype, true.dtype} != {np.dtype(bool)}:
+        raise InputError(
+            f"overlap: the masks have the shapes {predicted.shape} and {true.shape} and the types "
+            f"{predicted.dtype} and {true.dtype}: give two Boolean masks of the vertices of one mesh."
+        )
+    union = np.count_nonzero(predicted | true)
+    shares = [np.mean(predicted[true == side] == side) for side in (True, False) if side in true]
+    return OverlapScores(np.count_nonzero(predicted & true) / union if union else 1.0, float(np.mean(shares)))

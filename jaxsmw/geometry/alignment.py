@@ -24,6 +24,8 @@ _MOVED_FIRST = 500
 # Two alignments are different if the root mean square distance between the moved points exceeds this share of
 # the root mean square distance of y from its mean.
 _DIFFERENT = 0.25
+# The distance of the points on normals from the surface, in units of length.
+_THICKNESS = 0.1
 # A rotation is nearly ambiguous if `divisor` is at most `_AMBIGUOUS`. Otherwise, Newton's method for the
 # trace converges in 4 to 14 steps, and the error of the rotation is below 1e-10.
 _NEWTON_STEPS, _AMBIGUOUS = 16, 1e-3
@@ -180,6 +182,52 @@ def rigid_fit(
         pulls *= weights[:, None]
     (rotation,), _ = nearest_rotations((pulls.T @ (x - middle))[None])
     return Alignment(rotation, middle_of_targets - rotation @ middle)
+
+
+class PatchMotions(NamedTuple):
+    """The rigid motion that brings each of p patches as close as possible to its goals.
+
+    **Attributes:**
+
+    - `rotations`, `offsets`: the motions (p, 3, 3) and (p, 3); a point q moves to `rotation @ q + offset`.
+    - `deformations`: the mean squared distance that remains, divided by the size of the patch (p,), from 0
+      to 1. The size is the variance of the patch's positions plus the variance of its goals.
+    """
+
+    rotations: Float64[np.ndarray, "p 3 3"]
+    offsets: Float64[np.ndarray, "p 3"]
+    deformations: Float64[np.ndarray, " p"]
+
+
+def patch_motions(
+    patches: Float64[np.ndarray, "p s"],
+    positions: Float64[np.ndarray, "s 3"],
+    normals: Float64[np.ndarray, "s 3"],
+    goals: Float64[np.ndarray, "s 3"],
+    goal_normals: Float64[np.ndarray, "s 3"],
+) -> PatchMotions:
+    """Find the rigid motion of each patch of an oriented surface towards its goals.
+
+    For each point, two points on its normal count, one on either side of the surface, because a reflection of
+    a thin flat patch would only turn it over.
+
+    **Arguments:**
+
+    - `patches`: the weights of the s points in each of p patches (p, s). Each row has the sum 1.
+    - `positions`, `normals`: the points (s, 3), in units in which the surface has an area of about 1, and
+      their unit normals.
+    - `goals`, `goal_normals`: where the points and their normals should move (s, 3).
+    """
+    products = np.einsum("sa,sb->sab", goals, positions)
+    products += _THICKNESS**2 * np.einsum("sa,sb->sab", goal_normals, normals)
+    squares = np.sum(positions**2 + goals**2, axis=1, keepdims=True) + 2 * _THICKNESS**2
+    columns = patches @ np.hstack([positions, goals, products.reshape(-1, 9), squares])
+    before, after = columns[:, :3], columns[:, 3:6]
+    moments = columns[:, 6:15].reshape(-1, 3, 3) - np.einsum("pa,pb->pab", after, before)
+    rotations, traces = nearest_rotations(moments)
+    size = columns[:, 15] - np.sum(before**2 + after**2, axis=1)
+    remaining = np.clip((size - 2 * traces) / np.maximum(size, np.finfo(float).tiny), 0, 1)
+    return PatchMotions(rotations, after - np.einsum("pab,pb->pa", rotations, before), remaining)
 
 
 def nearest_rotations(

@@ -218,23 +218,39 @@ class Table:
         """Return a column as 0-based vertices (p,) of a mesh. The file counts from `base`."""
         return self.indices(column, len(mesh.vertices), f"vertices of {mesh.name}", base)
 
-    def indices(self, column: int, count: int, what: str, base: IndexBase) -> Int64[np.ndarray, " p"]:
+    def counterparts(self, mesh_x: Mesh, mesh_y: Mesh, base: IndexBase) -> Int64[np.ndarray, " m"]:
+        """Return the vertex of Y (m,) on the line of each vertex of X, 0-based, or -1 if the line is -1."""
+        m, n = len(mesh_x.vertices), len(mesh_y.vertices)
+        return self.indices(0, n, f"vertices of {mesh_y.name}", base, rows=m, gaps=True)
+
+    def indices(
+        self,
+        column: int,
+        count: int,
+        what: str,
+        base: IndexBase,
+        *,
+        rows: int | None = None,
+        gaps: bool = False,
+    ) -> Int64[np.ndarray, " p"]:
         """Return a column as 0-based indices (p,) of `count` elements, which messages call `what`.
 
         If a number is not a valid index, but all numbers are valid with the other index base, the message
-        recommends that index base.
+        recommends that index base. With `rows`, only the first rows are read. With `gaps`, -1 stays -1.
         """
-        numbers = self.values[:, column]
-        good = (numbers == np.floor(numbers)) & (numbers >= base) & (numbers < count + base)
+        numbers = self.values[:rows, column]
+        gap = (numbers == -1) & gaps
+        good = gap | (numbers == np.floor(numbers)) & (numbers >= base) & (numbers < count + base)
         if not good.all():
             row = int(good.argmin())
             cure = "correct the number, or give the file for this pair"
-            if base == 0 and numbers.min() >= 1 and numbers.max() == count:
+            least, most = numbers[~gap].min(), numbers[~gap].max()
+            if base == 0 and least >= 1 and most == count:
                 cure = "the file looks 1-based: pass index_base=1"
-            elif base == 1 and numbers.min() == 0 and numbers.max() < count:
+            elif base == 1 and least == 0 and most < count:
                 cure = "the file looks 0-based: pass index_base=0"
             raise InputError(
                 f"{self.place(row)}: {self.word(row, column)} is not one of the {what}, which are "
                 f"numbered {base} to {count - 1 + base}: {cure}."
             )
-        return numbers.astype(np.int64) - base
+        return np.where(gap, -1, numbers - base).astype(np.int64)

@@ -12,6 +12,7 @@
 - `judge`: measures of maps without ground truth.
 - `search`: the search for the right map, its judge, and the trimming of partial shapes.
 - `correspondence`: the result, for the vertices of the given meshes.
+- `template`: joins the matches of two partial shapes with a full shape.
 - `advice`: what `match` tells about a map that may be wrong.
 - `match`: all of these in one function, in the order in which they run.
 """

@@ -6,7 +6,7 @@ import functools
 import warnings
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -22,7 +22,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.assignment import one_to_one_map
 from jaxsmw.geometry.mesh import Mesh, extend_from, extend_to_unreferenced
 from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map
-from jaxsmw.matching.judge import distortion, estimate_error, overlap
+from jaxsmw.matching.judge import distortion, estimate_error, overlap_probability
 from jaxsmw.matching.outcome import Outcome, StageRun, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -37,6 +37,21 @@ if TYPE_CHECKING:
     from jaxsmw.core.soft_maps import SoftMap
 else:
     SoftMap = Any  # its module imports JAX
+
+
+class Overlap(NamedTuple):
+    """How probably each vertex of two partial shapes has a counterpart on the other shape.
+
+    **Attributes:** `of_x`, `of_y`: the probabilities of the vertices of X (m,) and of Y (n,), from 0 to 1.
+    """
+
+    of_x: Float[np.ndarray, " m"]
+    of_y: Float[np.ndarray, " n"]
+
+    @property
+    def masks(self) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
+        """Masks of X (m,) and of Y (n,), True for vertices that probably have a counterpart."""
+        return self.of_x >= 0.5, self.of_y >= 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -76,6 +91,7 @@ class Correspondence:
       X, even if X was mirrored.
     - `left_out`: the share of X's area in small components that have no counterpart on Y and only move with
       their surroundings; see `jaxsmw.transfer.match_small_components`.
+    - `shared`: the `Overlap` on the template, if the shapes were matched through one, else None.
     - `seconds`: a dictionary from the name of each step to its wall time in seconds. If JAX refines meshes of
       a certain size for the first time, the time includes compilation.
     """
@@ -95,6 +111,7 @@ class Correspondence:
     alternatives: tuple[Alternative, ...] = ()
     mirrored: bool = False
     left_out: float = 0.0
+    shared: Overlap | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -338,20 +355,18 @@ class Correspondence:
         """
         return self._expected_error.copy()
 
-    def overlap(
-        self, reverse_map: ArrayLike | None = None
-    ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
-        """Predict which vertices have a counterpart on the other shape, for partial shapes.
+    def overlap_probabilities(self, reverse_map: ArrayLike | None = None) -> Overlap:
+        """Predict how probably each vertex has a counterpart on the other shape, for partial shapes.
 
-        See `jaxsmw.matching.judge.overlap`.
+        See `jaxsmw.matching.judge.overlap_probability`. If the shapes were matched through a template, a
+        vertex must in addition lie in the region of the template that both shapes cover.
 
         **Arguments:**
 
         - `reverse_map`: a map Y -> X (n,), 0-based vertices of X. By default, `Correspondence.reverse_map`
           computes it. The map of a second match, from Y to X, makes the prediction more accurate.
 
-        **Returns:** A mask of the vertices of X (m,) and a mask of the vertices of Y (n,), True for vertices
-        with a counterpart.
+        **Returns:** An `Overlap`.
 
         **Raises:** `InputError` if the reverse map does not fit the meshes.
         """
@@ -359,10 +374,27 @@ class Correspondence:
             reverse = self.reverse_map()
         else:
             reverse = check_pointwise_map(reverse_map, self.mesh_y, self.mesh_x, "reverse map")
-        return (
-            overlap(self.pair, self.pointwise_map, reverse),
-            overlap(self.pair.reversed(), reverse, self.pointwise_map),
+        predicted = Overlap(
+            overlap_probability(self.pair, self.pointwise_map, reverse),
+            overlap_probability(self.pair.reversed(), reverse, self.pointwise_map),
         )
+        if self.shared is None:
+            return predicted
+        return Overlap(*(np.minimum(*both) for both in zip(predicted, self.shared, strict=True)))
+
+    def overlap(
+        self, reverse_map: ArrayLike | None = None
+    ) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]]:
+        """Predict which vertices have a counterpart on the other shape, for partial shapes.
+
+        **Arguments:** see `overlap_probabilities`.
+
+        **Returns:** A mask of the vertices of X (m,) and a mask of the vertices of Y (n,), True for vertices
+        that probably have a counterpart.
+
+        **Raises:** `InputError` if the reverse map does not fit the meshes.
+        """
+        return self.overlap_probabilities(reverse_map).masks
 
     def wrong_probability(self) -> float:
         """Return the probability, from 0 to 1, that the map is wrong as a whole: 1 - `probability`."""

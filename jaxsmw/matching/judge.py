@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.core.spectrum import Spectrum
-from jaxsmw.geometry.mesh import connected_components, extend_from
+from jaxsmw.geometry.mesh import Mesh, connected_components, extend_from
 from jaxsmw.geometry.sampling import coarse_edges
 from jaxsmw.matching.outcome import StageRun
 from jaxsmw.matching.pair import Pair
@@ -180,9 +180,14 @@ def edge_lengths(
     return before, after
 
 
-# The largest detour of a vertex in the overlap, in `Pair.units_of_length`. (Entry R39 of
-# docs/research_log.md)
-_LARGEST_DETOUR = 0.04
+# A vertex with this detour, in `Pair.units_of_length`, is in the overlap with a probability of one half. The
+# odds fall with this power of the detour. (Entry R39 of docs/research_log.md)
+_EVEN_DETOUR, _POWER = 0.02, 2
+# A detour of zero counts like this share of the even detour.
+_LEAST = 0.1
+# The log-odds are averaged over neighbourhoods of about this radius, in the same units, by at most this
+# number of averages over neighbouring vertices.
+_SMOOTHED, _MOST_AVERAGES = 0.04, 20
 
 
 def detours(
@@ -197,19 +202,37 @@ def detours(
     return np.linalg.norm(offsets, axis=1) / pair.units_of_length[0]
 
 
-def overlap(
+def overlap_probability(
     pair: Pair, pointwise_map: Int64[np.ndarray, " m"], reverse_map: Int64[np.ndarray, " n"]
-) -> Bool[np.ndarray, " m"]:
-    """Predict which vertices of X have a counterpart on Y.
+) -> Float[np.ndarray, " m"]:
+    """Predict how probably each vertex of X has a counterpart on Y.
 
-    A vertex without a counterpart still has a match, for example at the boundary of Y. The reverse map does
-    not lead from this match back to the vertex. A vertex is therefore in the overlap if its detour is small.
-    The prediction is wrong where a part of X without a counterpart is matched to a part of Y without a
-    counterpart.
+    Each vertex receives a match, even if the other shape lacks its true point. The match is then, for
+    example, at the boundary of Y, and the reverse map does not lead from there back to the vertex. A vertex
+    with a small detour is therefore probably in the overlap. The prediction is wrong where a part of X
+    without a counterpart is matched to a part of Y without a counterpart. On coarse meshes, detours are
+    compared with the mean length of the edges, because no match is more exact. The log-odds are averaged over
+    small neighbourhoods.
 
-    **Returns:** A mask (m,), True for the vertices in the overlap.
+    **Returns:** The probabilities (m,), from 0 to 1.
     """
-    return detours(pair, pointwise_map, reverse_map) <= _LARGEST_DETOUR
+    sides = zip(pair.meshes, pair.units_of_length, strict=True)
+    edge, edge_y = (float(mesh.lengths(mesh.edges).mean()) / unit for mesh, unit in sides)
+    far = detours(pair, pointwise_map, reverse_map) / max(_EVEN_DETOUR, edge, edge_y)
+    log_odds = -_POWER * np.log(far + _LEAST)
+    for _ in range(min(round((_SMOOTHED / edge) ** 2), _MOST_AVERAGES)):
+        log_odds = _averaged(pair.mesh_x, log_odds)
+    return 1 / (1 + np.exp(-log_odds))
+
+
+def _averaged(mesh: Mesh, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Return the mean value of each vertex and its neighbours."""
+    first, second = mesh.edges.T
+    sums, numbers = values.copy(), np.ones(len(values))
+    for vertices, others in ((first, second), (second, first)):
+        sums += np.bincount(vertices, values[others], len(values))
+        numbers += np.bincount(vertices, minlength=len(values))
+    return sums / numbers
 
 
 def expected_error(

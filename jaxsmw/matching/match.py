@@ -21,9 +21,10 @@ from jaxsmw.choices import (
     MatchInit,
     Mirror,
     Scale,
+    Template,
 )
-from jaxsmw.errors import check_choice
-from jaxsmw.geometry.mesh import Mesh, MeshLike
+from jaxsmw.errors import InputError, check_choice
+from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.advice import advice
 from jaxsmw.matching.correspondence import Correspondence
@@ -36,6 +37,7 @@ from jaxsmw.matching.search.search import search
 from jaxsmw.matching.search.trimming import match_trimmed
 from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
 from jaxsmw.matching.starts import check_initial_map, make_start
+from jaxsmw.matching.template import join, scales_to_template
 from jaxsmw.runtime.memory import release_freed_memory
 from jaxsmw.runtime.progress import Step, no_step, timed
 from jaxsmw.runtime.threads import one_blas_thread
@@ -51,6 +53,7 @@ def match(
     eigensolver: Eigensolver = "auto",
     partial: bool = False,
     scale: float | Scale = 1.0,
+    template: Mesh | MeshLike | Template | None = None,
     mirror: Mirror = DEFAULT_MIRROR,
     history: bool = False,
     backend: Backend = DEFAULT_BACKEND,
@@ -92,6 +95,13 @@ def match(
       default is False, for two full shapes. `Correspondence.overlap` predicts which vertices have a
       counterpart on the other mesh.
     - `scale`: see `Pair.make`. Full shapes are always scaled to the same area.
+    - `template`: a full shape of the same kind of body, for two partial shapes that share only a region. Both
+      are matched to the template as its parts, and through it to each other; see docs/how_it_works.md. A
+      template makes `partial` True. The default is None, to match X to Y directly.
+
+        - a mesh in the unit of length of Y.
+        - `"quadruped"`, `"biped"`: a built-in synthetic body. Its scale is estimated.
+
     - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. If they are, the
       mirror image of X is matched instead of X. Whether X is mirrored or not, entry i of the map is the match
       of vertex i of X.
@@ -118,6 +128,40 @@ def match(
     """
     check_choice(mirror, Mirror, "a mirror setting")
     check_choice(backend, Backend, "a backend")
+    if template is not None:
+        if not isinstance(init, str):
+            raise InputError(
+                "an initial map from X to Y cannot be used with a template: leave out the one or the other."
+            )
+        x, y = as_mesh(mesh_x, "source mesh"), as_mesh(mesh_y, "target mesh")
+        whole, scale_x, scale_y = scales_to_template(x, y, template, scale)
+        to_template = functools.partial(
+            match,
+            mesh_y=whole,
+            preset=preset,
+            init=init,
+            laplacian=laplacian,
+            eigensolver=eigensolver,
+            partial=True,
+            mirror=mirror,
+            backend=backend,
+        )
+        seconds: dict[str, float] = {}
+        with timed("source to template", seconds):
+            x_to_template = to_template(x, scale=scale_x)
+        with timed("target to template", seconds):
+            y_to_template = to_template(y, scale=scale_y)
+        method = choose_preset(preset)
+        with timed("source to target", seconds), one_blas_thread():
+            joined = join(
+                x_to_template,
+                y_to_template,
+                method.with_history() if history else method,
+                laplacian=laplacian,
+                eigensolver=eigensolver,
+                backend=backend,
+            )
+        return replace(joined, seconds=seconds)
     pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
     adapts = isinstance(preset, str | Preset)
     method = choose_preset(preset)
@@ -131,7 +175,7 @@ def match(
     automatic = isinstance(init, str) and init == "auto"
     first_init = check_initial_map(pair, DEFAULT_INITIAL_MAP if automatic else init)
 
-    seconds: dict[str, float] = {}
+    seconds = {}
     step = functools.partial(timed, seconds=seconds)
     release_freed_memory()
     # Searches and preparation use all cores, for which threads of the linear algebra would only wait.

@@ -194,6 +194,7 @@ def prepare(
     laplacian: Laplacian = "auto",
     eigensolver: Eigensolver = "auto",
     backend: Backend = DEFAULT_BACKEND,
+    trimmed: bool = False,
     step: Step = no_step,
 ) -> PreparedPair:
     """Prepare both shapes of a pair, and pair them.
@@ -205,6 +206,7 @@ def prepare(
     - `given`: the pair to whose vertices the result refers, if `pair` is cut; by default `pair`.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
     - `backend`: see `jaxsmw.match`.
+    - `trimmed`: see `PreparedPair`.
     - `step`: reports and measures the steps.
 
     **Returns:** A `PreparedPair` without descriptors.
@@ -221,7 +223,9 @@ def prepare(
     x, y = prepare_shapes(
         pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver, backend=backend, step=step
     )
-    return PreparedPair.of(pair, x, y, given=given, laplacian=laplacian, eigensolver=eigensolver)
+    return PreparedPair.of(
+        pair, x, y, given=given, trimmed=trimmed, laplacian=laplacian, eigensolver=eigensolver
+    )
 
 
 def paired_spectra(

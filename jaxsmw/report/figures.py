@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int
 
 from jaxsmw.choices import Axis
 from jaxsmw.core.arrays import Array
@@ -62,6 +62,7 @@ def draw_correspondence(
     error_limit: float = ERROR_LIMIT,
     up: Axis | None = None,
     azimuth: float | None = None,
+    overlap: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]] | None = None,
 ) -> Figure:
     """Draw a map by colours: each vertex of X has the colour of its match on Y.
 
@@ -82,6 +83,8 @@ def draw_correspondence(
       mesh (`jaxsmw.report.standing.guess_up`).
     - `azimuth`: the direction from which the bodies are seen, in degrees from the front of the body towards
       its left; by default chosen for the bodies (`jaxsmw.report.rendering.choose_azimuth`).
+    - `overlap`: masks of X (m,) and of Y (n,), False for vertices without a counterpart, which are grey. By
+      default, all vertices have colours.
 
     **Raises:** `InputError` if the map or the errors do not fit the meshes, if the limit is not positive, or
     if `up` is not an axis.
@@ -89,7 +92,10 @@ def draw_correspondence(
     indices = check_pointwise_map(pointwise_map, mesh_x, mesh_y)
     shown_x, shown_y = stand_pair(mesh_x, mesh_y, up, indices)
     colors_y = position_colors(shown_y)
-    panels = [_Panel("Source", shown_x, colors_y[indices]), _Panel("Target", shown_y, colors_y)]
+    colors = [colors_y[indices], colors_y]
+    if overlap is not None:
+        colors = [np.where(mask[:, None], of, PLAIN) for mask, of in zip(overlap, colors, strict=True)]
+    panels = [_Panel("Source", shown_x, colors[0]), _Panel("Target", shown_y, colors[1])]
     if not errors:
         return _draw_panels(panels, azimuth)
     check_number("error_limit", error_limit, positive=True)

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsmw.choices import Axis
 from jaxsmw.core.arrays import Array
@@ -105,6 +105,7 @@ def write_page(
     up: Axis | None = None,
     registered: Float[np.ndarray, "m 3"] | None = None,
     landmarks: tuple[Landmarks, Landmarks] | None = None,
+    overlap: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]] | None = None,
 ) -> None:
     """Write a web page that shows both bodies in 3D and colours them by one map at a time.
 
@@ -141,6 +142,8 @@ def write_page(
       page can draw X on top of Y, and a slider deforms X from its own shape to these positions.
     - `landmarks`: a pair of `Landmarks`, on X and on Y, with which the page opens, in the coordinates of the
       mesh files. Landmarks of the same name correspond.
+    - `overlap`: masks of X (m,) and of Y (n,), False for vertices without a counterpart, which are grey. By
+      default, all vertices have colours.
 
     **Raises:** `InputError` if there is no map, or if the maps, errors, spectra or registered positions do
     not fit the meshes. `InputError` is also raised if a functional map is not a matrix of finite numbers, the
@@ -168,6 +171,8 @@ def write_page(
     }
     if registered is not None:
         data["registered"] = encode_registered(registered, mesh_x, mesh_y, shown_y)
+    if overlap is not None:
+        data["alone"] = {side: encode(~mask, "u1") for side, mask in zip("xy", overlap, strict=True)}
     if landmarks is not None:
         data["landmarks"] = dict(zip("xy", map(_encode_landmarks, landmarks), strict=True))
     filters = _add_wavelets(data, mesh_x, mesh_y, spectra, refiner)
@@ -180,7 +185,7 @@ def write_page(
         "last_filter": str(max(filters - 1, 0)),
         "map_choices": _choices("map", "Map", dict(enumerate(maps))) if len(maps) > 1 else "",
         "mode_choices": _choices("mode", "Show", modes),
-        "explanations": _explanations(modes, error_meanings),
+        "explanations": _explanations(modes, error_meanings, has_parts=overlap is not None),
         "error_end": f"{error_limit:g} and above",
         "comparison": _comparison(maps),
         "statistics": f"<h2>Result</h2>{facts(statistics)}" if statistics else "",
@@ -248,13 +253,15 @@ def _choices(name: str, label: str, choices: Mapping[Any, str]) -> str:
     )
 
 
-def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str]) -> str:
+def _explanations(modes: Mapping[str, str], error_meanings: Mapping[str, str], *, has_parts: bool) -> str:
     """Return the HTML of one paragraph per mode. The viewer shows the paragraph of the current mode."""
     paragraphs = []
     for mode, label in modes.items():
         text = _EXPLANATIONS.get(mode)
         if text is None:
             text = f"{error_meanings.get(label, f'{label} of every match.')} {_DISTANCES}"
+        if mode == "transfer" and has_parts:
+            text += " Grey points probably have no counterpart on the other body."
         paragraphs.append(f'<p data-for="{mode}">{escape(text)}</p>')
     return "".join(paragraphs)
 

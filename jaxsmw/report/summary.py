@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxsmw.choices import Axis
 from jaxsmw.core.arrays import Array
@@ -124,8 +124,11 @@ def write_report(
         with timed("expected error", steps):
             correspondence.expected_error()
     shown = _shown_maps(correspondence, errors)
+    overlap = correspondence.overlap() if correspondence.pair.partial else None
     with timed("pictures", steps):
-        pictures, captions = _save_figures(directory, correspondence, shown["refined"].errors, errors, up)
+        pictures, captions = _save_figures(
+            directory, correspondence, shown["refined"].errors, errors, up, overlap
+        )
     wavelets = _last_wavelets(correspondence)
     # The page's table of maps already shows the errors of the initial map and of the refined map.
     others = {name: error for name, error in list(errors.items())[:-1] if name != "initial"}
@@ -143,6 +146,7 @@ def write_report(
         up=up,
         registered=(registered or correspondence.registered_mesh()).vertices,
         landmarks=landmarks,
+        overlap=overlap,
     )
     summary = {
         "settings": dict(settings or {}),
@@ -150,6 +154,9 @@ def write_report(
         "backend": correspondence.backend,
         "partial": correspondence.pair.partial,
         "scale": correspondence.pair.scale,
+        "overlap": None
+        if overlap is None
+        else [mesh.average(mask) for mesh, mask in zip(correspondence.pair.meshes, overlap, strict=True)],
         "distortion": correspondence.distortion,
         "suspicious": correspondence.suspicious,
         "wrong_probability": correspondence.wrong_probability(),
@@ -217,13 +224,14 @@ def _save_figures(
     per_vertex: Mapping[str, Float[np.ndarray | Array, " m"]],
     errors: Mapping[str, GeodesicError],
     up: Axis | None,
+    overlap: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]] | None,
 ) -> tuple[list[Path], dict[Path, str]]:
     """Write all figures. Return their files, and the captions of the files that are also on the page."""
     mesh_x, mesh_y = correspondence.mesh_x, correspondence.mesh_y
     convention = correspondence.preset.stages[-1].refiner.convention
     figures = {
         "correspondence": draw_correspondence(
-            mesh_x, mesh_y, correspondence.pointwise_map, errors=per_vertex, up=up
+            mesh_x, mesh_y, correspondence.pointwise_map, errors=per_vertex, up=up, overlap=overlap
         ),
         "functional_map": draw_functional_map(correspondence.functional_map, convention=convention),
     }

@@ -143,6 +143,8 @@ function shownEntry() {
 // ---- Colours
 
 const colorsY = decode(data.colors, Uint8Array);
+/** For each vertex of both bodies, 1 if it has no counterpart; null if all vertices have one. */
+const alone = data.alone && { x: decode(data.alone.x, Uint8Array), y: decode(data.alone.y, Uint8Array) };
 
 function colored(values, scale, index) {
   const colors = new Uint8Array(3 * values.length);
@@ -171,6 +173,13 @@ function announce(mode, scale) {
   document.body.dataset.mode = state.mode;
 }
 
+/** Returns colours in which the marked vertices are grey. */
+function greyed(colors, marked) {
+  const result = colors.slice();
+  marked.forEach((mark, i) => mark && result.set(data.plain, 3 * i));
+  return result;
+}
+
 /** Colours both bodies as the mode says. */
 function paint() {
   const { pointwise, errors } = maps[state.map];
@@ -182,6 +191,7 @@ function paint() {
     colors.y = colorsY;
     colors.x = new Uint8Array(3 * pointwise.length);
     pointwise.forEach((j, i) => colors.x.set(colorsY.subarray(3 * j, 3 * j + 3), 3 * i));
+    if (alone) for (const side of ["x", "y"]) colors[side] = greyed(colors[side], alone[side]);
   } else if (mode === "eigenfunctions") {
     const entry = shownEntry();
     functions = { x: eigenfunction("x", entry.x), y: eigenfunction("y", entry.y) };

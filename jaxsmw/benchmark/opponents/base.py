@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float64, Int, Int64
@@ -22,6 +23,7 @@ from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, extend_to_unreferenced, make_mesh
+from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.spectral_pair import SpectralPair
@@ -81,6 +83,22 @@ class MethodInput:
         return cls(prepared.spectra, initial_map, pair.meshes, names, init)
 
 
+class Measured(NamedTuple):
+    """The map that a method has computed, and the time that this took.
+
+    **Attributes:**
+
+    - `pointwise_map`: the pointwise map X -> Y (m,), 0-based vertices of Y.
+    - `seconds`: the seconds from the initial map to the map; NaN if it was computed elsewhere.
+    - `correspondence`: if the method calls `match`, its `Correspondence`, which also predicts the overlap of
+      two parts and the probability that the map is right; otherwise None.
+    """
+
+    pointwise_map: PointwiseMap
+    seconds: float
+    correspondence: Correspondence | None = None
+
+
 class Method(abc.ABC):
     """The base class of all compared methods. A method computes a pointwise map from a prepared pair.
 
@@ -113,11 +131,11 @@ class Method(abc.ABC):
         """Whether the package that the method needs is installed."""
         return not self.package or find_spec(self.package) is not None
 
-    def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
-        """Return the map, and the seconds from the initial map to it; NaN if it was computed elsewhere."""
+    def measure(self, pair: MethodInput) -> Measured:
+        """Compute the map, and measure its time."""
         began = time.perf_counter()
         pointwise_map = np.asarray(self(pair))  # waits for JAX
-        return pointwise_map, time.perf_counter() - began
+        return Measured(pointwise_map, time.perf_counter() - began)
 
     def check(self, pairs: Sequence[DataPair]) -> None:
         """Raise `InputError` if the method cannot match a pair. A benchmark checks all pairs at first."""

@@ -22,12 +22,21 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Int64
 
 from jaxsmw.benchmark.datasets import DataPair
-from jaxsmw.benchmark.opponents.base import MOST_SAMPLES, Method, MethodInput, PointwiseMap, successful
+from jaxsmw.benchmark.opponents.base import (
+    MOST_SAMPLES,
+    Measured,
+    Method,
+    MethodInput,
+    PointwiseMap,
+    successful,
+)
+from jaxsmw.choices import Template
 from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
@@ -37,6 +46,7 @@ from jaxsmw.core.solutions.closed_form import Filtering, NearestOrthogonal
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.maps import read_pointwise_map
+from jaxsmw.io.meshes import read_mesh
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.executor import refine_stage
 from jaxsmw.matching.match import match
@@ -71,8 +81,8 @@ class PublishedMaps(Method):
         assert pair.meshes is not None
         return read_published_map(self.directory, pair.names, pair.meshes)
 
-    def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
-        return self(pair), np.nan
+    def measure(self, pair: MethodInput) -> Measured:
+        return Measured(self(pair), np.nan)
 
     def check(self, pairs: Sequence[DataPair]) -> None:
         """Raise `InputError` if the directory has no map for a pair."""
@@ -125,11 +135,14 @@ class Matched(Method):
     """A method that calls `jaxsmw.match` with a preset, on the meshes and the argument `init` of the pair.
 
     `match` prepares the pair itself. The seconds leave out the steps whose results all methods share
-    (`_SHARED_STEPS`). Nothing is read from the cache, so all steps take as long as for new shapes.
+    (`_SHARED_STEPS`). Nothing is read from the cache, so all steps take as long as for new shapes. Through a
+    `template`, which is a mesh file or the name of a built-in shape, all steps count.
     """
 
     reference: str
     preset: PresetName
+    template: str | None = None
+    partial_only: bool = False
     number_of_eigenvectors: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -139,17 +152,38 @@ class Matched(Method):
     def __call__(self, pair: MethodInput) -> PointwiseMap:
         return self._match(pair).pointwise_map
 
-    def measure(self, pair: MethodInput) -> tuple[PointwiseMap, float]:
+    def measure(self, pair: MethodInput) -> Measured:
         with recomputing():
             result = self._match(pair)
         own_steps = (t for step, t in result.seconds.items() if step not in _SHARED_STEPS)
-        return result.pointwise_map, sum(own_steps)
+        return Measured(result.pointwise_map, sum(own_steps), result)
 
     def _match(self, pair: MethodInput) -> Correspondence:
         assert pair.meshes is not None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the errors are measured, so suspicions need no message
-            return match(*pair.meshes, preset=self.preset, init=pair.init, partial=pair.spectra.partial)
+            return match(
+                *pair.meshes,
+                preset=self.preset,
+                init=pair.init,
+                partial=pair.spectra.partial,
+                template=None if self.template is None else _template(self.template),
+            )
+
+
+def _template(name: str) -> Mesh | Template:
+    """Return the name of a built-in template, or read the mesh file of a template."""
+    return next((known for known in get_args(Template) if known == name), None) or read_mesh(name)
+
+
+def through_template(template: str) -> Matched:
+    """Return the method that matches two partial shapes through a template.
+
+    **Raises:** `InputError` if the file of the template cannot be read.
+    """
+    _template(template)  # before the benchmark starts
+    reference = f"preset accurate, through the template {Path(template).name}"
+    return Matched(reference, "accurate", template=template, partial_only=True)
 
 
 # The steps in `Correspondence.seconds` whose results are in `MethodInput`.

@@ -54,6 +54,9 @@ METHODS = Methods(
 )
 """The methods that need no other library, in the order of the rows of tables."""
 
+# The beginning of the name of a method that matches two partial shapes through a template.
+_THROUGH = "accurate:"
+
 PEERS = Methods({"pyfm-zoomout": "peers:PYFM", "geomfum-zoomout": "peers:GEOMFUM"})
 """The methods of other libraries, which a benchmark can measure if the libraries are installed."""
 
@@ -72,17 +75,23 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
     """Return methods by name.
 
     A name can also be the path of a directory with maps `X_Y.map` of another program. The name of the method
-    is then the name of the directory. Duplicate names are ignored.
+    is then the name of the directory. `accurate:TEMPLATE` is `accurate` through a template, which is a mesh
+    file or a built-in shape; see `jaxsmw.match`. Duplicate names are ignored.
 
-    **Raises:** `InputError` if a name is neither a known method nor a directory, or if two methods would have
-    the same name.
+    **Raises:** `InputError` if a name is neither a known method nor a directory, if two methods would have
+    the same name, or if a template cannot be read.
     """
-    from jaxsmw.benchmark.opponents.baselines import PublishedMaps
+    from jaxsmw.benchmark.opponents.baselines import PublishedMaps, through_template
 
     available, methods = known_methods(), {}
     for name in dict.fromkeys(names):
         if name in available:
             methods[name] = available[name]
+            continue
+        if name.startswith(_THROUGH):
+            methods[_THROUGH + Path(name).name.removeprefix(_THROUGH)] = through_template(
+                name.removeprefix(_THROUGH)
+            )
             continue
         # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
         if not os.path.isdir(name):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsmw.geometry.alignment import nearest_rotations
+from jaxsmw.geometry.alignment import patch_motions
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
@@ -19,8 +19,6 @@ _UNCOVERED, _AGREEMENT = -3.1, 1.3
 _CONTRAST = 5.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
 _LEAST = 0.01
-# The distance of the points on normals from the surface, in units of the square root of the area.
-_THICKNESS = 0.1
 # A map is in place if the mean distance between the given positions of samples and of their matches is below
 # this number of units of Y.
 _NEAR = 0.1
@@ -140,24 +138,12 @@ def discontinuity(source: Proxy, target: Proxy, matches: SampleMap, areas: Float
 def deformation(source: Proxy, target: Proxy, matches: SampleMap) -> Float[np.ndarray, " s"]:
     """Measure how far a map deviates from a rigid motion on the patch around each source sample.
 
-    A rotation and a translation carry the patch as close as possible to its matches. The deformation is the
-    mean squared distance that remains, divided by the size of the patch. The size is the variance of the
-    patch's positions plus the variance of its matches. For each sample, two points on its normal count, one
-    on either side of the surface, because a reflection of a thin flat patch would only turn it over.
-
-    A map that bends a body at its joints deforms most patches little. Mirrored and upside-down maps deform
-    most patches. The deformation is an "as-rigid-as-possible" energy (Sorkine, Alexa 2007).
+    A rotation and a translation carry the patch as close as possible to its matches (`patch_motions`). The
+    deformation is the distance that remains. A map that bends a body at its joints deforms most patches
+    little. Mirrored and upside-down maps deform most patches. The deformation is an "as-rigid-as-possible"
+    energy (Sorkine, Alexa 2007).
 
     **Returns:** The deformation of each patch (s,), from 0 for a rigid motion to at most 1.
     """
-    before, after = source.positions, target.positions[matches]
-    products = np.einsum("sa,sb->sab", before, after)
-    # The sums over two points on the normal of each sample, one on either side of the surface.
-    products += _THICKNESS**2 * np.einsum("sa,sb->sab", source.normals, target.normals[matches])
-    squares = np.sum(before**2 + after**2, axis=1, keepdims=True) + 2 * _THICKNESS**2
-    columns = source.patches @ np.hstack([before, after, products.reshape(-1, 9), squares])
-    mean_before, mean_after = columns[:, :3], columns[:, 3:6]
-    moments = columns[:, 6:15].reshape(-1, 3, 3) - np.einsum("sa,sb->sab", mean_before, mean_after)
-    size = columns[:, 15] - np.sum(mean_before**2 + mean_after**2, axis=1)
-    _, traces = nearest_rotations(moments)
-    return np.clip((size - 2 * traces) / np.maximum(size, np.finfo(float).tiny), 0, 1)
+    goals = target.positions[matches], target.normals[matches]
+    return patch_motions(source.patches, source.positions, source.normals, *goals).deformations

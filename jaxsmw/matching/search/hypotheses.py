@@ -15,6 +15,7 @@ from jaxtyping import Float, Int64
 from scipy.spatial import KDTree
 
 from jaxsmw.geometry.alignment import alignments
+from jaxsmw.matching.search.fitting import features, fits
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
@@ -39,6 +40,8 @@ def by_descriptors(reading: Reading) -> Iterator[SampleMap]:
 
 def by_alignment(reading: Reading) -> Iterator[SampleMap]:
     """Align X rigidly with Y in several ways, and match samples that are near and have similar SHOT."""
+    if reading.prepared.pair.partial:  # see `by_fits`
+        return
     x, y = reading.x, reading.y
     shot = _shot_squares(reading)
     for motion in alignments(x.positions, y.positions, _ALIGNMENTS):
@@ -91,12 +94,27 @@ def by_extremities(reading: Reading) -> Iterator[SampleMap]:
         yield costs(pairing, 1.0, slice(None)).argmin(axis=1)
 
 
+def by_fits(reading: Reading) -> Iterator[SampleMap]:
+    """Fit the smaller shape to the larger one, of which it may be a part, and match the nearest samples."""
+    x, y, pair = reading.x, reading.y, reading.prepared.pair
+    if not pair.partial:
+        return
+    area_x, area_y = pair.areas
+    moving, fixed = (x, y) if area_x <= area_y else (y, x)
+    for fit in fits(moving, fixed):
+        queries, database = fit.features, features(fixed.positions, fixed.normals)
+        if moving is y:
+            queries, database = database, queries
+        yield KDTree(database).query(queries)[1]
+
+
 HYPOTHESES: tuple[Callable[[Reading], Iterator[SampleMap]], ...] = (
     by_descriptors,
     by_alignment,
     by_given_positions,
     by_principal_axes,
     by_extremities,
+    by_fits,
 )
 """All kinds of hypothesis."""
 

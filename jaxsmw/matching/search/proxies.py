@@ -7,7 +7,7 @@ import functools
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial.distance import cdist
 
@@ -73,6 +73,17 @@ class Proxy:
         mirrored.mirrored = not self.mirrored
         return mirrored
 
+    def in_unit(self, unit: float) -> Proxy:
+        """Return the proxy in another unit of length."""
+        factor = self.unit / unit
+        other = copy.copy(self)
+        other.unit, other.positions, other._shot = unit, factor * self.positions, {}
+        # Everything that depends on distances is computed again.
+        for name in ("patches", "neighbours"):
+            vars(other).pop(name, None)
+        vars(other)["distances"] = factor * self.distances
+        return other
+
     def shot(self, radius: int) -> Float[np.ndarray, "s 352"]:
         """Return SHOT at the samples, with a radius in units of 0.06, in `unit`.
 
@@ -113,6 +124,13 @@ class Proxy:
             straight = cdist(self.positions, self.positions)
             distances = np.where(np.isfinite(distances), distances, straight)
         return distances
+
+    @functools.cached_property
+    def on_boundary(self) -> Bool[np.ndarray, " s"]:
+        """Whether a sample's region touches the boundary of the surface."""
+        on_boundary = np.zeros(len(self.mesh.vertices))
+        on_boundary[self.mesh.boundary_edges.ravel()] = 1
+        return np.bincount(self.samples.nearest, on_boundary, len(self.areas)) > 0
 
     @functools.cached_property
     def patches(self) -> Float[np.ndarray, "s s"]:
