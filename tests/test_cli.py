@@ -403,6 +403,31 @@ def test_the_overlap_of_partial_shapes_is_written(run, pair, tmp_path):
     assert f"overlap:     {mesh.average(found):.0%} of the source's area and" in outcome.output
 
 
+@pytest.mark.filterwarnings("default:.*wrong as a whole")
+def test_two_parts_are_matched_through_a_template(run, pair, tmp_path):
+    mesh = read_mesh(pair / "x.off")
+    heights = mesh.vertices[:, 1]
+    for name, kept in (
+        ("upper", heights > np.quantile(heights, 0.3)),
+        ("lower", heights < np.quantile(heights, 0.7)),
+    ):
+        part = make_mesh(mesh.vertices, mesh.faces[kept[mesh.faces].all(axis=1)])
+        write_mesh(tmp_path / f"{name}.off", part)
+    files = [tmp_path / "upper.off", tmp_path / "lower.off", "--output", tmp_path / "m.txt"]
+    call = ["match", *files, "--preset", "fast", "--template", pair / "x.off"]
+    outcome = run(*call, "--overlap", tmp_path / "overlap.txt", "--report", tmp_path / "report")
+    assert outcome.code == 0, outcome.errors
+    assert "source to template" in outcome.output and "overlap:     " in outcome.output
+    assert len(np.loadtxt(tmp_path / "m.txt")) == len(mesh.vertices)
+    summary = json.loads((tmp_path / "report" / "summary.json").read_text("utf-8"))
+    assert summary["partial"] and len(summary["overlap"]) == 2
+    np.savetxt(tmp_path / "init.txt", np.zeros(len(mesh.vertices)), "%d")
+    assert_refused(
+        run(*call, "--init", f"map:{tmp_path / 'init.txt'}"), naming="--template: cannot be used with"
+    )
+    assert_refused(run(*call[:-1], tmp_path / "missing.off"), naming="missing.off")
+
+
 def test_spectrum_writes_an_orthonormal_eigenbasis(run, pair, tmp_path):
     outcome = run(
         "spectrum", pair / "x.off", "--eigenvectors", 12, "--output", tmp_path / "s.npz", "--figure", tmp_path / "s.png"

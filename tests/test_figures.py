@@ -51,6 +51,15 @@ def panels(figure: Any) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.usefixtures("small")
+def test_points_without_a_counterpart_are_grey() -> None:
+    n = len(TALL.vertices)
+    masks = np.zeros(n, bool), np.ones(n, bool)
+    shown = panels(draw_correspondence(TALL, TALL, np.arange(n), overlap=masks))
+    source, target = (panel[panel[..., 3] == 255][:, :3].astype(int) for panel in shown.values())
+    assert np.ptp(source, axis=1).max() < 20 and np.ptp(target, axis=1).max() > 100
+
+
+@pytest.mark.usefixtures("small")
 def test_correspondence_transfers_colors() -> None:
     other, number = renumbered(replace(TALL, name="other"))
     figure = draw_correspondence(TALL, other, number)

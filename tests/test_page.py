@@ -109,6 +109,24 @@ def test_page_holds_its_data_and_loads_nothing(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["page.html"]
 
 
+def test_page_marks_points_without_a_counterpart(tmp_path: Path) -> None:
+    n, path, shown = (
+        len(TALL.vertices),
+        tmp_path / "page.html",
+        {"map": ShownMap(np.arange(len(TALL.vertices)))},
+    )
+    masks = np.arange(n) < n // 2, np.arange(n) > n // 3
+    write_page(path, TALL, TALL, shown, title="", overlap=masks)
+    page = path.read_text("utf-8")
+    for side, mask in zip("xy", masks, strict=True):
+        assert np.array_equal(decode(embedded(page)["alone"][side], "u1"), ~mask)
+    explanation = "Grey points probably have no counterpart"
+    assert explanation in page
+    write_page(path, TALL, TALL, shown, title="")
+    page = path.read_text("utf-8")
+    assert "alone" not in embedded(page) and explanation not in page
+
+
 def test_page_holds_the_placements_and_the_registered_source(tmp_path: Path) -> None:
     other, number = renumbered(ellipsoid(0.5, 1.1, 0.4, name="/home/someone/other.off"))
     other = replace(other, vertices=70 * other.vertices + [4000, 0, -3])
