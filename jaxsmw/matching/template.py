@@ -29,8 +29,8 @@ from jaxsmw.matching.stages import Preset, Sizes, Stage
 # Beside positions in units of the square root of the template's area, normals have this weight. It keeps the
 # two sides of a thin part apart.
 _NORMALS = 0.1
-
-
+# Less probable alternatives are left out, because both parts have several.
+_LEAST_PROBABILITY = 0.01
 # The number of vertices of a built-in template.
 _VERTICES = 3000
 
@@ -191,7 +191,7 @@ def _kept(mesh: Mesh, mask: Bool[np.ndarray, " n"]) -> Mesh:
 
 
 def _alternatives(x_to_template: Correspondence, y_to_template: Correspondence) -> tuple[Alternative, ...]:
-    """Return the maps that result if one of the two maps to the template is replaced by an alternative."""
+    """Return the maps that result if one of the maps to the template is replaced by an alternative."""
     template, map_x, map_y = x_to_template.mesh_y, x_to_template.pointwise_map, y_to_template.pointwise_map
     found = [
         Alternative(
@@ -209,4 +209,5 @@ def _alternatives(x_to_template: Correspondence, y_to_template: Correspondence) 
         )
         for other in y_to_template.alternatives
     ]
-    return tuple(sorted(found, key=lambda other: -other.probability))
+    likely = (other for other in found if other.probability >= _LEAST_PROBABILITY)
+    return tuple(sorted(likely, key=lambda other: -other.probability))
