@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from jaxsmw import Registration, Stage, creature_pair, make_mesh, match
 from jaxsmw.creature import creature
 from jaxsmw.errors import InputError
+from jaxsmw.matching.advice import advice
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.stages import Preset
@@ -71,6 +72,13 @@ def test_the_result_is_a_partial_correspondence_of_the_given_meshes(parts, joine
     # A vertex must lie in the region of the template that both shapes cover.
     assert (probabilities.of_x <= joined.shared.of_x).all()
     assert np.isfinite(joined.expected_error()).all()
+
+
+def test_a_template_is_recommended_for_uncertain_parts(joined):
+    uncertain = replace(joined, probability=0.1)
+    for match_of_parts, recommended in ((uncertain, False), (replace(uncertain, shared=None), True)):
+        (text,) = advice(match_of_parts, partial=True)
+        assert ("template=mesh" in text) == recommended
 
 
 def test_points_are_matched_where_they_meet_on_the_template():

@@ -63,6 +63,7 @@ _ARGUMENT = re.compile(
 _NAMES = {
     "Correspondence.alternatives": "match --alternatives 3",
     "init=landmarks": "--init landmarks:FILE",
+    "template=mesh": "--template FILE",
     "jaxsmw.report.summary.write_report": "--report DIR",
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from jaxsmw.geometry.scale import relative_boundary
 from jaxsmw.geometry.scans import SMALL_CLOSED
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.wording import percentage
@@ -62,6 +63,10 @@ def _suspicion(correspondence: Correspondence) -> str:
         cures.insert(0, 'use preset="accurate", which searches for the right map')
     if pair.partial and pair.scale == 1:
         cures.append('estimate the scale with scale="unknown" if the units of length differ')
+    if pair.partial and correspondence.shared is None and all(map(relative_boundary, pair.meshes)):
+        cures.append(
+            "match both meshes through a full shape of this kind with template=mesh if both are parts"
+        )
     if not pair.partial:
         cures.append("set partial=True if one mesh is a part of the other")
     return (
