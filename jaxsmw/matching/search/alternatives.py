@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsmw.geometry.alignment import rigid_fit
 from jaxsmw.geometry.mesh import extend_to_unreferenced
-from jaxsmw.matching.search.evidence import probabilities
-from jaxsmw.matching.search.search import Judged
+from jaxsmw.matching.search.search import Judged, shares_of
 
 # One map is another one, turned, if a rotation explains all but this share of the squared distances between
 # their matches.
@@ -36,7 +35,7 @@ class Alternative(NamedTuple):
 
 def alternatives(best: Judged, others: Sequence[Judged]) -> tuple[float, tuple[Alternative, ...]]:
     """Return the probability that the best map is right, and the other maps, the most probable first."""
-    first, *shares = probabilities([judged.log_odds for judged in (best, *others)]).tolist()
+    first, *shares = shares_of([best, *others]).tolist()
     return first, tuple(
         Alternative(
             extend_to_unreferenced(other.reading.prepared.given.mesh_x, other.pointwise_map),

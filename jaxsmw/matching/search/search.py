@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float, Int64
 
 from jaxsmw.choices import Mirror
 from jaxsmw.core.arrays import namespace
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.scale import relative_boundary
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import area_shape_difference, distortion
+from jaxsmw.matching.judge import area_shape_difference, detours, distortion
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -52,6 +54,18 @@ class Judged(Candidate):
         if not outcome.successful:
             return cls(reading, matches, NO_EVIDENCE, outcome)
         return cls(reading, matches, Evidence.of(reading, matches), outcome)
+
+    @functools.cached_property
+    def detour(self) -> float:
+        """The mean detour in both directions, in the units of the pair; infinite after a failure."""
+        if not self.outcome.successful:
+            return np.inf
+        pair = self.reading.prepared.pair
+        forward = extend_to_unreferenced(pair.mesh_x, self.pointwise_map)
+        reverse = extend_to_unreferenced(pair.mesh_y, self.outcome.last.reverse_map())
+        of_x = pair.mesh_x.average(detours(pair, forward, reverse))
+        of_y = pair.mesh_y.average(detours(pair.reversed(), reverse, forward))
+        return float((of_x + of_y) / 2)
 
     @property
     def pointwise_map(self) -> Int64[np.ndarray, " m"]:
@@ -112,7 +126,15 @@ def search(
         judged = list(different([*judged, *refined]))
         certain = _certain(judged, settings)
     likely = _likely(judged, settings)
-    return list(different([_finished(one, preset) if one in likely else one for one in judged]))
+    judged = list(different([_finished(one, preset) if one in likely else one for one in judged]))
+    shares = shares_of(judged)
+    return [judged[number] for number in np.argsort(-shares, kind="stable")]
+
+
+def shares_of(judged: Sequence[Judged]) -> Float[np.ndarray, " c"]:
+    """Return the probability of each of several different maps (c,) to be right."""
+    log_odds = [one.log_odds for one in judged]
+    return probabilities(log_odds, [one.detour for one in judged] if len(judged) > 1 else None)
 
 
 def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
