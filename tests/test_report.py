@@ -81,9 +81,10 @@ def _check_results(
 ) -> None:
     """Check that the summary and the page state the results of the match."""
     assert list(summary) == [
-        "settings", "result", "backend", "partial", "scale", "distortion", "suspicious", "wrong_probability",
-        "alternatives", "errors", "seconds", "provenance",
+        "settings", "result", "backend", "partial", "scale", "overlap", "distortion", "suspicious",
+        "wrong_probability", "alternatives", "errors", "seconds", "provenance",
     ]  # fmt: skip
+    assert summary["overlap"] is None  # both shapes are full
     assert summary["settings"] == {"seed": 3}
     assert summary["distortion"] == pytest.approx(1, abs=1e-3) and summary["suspicious"] is False
     assert summary["errors"]["refined"]["mean"] == errors["refined"].mean
