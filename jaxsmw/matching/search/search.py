@@ -57,9 +57,14 @@ class Judged(Candidate):
 
     @functools.cached_property
     def detour(self) -> float:
-        """The mean detour in both directions, in the units of the pair; infinite after a failure."""
+        """The mean detour in both directions, in the units of the pair; infinite after a failure.
+
+        It is 1 for all maps of a pair if no stage has run, because there is no reverse map.
+        """
         if not self.outcome.successful:
             return np.inf
+        if not self.outcome.runs:
+            return 1.0
         pair = self.reading.prepared.pair
         forward = extend_to_unreferenced(pair.mesh_x, self.pointwise_map)
         reverse = extend_to_unreferenced(pair.mesh_y, self.outcome.last.reverse_map())
