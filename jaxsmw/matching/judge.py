@@ -182,7 +182,7 @@ def edge_lengths(
 
 # A vertex with this detour, in `Pair.units_of_length`, is in the overlap with a probability of one half. The
 # odds fall with this power of the detour. (Entry R39 of docs/research_log.md)
-_EVEN_DETOUR, _POWER = 0.02, 2
+_EVEN_DETOUR, _POWER = 0.03, 2
 # A detour of zero counts like this share of the even detour.
 _LEAST = 0.1
 # The log-odds are averaged over neighbourhoods of about this radius, in the same units, by at most this
