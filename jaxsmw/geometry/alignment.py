@@ -82,9 +82,25 @@ def alignments(x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "q 3"], num
     - `number`: the largest number of motions.
     """
     least = _DIFFERENT**2 * ((y - y.mean(axis=0)) ** 2).sum(axis=1).mean()
+    motions = [motion for _, motion in _iterated(x, y, KDTree(y), _between_axes(x, y))]
+    return different_alignments(motions, x, least, number)
+
+
+def different_alignments(
+    motions: Sequence[Alignment], points: Float64[np.ndarray, "p 3"], least: float, number: int
+) -> list[Alignment]:
+    """Return the first motions that differ from all earlier ones.
+
+    **Arguments:**
+
+    - `motions`: rigid motions, the best first.
+    - `points`: the points that they move (p, 3).
+    - `least`: two motions differ if the mean square distance between the moved points is larger.
+    - `number`: the largest number of motions.
+    """
     kept: list[tuple[Alignment, Float64[np.ndarray, "p 3"]]] = []
-    for _, motion in _iterated(x, y, KDTree(y), _between_axes(x, y)):
-        moved = motion.apply(x)
+    for motion in motions:
+        moved = motion.apply(points)
         if all(((moved - other) ** 2).sum(axis=1).mean() > least for _, other in kept):
             kept.append((motion, moved))
         if len(kept) == number:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.spatial.transform import Rotation
 
-from jaxsmw.geometry.alignment import Alignment
+from jaxsmw.geometry.alignment import Alignment, different_alignments
 
 # The width of the Gaussian kernel, in units of length.
 _WIDTH = 0.08
@@ -73,18 +73,7 @@ def overlapping_alignments(x: Oriented, y: Oriented, number: int, *, dense: bool
             around = (best[:, None] + np.arange(-_AROUND, _AROUND + 1)) % _CELLS
             overlaps[np.ix_(*around)] = -np.inf
     found.sort(key=lambda pair: -pair[0])
-    return _different([motion for _, motion in found], x.positions, number)
-
-
-def _different(motions: list[Alignment], points: Float[np.ndarray, "s 3"], number: int) -> list[Alignment]:
-    kept: list[tuple[Alignment, Float[np.ndarray, "s 3"]]] = []
-    for motion in motions:
-        moved = motion.apply(points)
-        if all(((moved - other) ** 2).sum(axis=1).mean() > _DIFFERENT**2 for _, other in kept):
-            kept.append((motion, moved))
-        if len(kept) == number:
-            break
-    return [motion for motion, _ in kept]
+    return different_alignments([motion for _, motion in found], x.positions, _DIFFERENT**2, number)
 
 
 def _rotations(dense: bool) -> Float[np.ndarray, "r 3 3"]:

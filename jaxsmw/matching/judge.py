@@ -219,20 +219,19 @@ def overlap_probability(
     sides = zip(pair.meshes, pair.units_of_length, strict=True)
     edge, edge_y = (float(mesh.lengths(mesh.edges).mean()) / unit for mesh, unit in sides)
     far = detours(pair, pointwise_map, reverse_map) / max(_EVEN_DETOUR, edge, edge_y)
-    log_odds = -_POWER * np.log(far + _LEAST)
-    for _ in range(min(round((_SMOOTHED / edge) ** 2), _MOST_AVERAGES)):
-        log_odds = _averaged(pair.mesh_x, log_odds)
+    averages = min(round((_SMOOTHED / edge) ** 2), _MOST_AVERAGES)
+    log_odds = _averaged(pair.mesh_x, -_POWER * np.log(far + _LEAST), averages)
     return 1 / (1 + np.exp(-log_odds))
 
 
-def _averaged(mesh: Mesh, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return the mean value of each vertex and its neighbours."""
-    first, second = mesh.edges.T
-    sums, numbers = values.copy(), np.ones(len(values))
-    for vertices, others in ((first, second), (second, first)):
-        sums += np.bincount(vertices, values[others], len(values))
-        numbers += np.bincount(vertices, minlength=len(values))
-    return sums / numbers
+def _averaged(mesh: Mesh, values: Float[np.ndarray, " m"], averages: int) -> Float[np.ndarray, " m"]:
+    """Replace the value of each vertex by the mean of itself and its neighbours, several times."""
+    (first, second), m = mesh.edges.T, len(values)
+    numbers = 1 + np.bincount(mesh.edges.ravel(), minlength=m)
+    for _ in range(averages):
+        sums = values + np.bincount(first, values[second], m) + np.bincount(second, values[first], m)
+        values = sums / numbers
+    return values
 
 
 def expected_error(

@@ -102,9 +102,7 @@ def join(
         partial=True,
         scale=x_to_template.pair.scale / y_to_template.pair.scale,
     )
-    initial_map = _composed(
-        x_to_template.pair.mesh_y, x_to_template.pointwise_map, y_to_template.pointwise_map
-    )
+    initial_map = _composed(x_to_template.mesh_y, x_to_template.pointwise_map, y_to_template.pointwise_map)
     shared = _overlap(x_to_template, y_to_template)
     prepared, stage = _prepared(pair, shared, preset, laplacian, eigensolver, backend)
     if x_to_template.mirrored != y_to_template.mirrored:
@@ -193,21 +191,21 @@ def _kept(mesh: Mesh, mask: Bool[np.ndarray, " n"]) -> Mesh:
 def _alternatives(x_to_template: Correspondence, y_to_template: Correspondence) -> tuple[Alternative, ...]:
     """Return the maps that result if one of the maps to the template is replaced by an alternative."""
     template, map_x, map_y = x_to_template.mesh_y, x_to_template.pointwise_map, y_to_template.pointwise_map
-    found = [
-        Alternative(
-            _composed(template, other.pointwise_map, map_y),
-            other.probability * y_to_template.probability,
-            f"source on the template: {other.difference}",
-        )
+    replaced = [
+        ("source", other, y_to_template.probability, (other.pointwise_map, map_y))
         for other in x_to_template.alternatives
     ]
-    found += [
-        Alternative(
-            _composed(template, map_x, other.pointwise_map),
-            other.probability * x_to_template.probability,
-            f"target on the template: {other.difference.replace('the source', 'the target')}",
-        )
+    replaced += [
+        ("target", other, x_to_template.probability, (map_x, other.pointwise_map))
         for other in y_to_template.alternatives
     ]
-    likely = (other for other in found if other.probability >= _LEAST_PROBABILITY)
-    return tuple(sorted(likely, key=lambda other: -other.probability))
+    found = [
+        Alternative(
+            _composed(template, *maps),
+            other.probability * probability,
+            f"{name} on the template: {other.difference.replace('the source', f'the {name}')}",
+        )
+        for name, other, probability, maps in replaced
+        if other.probability * probability >= _LEAST_PROBABILITY
+    ]
+    return tuple(sorted(found, key=lambda other: -other.probability))

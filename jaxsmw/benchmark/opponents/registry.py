@@ -89,9 +89,8 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
             methods[name] = available[name]
             continue
         if name.startswith(_THROUGH):
-            methods[_THROUGH + Path(name).name.removeprefix(_THROUGH)] = through_template(
-                name.removeprefix(_THROUGH)
-            )
+            template = name.removeprefix(_THROUGH)
+            methods[_THROUGH + Path(template).name] = through_template(template)
             continue
         # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
         if not os.path.isdir(name):

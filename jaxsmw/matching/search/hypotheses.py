@@ -101,10 +101,9 @@ def by_fits(reading: Reading) -> Iterator[SampleMap]:
         return
     area_x, area_y = pair.areas
     moving, fixed = (x, y) if area_x <= area_y else (y, x)
+    of_fixed = features(fixed.positions, fixed.normals)
     for fit in fits(moving, fixed):
-        queries, database = fit.features, features(fixed.positions, fixed.normals)
-        if moving is y:
-            queries, database = database, queries
+        queries, database = (fit.features, of_fixed) if moving is x else (of_fixed, fit.features)
         yield KDTree(database).query(queries)[1]
 
 
