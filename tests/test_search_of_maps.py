@@ -16,6 +16,7 @@ from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.geometry.shot import mirrored_descriptors, shot_descriptors
 from jaxsmw.matching.advice import advice
+from jaxsmw.matching.judge import stretch
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
@@ -185,6 +186,27 @@ def test_different_maps_share_the_probability_of_the_best_one():
     np.testing.assert_allclose(probabilities([2000.0, 1990.0, -np.inf]), [1, 0, 0], atol=1e-9)
     assert probabilities([1.0, 0.9]).sum() == pytest.approx(probabilities([1.0])[0])
     assert len(probabilities([])) == 0
+
+
+def test_of_equal_maps_the_more_consistent_one_is_preferred():
+    first, second = probabilities([1.0, 1.0], [0.01, 0.02])
+    assert second < 1e-3 * first and first + second == pytest.approx(probabilities([1.0])[0])
+    np.testing.assert_allclose(probabilities([0.0, 0.0], [0.02, 0.02]), 1 / 4)
+    np.testing.assert_allclose(probabilities([0.0, -np.inf], [0.02, np.inf]), [1 / 2, 0])
+    assert probabilities([3.0, 2.0], [0.0, 0.0])[0] > probabilities([2.0])[0]  # both maps are exact
+
+
+def test_maps_that_tear_a_surface_stretch_it(pair):
+    mesh_x, mesh_y, truth = pair
+    pair_of_meshes = Pair.make(mesh_x, mesh_y)
+    right = stretch(pair_of_meshes, truth)
+    assert right < 0.5 * stretch(pair_of_meshes, upside_down(mesh_x, truth))
+    enlarged = Pair.make(make_mesh((7 * mesh_x.vertices, mesh_x.faces)), mesh_y)
+    assert stretch(enlarged, truth) == pytest.approx(right)
+    identity = np.arange(len(mesh_x.vertices))
+    assert stretch(Pair.make(mesh_x, mesh_x), identity) == 0
+    shuffled = np.random.default_rng(0).permutation(identity)
+    assert stretch(Pair.make(mesh_x, mesh_x), shuffled) <= 0.1  # the largest change that counts
 
 
 def test_descriptors_of_a_mirror_image_are_those_of_the_surface_in_another_order(lump):

@@ -15,8 +15,10 @@ from jaxsmw.matching.search.reading import Reading
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
 _INTERCEPT, _DEFORMATION, _IN_PLACE, _DISCONTINUITY = -6.6, -3.5, 1.4, -6.7
 _UNCOVERED, _AGREEMENT = -3.1, 1.3
-# The weight of the logarithm of the mean detour, which only counts between maps of the same pair.
-_DETOUR = -2.0
+# The weight of the logarithm of the inconsistency, which only counts between maps of the same pair.
+_INCONSISTENCY = -5.0
+# Smaller inconsistencies are equal, because exact maps have none.
+_CONSISTENT = 1e-3
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # This number is added to the deformation, because even right maps of samples have such a deformation.
@@ -98,7 +100,7 @@ NO_EVIDENCE = Evidence(np.inf, in_place=False, discontinuity=1.0, uncovered=1.0,
 
 
 def probabilities(
-    log_odds: Sequence[float], detours: Sequence[float] | None = None
+    log_odds: Sequence[float], inconsistencies: Sequence[float] | None = None
 ) -> Float[np.ndarray, " c"]:
     """Return the probability of each of several different maps to be right, given the log-odds of each (c,).
 
@@ -106,16 +108,16 @@ def probabilities(
     divided among the maps by a multinomial logistic model, in which differences of the log-odds count
     `_CONTRAST` times, because maps of the same pair are easier to compare than maps of different pairs.
 
-    If the mean detours of the maps are given (c,), maps with smaller detours are preferred. A map that
-    exchanges two legs in opposite poses can deform patches less than the right map, but it is less consistent
-    with its reverse map.
+    If the inconsistencies of the maps are given (c,), more consistent maps are preferred. A map that
+    exchanges two legs in opposite poses can deform patches less than the right map, but it stretches the
+    surface between the legs.
     """
     odds = np.asarray(log_odds, float)
     if not np.isfinite(odds).any():
         return np.zeros(len(odds))
     preferences = odds
-    if detours is not None:
-        preferences = odds + _DETOUR * np.log(np.maximum(detours, np.finfo(float).tiny))
+    if inconsistencies is not None:
+        preferences = odds + _INCONSISTENCY * np.log(np.maximum(inconsistencies, _CONSISTENT))
     shares = np.exp(_CONTRAST * (preferences - preferences.max()))
     return shares / shares.sum() / (1 + np.exp(-odds[preferences.argmax()]))
 

@@ -18,7 +18,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.scale import relative_boundary
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import area_shape_difference, detours, distortion
+from jaxsmw.matching.judge import area_shape_difference, detours, distortion, stretch
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -56,10 +56,11 @@ class Judged(Candidate):
         return cls(reading, matches, Evidence.of(reading, matches), outcome)
 
     @functools.cached_property
-    def detour(self) -> float:
-        """The mean detour in both directions, in the units of the pair; infinite after a failure.
+    def inconsistency(self) -> float:
+        """The sum of the `stretch` and the mean detour, averaged over the map and its reverse map.
 
-        It is 1 for all maps of a pair if no stage has run, because there is no reverse map.
+        It is infinite after a failure. It is 1 for all maps of a pair if no stage has run, because there is
+        no reverse map.
         """
         if not self.outcome.successful:
             return np.inf
@@ -68,9 +69,12 @@ class Judged(Candidate):
         pair = self.reading.prepared.pair
         forward = extend_to_unreferenced(pair.mesh_x, self.pointwise_map)
         reverse = extend_to_unreferenced(pair.mesh_y, self.outcome.last.reverse_map())
-        of_x = pair.mesh_x.average(detours(pair, forward, reverse))
-        of_y = pair.mesh_y.average(detours(pair.reversed(), reverse, forward))
-        return float((of_x + of_y) / 2)
+        directions = (pair, forward, reverse), (pair.reversed(), reverse, forward)
+        lengths = [
+            stretch(sides, there) + sides.mesh_x.average(detours(sides, there, back))
+            for sides, there, back in directions
+        ]
+        return float(np.mean(lengths))
 
     @property
     def pointwise_map(self) -> Int64[np.ndarray, " m"]:
@@ -139,7 +143,7 @@ def search(
 def shares_of(judged: Sequence[Judged]) -> Float[np.ndarray, " c"]:
     """Return the probability of each of several different maps (c,) to be right."""
     log_odds = [one.log_odds for one in judged]
-    return probabilities(log_odds, [one.detour for one in judged] if len(judged) > 1 else None)
+    return probabilities(log_odds, [one.inconsistency for one in judged] if len(judged) > 1 else None)
 
 
 def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
