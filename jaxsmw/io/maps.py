@@ -129,17 +129,18 @@ class Table:
 
     Each row of the matrix is one line of a text file, or one row of an array in a file. In text files, spaces
     or tabs separate numbers. Commas are refused, because `3,5` could be a number with a decimal comma or the
-    two vertices 3 and 5. `columns` is the required number of columns, or None for any number.
+    two vertices 3 and 5. `columns` is the required number of columns, or None for any number. `variable` is
+    the name of the matrix in a `.mat` file with several matrices.
     """
 
-    def __init__(self, path: Path, *, columns: int | None = None) -> None:
+    def __init__(self, path: Path, *, columns: int | None = None, variable: str = POINTWISE_MAP) -> None:
         self.path = path
         self._is_text = not is_mat_file(path) and not _is_npy_file(path)
         if self._is_text:
             self._words = self._read_text(columns)
             self.values = np.array(self._words, dtype=np.float64)
         elif is_mat_file(path):
-            self.values = read_matrix(path, POINTWISE_MAP, columns=columns)
+            self.values = read_matrix(path, variable, columns=columns)
         else:
             self.values = self._read_array(columns)
         self.rows, self.columns = self.values.shape
