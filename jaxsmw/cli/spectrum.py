@@ -31,8 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         {
             "--output FILE": "write the eigenbasis of the surface, scaled to area 1, to this file: a .npz "
-            "file with the arrays eigenvalues, eigenvectors and vertex_areas, or a .mat file with a struct S "
-            "with the fields evals, evecs, A and surface",
+            "or .safetensors file with the arrays eigenvalues, eigenvectors and vertex_areas, or a .mat file "
+            "with a struct S with the fields evals, evecs, A and surface",
             "--figure FILE": "draw the filters as functions of the eigenvalue to this file (.png, .pdf or "
             ".svg)",
         },
