@@ -394,10 +394,15 @@ REAL = {
     "shrec16_partial": ("SHREC'16 partial", 56),
     "partial_smal": ("PARTIALSMAL", 60),
     "shrec16_topology": ("SHREC'16 topology", 15),
+    "smal_r": ("a remeshed set", None),
+    "shrec19_r": ("a remeshed set", 62),
 }
+# The shapes of this set are training shapes.
+TRAINING = {"faust_r"}
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.* are vertices that no face")
 @pytest.mark.parametrize("name", REAL)
 def test_real_data_sets_are_recognised(shared, name):
     layout, pairs = REAL[name]
@@ -405,8 +410,17 @@ def test_real_data_sets_are_recognised(shared, name):
     assert data_set.layout == layout
     assert pairs is None or len(data_set.pairs) == pairs
     for pair in data_set.pairs[:1] + data_set.pairs[-1:]:
-        truth = pair.ground_truth(read_mesh(pair.source_file), read_mesh(pair.target_file))
-        assert len(truth.source_vertices) > 400
+        mesh_x, mesh_y, truth = pair.read()
+        pairs_of_vertices = truth.vertex_pairs(mesh_y)
+        assert len(pairs_of_vertices) > 400
+        assert (pairs_of_vertices.max(axis=0) < [len(mesh_x.vertices), len(mesh_y.vertices)]).all()
+        differences = compare_shapes(mesh_x, mesh_y, truth)
+        assert 0.6 < differences.factor < 1.6
+        assert differences.retriangulated == (layout in ("a remeshed set", "PARTIALSMAL"))
+    if name in TRAINING:
+        assert len(data_set.split("train")) >= len(data_set.pairs)
+        with pytest.raises(InputError, match="contains no pair of test shapes"):
+            data_set.split("test")
 
 
 @pytest.mark.parametrize("copy", [partial_copy, topology_copy])

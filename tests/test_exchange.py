@@ -24,7 +24,7 @@ from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 import jaxsmw
 from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh
 from jaxsmw.io import exchange, make_spectrum
-from jaxsmw.io.maps import read_landmarks
+from jaxsmw.io.maps import check_map_name, read_landmarks
 
 K = 12
 
@@ -739,6 +739,8 @@ def test_missing_safetensors_is_explained(bodies, spectra, pointwise_map, tmp_pa
     fault = r"map.safetensors: this format needs the package safetensors: run pip install 'jaxsmw\[safetensors\]', or use"
     with pytest.raises(InputError, match=fault):
         jaxsmw.write_pointwise_map(path, pointwise_map)
+    with pytest.raises(InputError, match=fault):  # commands call this before they match
+        check_map_name(path)
     assert not path.exists()
     path.write_bytes(b"")
     for reader in ("pointwise map", "functional map", "spectrum"):

@@ -95,6 +95,15 @@ def test_correspondences_between_classes_lead_through_the_lines_of_a_file(tmp_pa
     assert truth.targets.tolist() == list(range(10, 0, -1))
 
 
+def test_the_test_shapes_of_characters_are_listed(tmp_path):
+    characters(tmp_path)
+    pairs = {pair.names for pair in open_data_set(tmp_path).split("test")}
+    for name in ("dt4d-intra", "dt4d-inter"):
+        assert {pair.names for pair in protocol_pairs(name, open_data_set(tmp_path))} < pairs
+    assert ("pumpkinhulk/Walk001", "pumpkinhulk/Walk002") in pairs
+    assert not any("ortiz/Walk002" in names for names in pairs)
+
+
 def lines_are_wrong(directory: Path, contents: str) -> None:
     characters(directory)
     put(directory / "corres" / "cross_category_corres" / "crypto_ortiz.vts", contents)

@@ -470,7 +470,7 @@ def _remeshed(directory: Path) -> _Pairs | None:
     plain = {name: file for name, file in files.items() if not name.endswith(".sym")}
     if not plain:
         return None
-    if directory.resolve().name in _PARTIAL_FOLDERS and (directory.resolve().parent / "null").is_dir():
+    if (directory.resolve().parent / "null").is_dir():
         raise InputError(f"{directory}: is only a part of a data set: give {directory.resolve().parent}.")
     folders = (folder for folder in sorted(directory.iterdir()) if folder.is_dir() and folder != truths)
     shapes = next((meshes for meshes in map(_meshes, folders) if meshes.keys() & plain.keys()), {})

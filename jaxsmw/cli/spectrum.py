@@ -48,9 +48,11 @@ def run(options: argparse.Namespace) -> None:
     check_inputs(options.mesh)
     check_outputs([options.mesh], files=[options.output], figures=[options.figure])
     if options.output:
+        from jaxsmw.io.formats.named_arrays import check_writable
         from jaxsmw.io.spectra import SPECTRUM_SUFFIXES
 
         check_suffix(options.output, "spectra", *SPECTRUM_SUFFIXES)
+        check_writable(options.output)
     bank = make_bank(options.bank, options.filters)
     from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
     from jaxsmw.geometry.laplacian import choose_laplacian

@@ -39,8 +39,8 @@ def to_torch(result: Any) -> Tensors:
     """Convert the arrays of a result to PyTorch tensors, which share the memory of the arrays (DLPack).
 
     A tensor must not be changed in place, because the result would change too; use `tensor.clone()`.
-    `jax.numpy.from_dlpack(tensor)` converts in
-    the opposite direction, and shares memory if JAX has the tensor's type (float64 needs `jax_enable_x64`).
+    `jax.numpy.from_dlpack(tensor)` converts in the opposite direction, and shares memory if JAX has the type
+    of the tensor (float64 needs `jax_enable_x64`).
 
     **Arguments:** `result`: an array of NumPy or JAX; a `Spectrum`; or a `Correspondence`, a `Refinement` or
     another object with the attributes `pointwise_map` and `functional_map`.

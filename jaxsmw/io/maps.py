@@ -19,7 +19,13 @@ from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.formats.mat import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
-from jaxsmw.io.formats.named_arrays import ARRAY_SUFFIXES, is_array_file, read_named_array, write_named_arrays
+from jaxsmw.io.formats.named_arrays import (
+    ARRAY_SUFFIXES,
+    check_writable,
+    is_array_file,
+    read_named_array,
+    write_named_arrays,
+)
 from jaxsmw.io.formats.npz import read_array
 from jaxsmw.io.formats.text import is_number
 from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
@@ -120,13 +126,14 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 
 
 def check_map_name(path: str | os.PathLike[str]) -> None:
-    """Refuse the suffixes of other kinds of files, such as pictures and meshes, as the name of a map."""
+    """Refuse the suffix of another kind of file, such as a mesh, or of a format that needs a package."""
     suffix = Path(path).suffix.lower()
     if suffix in _NOT_MAPS:
         raise InputError(
             f"{path}: maps are written as text, .npy, .npz, .safetensors or .mat, not as {suffix}: choose a "
             "name with another suffix, such as .txt."
         )
+    check_writable(path)
 
 
 def _is_npy_file(path: str | os.PathLike[str]) -> bool:

@@ -39,16 +39,22 @@ def read_named_array(path: str | os.PathLike[str], name: str) -> np.ndarray:
 
 def write_named_arrays(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> None:
     """Write arrays to a new file, in the format of its suffix."""
+    check_writable(path)
     with atomic_write(path) as temporary:
         if Path(path).suffix.lower() == ".npz":
             np.savez(temporary, **arrays)  # type: ignore[arg-type]
             return
-        with naming(path):
-            _need_safetensors()
         from safetensors.numpy import save
 
         # `save_file` would replace the temporary file, and with it its lock and its permissions.
         temporary.write_bytes(save({name: np.ascontiguousarray(array) for name, array in arrays.items()}))
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Refuse a file whose format needs a package that is not installed, before a long computation."""
+    if Path(path).suffix.lower() == ".safetensors":
+        with naming(path):
+            _need_safetensors()
 
 
 def _read_tensors(data: bytes) -> dict[str, np.ndarray]:
