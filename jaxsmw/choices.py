@@ -51,6 +51,9 @@ GeodesicMethod = Literal["strips", "exact"]
 IndexBase = Literal[0, 1]
 """The possible indices of the first vertex in a file."""
 
+Split = Literal["train", "test"]
+"""The two parts of a data set for learned methods; see `jaxsmw.benchmark.DataSet.split`."""
+
 CoordinateSystem = Literal["LPS", "RAS"]
 """The names of coordinate systems of medical images; the letters say in which directions x, y, z increase.
 

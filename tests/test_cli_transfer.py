@@ -261,7 +261,7 @@ def test_what_cannot_be_used_is_refused(run, pair, tmp_path, arguments, fault):
         ("match {m} --output m --init landmarks:a.mps", "a.mps: contains landmarks of one mesh only"),
         (
             "match {p}/x.off {p}/y.ply --output {t}/m.fcsv",
-            "m.fcsv: maps are written as text, .npy or .mat, not as .fcsv",
+            "m.fcsv: maps are written as text, .npy, .npz, .safetensors or .mat, not as .fcsv",
         ),
         # A table may contain vertices of both meshes, so the command goes on and reads a mesh.
         ("match {m} --output {t}/m --init landmarks:a.csv", "missing_x.off"),

@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import scipy.io
 from messages import refused
-from synthetic import grid_mesh
+from synthetic import bumpy_mesh, grid_mesh
 
 from jaxsmw import InputError, read_mesh
+from jaxsmw.benchmark import compare_shapes, datasets
 from jaxsmw.benchmark.datasets import DataSet, open_data_set, read_pairs
+from jaxsmw.cli.run import run_command
+from jaxsmw.evaluation import GroundTruth
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.io.meshes import write_mesh
@@ -106,6 +109,40 @@ def tosca(directory: Path) -> None:
         put(directory / f"{name}.mat")
 
 
+def partial_copy(directory: Path) -> None:
+    """Write SHREC'16 partial as in the copy of Cao et al."""
+    put(directory / "null" / "off" / "cat.off")
+    put(directory / "cuts" / "off" / "cuts_cat_shape_1.off")
+    put(directory / "cuts" / "corres" / "cuts_cat_shape_1.vts", column(range(20, 0, -1)))
+
+
+def topology_copy(directory: Path) -> None:
+    """Write SHREC'16 topology as in the copy of Cao et al."""
+    for number in range(3):
+        put(directory / "off" / f"kid{number:02}.off")
+        if number:
+            put(directory / "corres" / f"kid{number:02}_ref.vts", column(range(20, 0, -1)))
+
+
+# The names of landmarks, their vertices, and their faces and weights, counted from 1.
+LANDMARKS = {
+    "cow": ([1, 2, 7, 52], [3, 4, 5, 6], [[1, 1, 0, 0], [2, 0, 1, 0], [3, 0, 0, 1], [4, 0.5, 0.5, 0]]),
+    "bison": ([2, 1, 9, 52], [7, 8, 9, 10], [[5, 1, 0, 0], [6, 0, 1, 0], [7, 0, 0, 1], [8, 0.2, 0.3, 0.5]]),
+    "dog": ([1, 3], [11, 12], [[9, 0, 1, 0], [10, 1, 0, 0]]),
+}
+
+
+def animals(directory: Path) -> None:
+    for name, (points, vertices, weights) in LANDMARKS.items():
+        put(directory / "models" / f"{name}.obj")
+        folder = directory.with_name(f"{directory.name}_gts")
+        folder.mkdir(exist_ok=True)
+        named = dict(fname=f"{name}.obj", points=points, verts=vertices, baryc=weights, centroids=np.eye(3))
+        scipy.io.savemat(folder / f"{name}.mat", named)
+    put(directory / "test-sets" / "test-set0.txt", "dog,cow\n")
+    put(directory / "test-sets" / "test-set1.txt", "cow,bison\n")
+
+
 LAYOUTS = {
     "a remeshed set": (remeshed, [("cat1", "cat2"), ("cat1", "cat10"), ("cat2", "cat1"), ("cat2", "cat10")]),
     "SHREC'19 humans": (shrec19, [("1", "2"), ("2", "10")]),
@@ -113,6 +150,7 @@ LAYOUTS = {
     "PARTIALSMAL": (two_parts, [(A, C), (A, B), (B, A)]),
     "CP2P24": (two_cuts, [("cat-01", "cat-02")]),
     "SHREC'16 topology": (topology, [("kid01", "kid00"), ("kid02", "kid00")]),
+    "SHREC'20": (animals, [("dog", "cow"), ("cow", "bison")]),
     "FAUST registrations": (faust, [("tr_reg_000", "tr_reg_002"), ("tr_reg_000", "tr_reg_011")]),
     "SCAPE": (scape, [("mesh000", "mesh001"), ("mesh000", "mesh002"), ("mesh001", "mesh000")]),
     "TOSCA": (tosca, [("cat0", "cat1"), ("cat1", "cat0"), ("wolf0", "wolf2"), ("wolf2", "wolf0")]),
@@ -146,6 +184,16 @@ def test_layouts_are_recognised_and_their_ground_truth_is_read(tmp_path, layout)
             assert truth.targets.tolist() == list(range(19, -1, -1))
         elif layout == "SHREC'16 partial":
             assert isinstance(truth.targets, SurfacePoints) and set(truth.targets.faces.tolist()) == {1}
+        elif layout == "SHREC'20":
+            expected = {
+                "dog": ([10], [0], [[1, 0, 0]]),
+                "cow": ([2, 3, 5], [5, 4, 7], [[0, 1, 0], [1, 0, 0], [0.2, 0.3, 0.5]]),
+            }
+            sources, triangles, weights = expected[pair.source]
+            assert truth.source_vertices.tolist() == sources
+            assert truth.targets.faces.tolist() == triangles
+            np.testing.assert_allclose(truth.targets.weights, weights)
+            assert pair.partial == (pair.source == "dog")
         elif layout in ("PARTIALSMAL", "CP2P24"):
             lines = np.array(OVERLAPS[pair.names if layout == "PARTIALSMAL" else (A, B)])
             assert truth.source_vertices.tolist() == np.flatnonzero(lines >= 0).tolist()
@@ -346,10 +394,15 @@ REAL = {
     "shrec16_partial": ("SHREC'16 partial", 56),
     "partial_smal": ("PARTIALSMAL", 60),
     "shrec16_topology": ("SHREC'16 topology", 15),
+    "smal_r": ("a remeshed set", None),
+    "shrec19_r": ("a remeshed set", 62),
 }
+# The shapes of this set are training shapes.
+TRAINING = {"faust_r"}
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.* are vertices that no face")
 @pytest.mark.parametrize("name", REAL)
 def test_real_data_sets_are_recognised(shared, name):
     layout, pairs = REAL[name]
@@ -357,8 +410,192 @@ def test_real_data_sets_are_recognised(shared, name):
     assert data_set.layout == layout
     assert pairs is None or len(data_set.pairs) == pairs
     for pair in data_set.pairs[:1] + data_set.pairs[-1:]:
-        truth = pair.ground_truth(read_mesh(pair.source_file), read_mesh(pair.target_file))
-        assert len(truth.source_vertices) > 400
+        mesh_x, mesh_y, truth = pair.read()
+        pairs_of_vertices = truth.vertex_pairs(mesh_y)
+        assert len(pairs_of_vertices) > 400
+        assert (pairs_of_vertices.max(axis=0) < [len(mesh_x.vertices), len(mesh_y.vertices)]).all()
+        differences = compare_shapes(mesh_x, mesh_y, truth)
+        assert 0.6 < differences.factor < 1.6
+        assert differences.retriangulated == (layout in ("a remeshed set", "PARTIALSMAL"))
+    if name in TRAINING:
+        assert len(data_set.split("train")) >= len(data_set.pairs)
+        with pytest.raises(InputError, match="contains no pair of test shapes"):
+            data_set.split("test")
+
+
+@pytest.mark.parametrize("copy", [partial_copy, topology_copy])
+def test_the_copies_of_a_training_framework_are_read(tmp_path, copy):
+    copy(tmp_path)
+    data_set = open_data_set(tmp_path)
+    for pair in data_set.pairs:
+        _, mesh_y, truth = pair.read()
+        assert truth.vertex_pairs(mesh_y)[:, 1].tolist() == list(range(19, -1, -1))
+    assert data_set.layout == {partial_copy: "SHREC'16 partial", topology_copy: "SHREC'16 topology"}[copy]
+    assert len(data_set.pairs) == (1 if copy is partial_copy else 2)
+    if copy is partial_copy:
+        with pytest.raises(InputError, match=r"cuts: is only a part of a data set: give"):
+            open_data_set(tmp_path / "cuts")
+
+
+def unfit(directory: Path, name: str, **variables: object) -> None:
+    points, vertices, weights = LANDMARKS[name]
+    whole = dict(points=points, verts=vertices, baryc=weights) | variables
+    saved = {key: value for key, value in whole.items() if value is not None}
+    scipy.io.savemat(directory.with_name(f"{directory.name}_gts") / f"{name}.mat", saved)
+
+
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        (dict(points=[3, 4, 5, 6]), r"bison.mat: has no point in common with .*cow.mat"),
+        (dict(points=[1, 2, 7]), r"bison.mat: has 3 points but 4 verts"),
+        (dict(verts=None), r"bison.mat: contains points, but no verts"),
+        (dict(baryc=np.tile([1, 1, 0, 0], (3, 1))), r"bison.mat: has 4 points but 3 rows of baryc"),
+        (dict(baryc=np.tile([1, 1, 1, 0], (4, 1))), r"bison.mat, row 1: 1 1 0 are not barycentric weights|not barycentric"),
+        (dict(verts=[1, 2, 3, 21]), r"bison.mat, row 4: 21 is not one of the vertices|baryc"),
+    ],
+)  # fmt: skip
+def test_bad_landmarks_are_refused(tmp_path, variables, message):
+    animals(tmp_path / "set")
+    if "verts" in variables:
+        variables = variables | dict(baryc=None)
+    unfit(tmp_path / "set", "bison", **variables)
+    with pytest.raises(InputError, match=message):
+        open_data_set(tmp_path / "set").pairs[1].read()
+
+
+def test_landmarks_without_weights_have_vertices_as_targets(tmp_path):
+    animals(tmp_path / "set")
+    unfit(tmp_path / "set", "bison", baryc=None)
+    _, mesh_y, truth = open_data_set(tmp_path / "set").pairs[1].read()
+    assert truth.vertex_pairs(mesh_y).tolist() == [[2, 7], [3, 6], [5, 9]]
+
+
+def test_missing_landmarks_are_named(tmp_path):
+    animals(tmp_path / "set")
+    (tmp_path / "set_gts" / "dog.mat").unlink()
+    with pytest.raises(
+        InputError, match=r"set_gts.dog.mat: the ground truth of .*dog.obj is missing: unpack set_gts"
+    ):
+        open_data_set(tmp_path / "set")
+
+
+def split_names(data_set: DataSet, part: str) -> set[str]:
+    return {name for pair in data_set.split(part) for name in pair.names}
+
+
+def numbered(directory: Path) -> None:
+    for number in (0, 79, 80, 99):
+        put(directory / f"tr_reg_{number:03}.ply")
+
+
+def numbered_poses(directory: Path) -> None:
+    for number in (0, 50, 52, 71):
+        put(directory / f"mesh{number:03}.off")
+
+
+def listed(directory: Path) -> None:
+    remeshed(directory)
+    put(directory / "train_cat.txt", "cat1\ndog0\n")
+    put(directory / "test_cat.txt", "cat2\ncat10\n")
+    put(directory / "test.txt", "cat1\ncat2\n")
+
+
+SPLITS = {
+    "FAUST": (numbered, {"tr_reg_000", "tr_reg_079"}, {"tr_reg_080", "tr_reg_099"}),
+    "SCAPE": (numbered_poses, {"mesh000", "mesh050"}, {"mesh052", "mesh071"}),
+    "lists": (listed, {"cat1", "dog0"}, {"cat2", "cat10"}),
+    "only tests": (topology, set(), {"kid00", "kid01", "kid02"}),
+}
+
+
+@pytest.mark.parametrize("case", SPLITS)
+def test_published_splits_are_known(tmp_path, case):
+    build, train, test = SPLITS[case]
+    build(tmp_path)
+    data_set = open_data_set(tmp_path)
+    assert split_names(data_set, "test") == test
+    if train:
+        assert split_names(data_set, "train") == train
+    else:
+        with pytest.raises(InputError, match="contains no pair of train shapes"):
+            data_set.split("train")
+
+
+def test_the_halves_of_a_data_set_have_directories_of_their_own(tmp_path):
+    for name in ("test", "SHREC16"):
+        partial(tmp_path / name)
+    assert open_data_set(tmp_path / "test").split("test") == open_data_set(tmp_path / "test").pairs
+    for name, part in (("test", "train"), ("SHREC16", "test")):
+        with pytest.raises(InputError, match=f"that it is the {part} half of SHREC'16 partial: open"):
+            open_data_set(tmp_path / name).split(part)
+
+
+def test_splits_that_do_not_exist_are_refused(tmp_path):
+    tosca(tmp_path)
+    data_set = open_data_set(tmp_path)
+    with pytest.raises(InputError, match=r"has no published split: write .* into train.txt"):
+        data_set.split("train")
+    put(tmp_path / "train.txt", "cat0\ncow7\n")
+    with pytest.raises(InputError, match="lacks the listed shapes cow7"):
+        data_set.split("train")
+
+
+def test_each_layout_names_papers(tmp_path):
+    topology(tmp_path)
+    assert "Lähner 2016" in open_data_set(tmp_path).papers
+    text = (Path(__file__).parents[1] / "docs" / "datasets.md").read_text("utf-8")
+    for layout in datasets.LAYOUTS.values():
+        assert f"| {layout.papers} |" in text
+
+
+def test_reading_a_pair_and_its_differences_does_not_load_jax(tmp_path):
+    partial(tmp_path)
+    code = (
+        "import sys; from jaxsmw.benchmark import datasets\n"
+        "from jaxsmw.benchmark.differences import compare_shapes\n"
+        f"pair = datasets.open_data_set({str(tmp_path)!r}).pairs[0]\n"
+        "compare_shapes(*pair.read())\n"
+        "print([name for name in ('jax', 'torch', 'equinox') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_differences_between_shapes_are_computed_from_their_points():
+    vertices, faces = bumpy_mesh(2).vertices, bumpy_mesh(2).faces
+    mesh_x = make_mesh(vertices, faces)
+    order = np.random.default_rng(0).permutation(len(vertices))
+    place = np.argsort(order)
+    turned = vertices[order] @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]).T
+    mesh_y = make_mesh(3 * turned + 7, place[faces])
+    differences = compare_shapes(mesh_x, mesh_y, GroundTruth.of_all_vertices(place))
+    np.testing.assert_allclose(differences, (90, 3, 1), rtol=1e-6)
+    assert (differences.rotated, differences.rescaled, differences.retriangulated) == (True, True, False)
+    # A shuffled truth keeps no face, and two landmarks say nothing about faces.
+    shuffled = compare_shapes(mesh_x, mesh_x, GroundTruth.of_all_vertices(order))
+    assert shuffled.kept_faces < 0.1 and shuffled.retriangulated
+    landmarks = GroundTruth(np.arange(40, 44), np.arange(40, 44))
+    same = compare_shapes(mesh_x, mesh_x, landmarks)
+    np.testing.assert_allclose(same, (0, 1, 1), atol=1e-6)
+    assert not (same.rotated or same.rescaled or same.retriangulated)
+    assert compare_shapes(mesh_x, make_mesh(vertices, faces[::-1]), landmarks).kept_faces == 0
+
+
+def test_the_command_describes_a_data_set(tmp_path, capsys):
+    tosca(tmp_path / "TOSCA")
+    assert run_command(["benchmark", str(tmp_path / "TOSCA"), "--describe", "--pairs", "2", "--quiet"]) == 0
+    header, _, row = capsys.readouterr().out.splitlines()
+    assert [cell.strip() for cell in header.strip("|").split("|")][2:5] == [
+        "rotated",
+        "rescaled",
+        "re-triangulated",
+    ]
+    assert row.startswith(
+        "| TOSCA | TOSCA | 0 of 2 (median 0°) | 0 of 2 (median factor 1.00) | 0 of 2 (median 100 % of faces kept) |"
+    )
+    assert run_command(["benchmark", str(tmp_path / "TOSCA"), "--describe", "--methods", "mwp"]) == 2
+    assert "--describe matches nothing, so --methods has no effect: leave it out." in capsys.readouterr().err
 
 
 def test_importing_data_sets_and_protocols_loads_no_heavy_module():

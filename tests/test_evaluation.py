@@ -145,7 +145,6 @@ class TestReading:
             ".pdf",
             ".html",
             ".json",
-            ".npz",
             ".ply",
             ".off",
             ".glb",

@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +23,8 @@ from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 import jaxsmw
 from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh
-from jaxsmw.io import make_spectrum
-from jaxsmw.io.maps import read_landmarks
+from jaxsmw.io import exchange, make_spectrum
+from jaxsmw.io.maps import check_map_name, read_landmarks
 
 K = 12
 
@@ -603,16 +604,18 @@ def test_unsupported_and_damaged_files_are_refused(bodies, spectra, tmp_path):
     (tmp_path / "damaged.npz").write_bytes(b"no archive")
     np.savez(tmp_path / "fields.npz", eigenvalues=np.ones(3))
     for fault, call in {
-        "written as .npz or .mat": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.txt", x),
+        "written as .npz, .safetensors or .mat": lambda: jaxsmw.io.write_spectrum(tmp_path / "x.txt", x),
         "x.mat: the spectrum has 642 vertices, but y has 162": lambda: jaxsmw.io.write_spectrum(
             tmp_path / "x.mat", x, bodies[1]
         ),
         "x.npz: the spectrum has 642 vertices, but y has 162": lambda: jaxsmw.io.write_spectrum(
             tmp_path / "x.npz", x, bodies[1]
         ),
-        "written as .mat": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.txt", np.eye(3)),
+        "maps are written as .npz, .safetensors or .mat": lambda: jaxsmw.io.write_functional_map(
+            tmp_path / "c.txt", np.eye(3)
+        ),
         "not all finite": lambda: jaxsmw.io.write_functional_map(tmp_path / "c.mat", np.eye(3) * np.nan),
-        "read from .npz and .mat": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.txt"),
+        "read from .npz, .safetensors and .mat": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.txt"),
         "does not exist": lambda: jaxsmw.io.read_spectrum(tmp_path / "x.npz"),
         "damaged or not a .npz file": lambda: jaxsmw.io.read_spectrum(tmp_path / "damaged.npz"),
         "lacks eigenvectors, vertex_areas": lambda: jaxsmw.io.read_spectrum(tmp_path / "fields.npz"),
@@ -621,3 +624,262 @@ def test_unsupported_and_damaged_files_are_refused(bodies, spectra, tmp_path):
         with pytest.raises(InputError, match=fault):
             call()
     assert not list(tmp_path.glob("*.mat")) and not list(tmp_path.glob("*.txt"))
+
+
+# ------------------------------------------------------------------------- files of named arrays
+
+
+WRITERS = {
+    "spectrum": lambda path, spectra, _: jaxsmw.io.write_spectrum(path, spectra[0]),
+    "functional map": lambda path, spectra, T: jaxsmw.io.write_functional_map(path, encode(jnp.asarray(T), *spectra)),
+    "pointwise map": lambda path, _, T: jaxsmw.write_pointwise_map(path, T),
+}  # fmt: skip
+NAMED = {
+    "spectrum": ["eigenvalues", "eigenvectors", "vertex_areas"],
+    "functional map": ["functional_map"],
+    "pointwise map": ["pointwise_map"],
+}
+
+
+def named_arrays(path: Path) -> dict[str, np.ndarray]:
+    if path.suffix == ".npz":
+        return dict(np.load(path))
+    return pytest.importorskip("safetensors.numpy", reason="pip install safetensors").load_file(path)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+def test_results_survive_a_round_trip_through_named_arrays(bodies, spectra, pointwise_map, tmp_path, suffix):
+    if suffix == ".safetensors":
+        pytest.importorskip("safetensors")
+    paths = {what: tmp_path / f"{what}{suffix}" for what in WRITERS}
+    for what, path in paths.items():
+        WRITERS[what](path, spectra, pointwise_map)
+        assert sorted(named_arrays(path)) == NAMED[what]
+    same_spectrum(jaxsmw.io.read_spectrum(paths["spectrum"]), spectra[0], tolerance=1e-12)
+    read = jaxsmw.io.read_functional_map(paths["functional map"], *spectra)
+    np.testing.assert_array_equal(read, np.asarray(encode(jnp.asarray(pointwise_map), *spectra)))
+    read = jaxsmw.read_pointwise_map(paths["pointwise map"], *bodies)
+    np.testing.assert_array_equal(read, pointwise_map)
+    truth = jaxsmw.read_ground_truth(paths["pointwise map"], *bodies)
+    np.testing.assert_array_equal(truth.targets, pointwise_map)
+
+
+def test_arrays_of_any_name_are_read_if_they_are_alone(bodies, spectra, pointwise_map, tmp_path):
+    np.savez(tmp_path / "map.npz", pointwise_map)
+    np.testing.assert_array_equal(jaxsmw.read_pointwise_map(tmp_path / "map.npz", *bodies), pointwise_map)
+    np.savez(tmp_path / "c.npz", pointwise_map=pointwise_map, functional_map=np.eye(3))
+    np.testing.assert_array_equal(jaxsmw.io.read_functional_map(tmp_path / "c.npz", *spectra), np.eye(3))
+    np.testing.assert_array_equal(jaxsmw.read_pointwise_map(tmp_path / "c.npz", *bodies), pointwise_map)
+
+
+BAD_ARRAYS = {
+    "two maps": ("pointwise map", dict(a=np.ones(M), b=np.ones(M)), "contains 'a', 'b', but no pointwise_map: save the array"),
+    "no array": ("pointwise map", {}, "is empty, but no pointwise_map: save"),
+    "a map of another pair": ("pointwise map", dict(pointwise_map=np.ones(N)), "has 162 rows, but needs one for each of the 642"),
+    "a map as a matrix": ("pointwise map", dict(pointwise_map=np.ones((M, 2))), "contains an array of type float64 and shape"),
+    "a map out of range": ("pointwise map", dict(pointwise_map=np.arange(M) % N + 1), "row 162: 162 is not one of the vertices"),
+    "a list for a matrix": ("functional map", dict(functional_map=np.ones(3)), r"has shape \(3,\): give a functional map, which"),
+    "a number": ("functional map", dict(functional_map=np.float64(1)), r"has shape \(\): give a functional map, which"),
+    "words": ("functional map", dict(functional_map=np.array([["a"]])), "entries of the functional map are not an array of real"),
+    "infinite": ("functional map", dict(functional_map=np.full((3, 3), np.inf)), "entries of the functional map are not all finite"),
+    "too large": ("functional map", dict(functional_map=np.ones((K, K + 1))), r"has shape \(12, 13\), but .* at most \(12, 12\)"),
+    "no areas": ("spectrum", dict(eigenvalues=np.ones(3), eigenvectors=np.eye(8, 3)), "lacks vertex_areas: write"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+@pytest.mark.parametrize(("reader", "arrays", "fault"), BAD_ARRAYS.values(), ids=BAD_ARRAYS)
+def test_bad_named_arrays_end_in_one_sentence(bodies, spectra, tmp_path, suffix, reader, arrays, fault):
+    path = tmp_path / f"bad{suffix}"
+    if suffix == ".npz":
+        np.savez(path, **arrays)
+    else:
+        save_file = pytest.importorskip("safetensors.numpy").save_file
+        if any(array.dtype.kind == "U" for array in arrays.values()):
+            pytest.skip("safetensors has no words")
+        save_file({name: np.asarray(array) for name, array in arrays.items()}, path)
+    with pytest.raises(InputError, match=fault) as caught:
+        READERS[reader](path, bodies, spectra)
+    message = str(caught.value)
+    assert message.startswith(str(path)) and "\n" not in message and message.endswith(".")
+
+
+def tensors_file(header: str | bytes, body: bytes = b"") -> bytes:
+    header = header.encode() if isinstance(header, str) else header
+    return len(header).to_bytes(8, "little") + header + body
+
+
+DAMAGED_TENSORS = {
+    "empty": b"",
+    "text": b"no tensors at all\n" * 20,
+    "a huge header": (2**62).to_bytes(8, "little") + b"{}",
+    "no JSON": tensors_file("{" * 2000),
+    "more than the file": tensors_file('{"pointwise_map":{"dtype":"I64","shape":[900],"data_offsets":[0,7200]}}', b"123"),
+    "a negative shape": tensors_file('{"pointwise_map":{"dtype":"I64","shape":[-1],"data_offsets":[0,8]}}', b"12345678"),
+    "a type that NumPy lacks": tensors_file('{"pointwise_map":{"dtype":"BF16","shape":[4],"data_offsets":[0,8]}}', b"12345678"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("reader", [reader for reader in READERS if reader != "mesh"])
+@pytest.mark.parametrize("case", DAMAGED_TENSORS)
+def test_damaged_safetensors_end_in_one_sentence(bodies, spectra, tmp_path, reader, case):
+    pytest.importorskip("safetensors")
+    path = tmp_path / "damaged.safetensors"
+    path.write_bytes(DAMAGED_TENSORS[case])
+    with pytest.raises(
+        InputError, match=r"is damaged, or contains numbers of a type .*: write the file again"
+    ) as caught:
+        READERS[reader](path, bodies, spectra)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_missing_safetensors_is_explained(bodies, spectra, pointwise_map, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    path = tmp_path / "map.safetensors"
+    fault = r"map.safetensors: this format needs the package safetensors: run pip install 'jaxsmw\[safetensors\]', or use"
+    with pytest.raises(InputError, match=fault):
+        jaxsmw.write_pointwise_map(path, pointwise_map)
+    with pytest.raises(InputError, match=fault):  # commands call this before they match
+        check_map_name(path)
+    assert not path.exists()
+    path.write_bytes(b"")
+    for reader in ("pointwise map", "functional map", "spectrum"):
+        with pytest.raises(InputError, match=fault):
+            READERS[reader](path, bodies, spectra)
+
+
+# ------------------------------------------------------------------- objects of other libraries
+
+
+@pytest.fixture(scope="module")
+def result(bodies):
+    x, y = bodies
+    stage = jaxsmw.Stage(jaxsmw.WaveletPreservation(), number_of_eigenvectors=K, iterations=1)
+    init = np.random.default_rng(0).integers(0, len(y.vertices), len(x.vertices))
+    with pytest.warns(UserWarning, match="wrong as a whole"):
+        return jaxsmw.match(x, y, preset=stage, init=init, mirror="no")
+
+
+def same_memory(tensor: Any, array: Any) -> bool:
+    pointer = array.ctypes.data if isinstance(array, np.ndarray) else array.unsafe_buffer_pointer()
+    return tensor.data_ptr() == pointer
+
+
+@pytest.mark.parametrize("kind", ["numpy", "jax"])
+def test_tensors_share_the_memory_of_results(spectra, result, kind):
+    torch = pytest.importorskip("torch", reason="pip install torch")
+    convert = np.asarray if kind == "numpy" else jnp.asarray
+    spectrum = jax.tree.map(convert, spectra[0])
+    tensors = jaxsmw.io.to_torch(spectrum)
+    assert {"eigenvalues", "eigenvectors", "vertex_areas", "mask"} <= set(tensors)
+    for name, tensor in tensors.items():
+        array = getattr(spectrum, name)
+        assert isinstance(tensor, torch.Tensor) and same_memory(tensor, array)
+        np.testing.assert_array_equal(tensor, array)
+    matrix = convert(np.arange(6, dtype=np.float32).reshape(2, 3))
+    tensor = jaxsmw.io.to_torch(matrix)
+    assert same_memory(tensor, matrix)
+    # The opposite direction is one call of JAX, which needs memory that is aligned as PyTorch aligns it.
+    tensor = torch.arange(6.0).reshape(2, 3)
+    back = jnp.from_dlpack(tensor)
+    assert same_memory(tensor, back)
+    np.testing.assert_array_equal(back, tensor)
+
+
+def test_a_result_becomes_tensors_in_one_call(result):
+    pytest.importorskip("torch", reason="pip install torch")
+    tensors = jaxsmw.io.to_torch(result)
+    assert list(tensors) == ["pointwise_map", "functional_map", "spectrum_x", "spectrum_y"]
+    assert same_memory(tensors["pointwise_map"], result.pointwise_map)
+    np.testing.assert_array_equal(tensors["functional_map"], result.functional_map)
+    np.testing.assert_array_equal(tensors["spectrum_y"]["eigenvalues"], result.spectrum_y.eigenvalues)
+    assert list(jaxsmw.io.to_torch(result.refinement)) == ["pointwise_map", "functional_map"]
+    with pytest.raises(InputError, match="int contains no map and no spectrum: give an array"):
+        jaxsmw.io.to_torch(3)
+
+
+def test_a_result_goes_to_pyfm_and_back(bodies, result):
+    pytest.importorskip("pyFM.functional", reason="pip install pyfmaps")
+    x, y = bodies
+    mapping = result.to_pyfm()
+    np.testing.assert_array_equal(mapping.mesh1.vertices, y.vertices)
+    np.testing.assert_allclose(mapping.mesh2.area, x.area)
+    # Their pointwise map of our functional map is that of `decode`, although the areas differ.
+    spectra = result.spectrum_x, result.spectrum_y
+    ours = decode(jnp.asarray(result.functional_map), *spectra)
+    encoded = mapping.mesh2.project(mapping.mesh1.eigenvectors[np.asarray(ours)])
+    expected = encode(ours, *spectra)
+    np.testing.assert_allclose(encoded, np.asarray(expected) * np.sqrt(x.area / y.area), atol=1e-5)
+    imported = jaxsmw.io.make_functional_map(mapping)
+    np.testing.assert_allclose(imported.functional_map, result.functional_map, atol=1e-5)
+    for theirs, spectrum in zip(imported[1:], spectra, strict=True):
+        same_spectrum(theirs, spectrum, tolerance=1e-5)
+    assert np.mean(np.asarray(decode(*imported)) == np.asarray(ours)) > 0.99
+
+
+def test_a_result_goes_to_geomfum_and_back(bodies, result):
+    convert = pytest.importorskip("geomfum.convert", reason="pip install geomfum")
+    a, b, fmap_matrix = result.to_geomfum()
+    x, y = bodies
+    np.testing.assert_array_equal(a.vertices, y.vertices)
+    np.testing.assert_allclose(b.laplacian.mass_matrix.sum(), x.area)
+    imported = jaxsmw.io.make_functional_map(fmap_matrix, b, a)
+    np.testing.assert_allclose(imported.functional_map, result.functional_map, atol=1e-5)
+    theirs = convert.FmFromP2pConverter()(result.pointwise_map, a.basis, b.basis)
+    ours = encode(
+        jnp.asarray(result.pointwise_map),
+        result.spectrum_x,
+        result.spectrum_y,
+        pseudo_inverse="least_squares",
+    )
+    np.testing.assert_allclose(theirs, np.asarray(ours) * np.sqrt(x.area / y.area), atol=1e-4)
+
+
+def test_functional_maps_of_stand_ins_are_scaled(spectra):
+    x, y = (spectrum.scale(area) for spectrum, area in zip(spectra, (4.0, 9.0), strict=True))
+    matrix = np.arange(12.0).reshape(3, 4)
+    mapping = SimpleNamespace(mesh1=y, mesh2=x, FM_12=matrix)
+    for imported in (
+        jaxsmw.io.make_functional_map(mapping),
+        jaxsmw.io.make_functional_map(matrix, shape_x=x, shape_y=y),
+    ):
+        np.testing.assert_allclose(imported.functional_map, 1.5 * matrix, rtol=1e-12)
+        same_spectrum(imported.spectrum_x, spectra[0].truncate(3), tolerance=1e-12)
+        same_spectrum(imported.spectrum_y, spectra[1].truncate(4), tolerance=1e-12)
+
+
+def test_maps_that_cannot_be_imported_are_refused(spectra):
+    x, y = spectra
+    for fault, arguments in {
+        "has no functional map yet: call its method fit first": (
+            SimpleNamespace(mesh1=y, mesh2=x, FM_12=None),
+        ),
+        "needs the eigenbases of both shapes: give shape_x and shape_y": (np.eye(3), x),
+        "has no eigenbasis: give eigenvalues": (np.eye(3), x, SimpleNamespace()),
+        "the map: has shape": (np.ones(3), x, y),
+        "entries of the functional map are not all finite": (np.eye(3) * np.nan, x, y),
+        "at most .12, 12.: compute more eigenvectors": (np.eye(13), x, y),
+    }.items():
+        with pytest.raises(InputError, match=fault):
+            jaxsmw.io.make_functional_map(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("library", "convert"), [("torch", "to_torch"), ("pyFM", "to_pyfm"), ("geomfum", "to_geomfum")]
+)
+def test_missing_libraries_are_explained(bodies, monkeypatch, library, convert):
+    for module in list(sys.modules):
+        if module.split(".")[0] == library:
+            monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setitem(sys.modules, library, None)
+    package = {"pyFM": "pyfmaps"}.get(library, library)
+    argument = bodies[0].vertices if library == "torch" else bodies[0]
+    with pytest.raises(InputError, match=f"{package} is not installed: run pip install {package}."):
+        getattr(jaxsmw.io, convert)(argument)
+
+
+def test_the_spectrum_of_a_cut_mesh_is_not_converted(bodies, spectra):
+    with pytest.raises(
+        InputError, match=r"y: has 162 vertices, but its spectrum has 642, because the mesh was cut: compute"
+    ):
+        exchange.unit_factor(bodies[1], spectra[0])

@@ -36,7 +36,7 @@ MESHES = sorted(
     p.name for p in CORPUS.iterdir() if re.match(r"jaxsmw|trimesh|vtk|scipy|points\.(xyz|npy)|.*pcd", p.name)
 )
 LANDMARKS = sorted(p.name for p in CORPUS.iterdir() if p.name.startswith("landmarks"))
-MAPS = ["map.txt", "map.npy", "map.mat"]
+MAPS = ["map.txt", "map.npy", "map.mat", "map.npz", "map.safetensors"]
 TRUTHS = ["map.txt", "pairs.txt", "points.baryc_gt"]
 # The largest time of a command, and the largest growth of the memory of the process.
 SECONDS, BYTES = 20, 2 * 2**30

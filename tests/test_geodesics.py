@@ -10,7 +10,12 @@ from synthetic import grid_mesh, sphere_mesh
 
 from jaxsmw import InputError, Mesh, make_mesh, read_mesh
 from jaxsmw.geometry import geodesics
-from jaxsmw.geometry.geodesics import geodesic_distances, geodesic_distances_between, geodesic_graph
+from jaxsmw.geometry.geodesics import (
+    geodesic_distances,
+    geodesic_distances_between,
+    geodesic_graph,
+    geodesic_matrix,
+)
 from jaxsmw.geometry.surface_points import SurfacePoints
 
 
@@ -500,3 +505,17 @@ def test_no_sources_give_no_distances():
     none = SurfacePoints(nothing, np.empty((0, 3)))
     assert geodesic_distances(CUBE, none).shape == (0, 8)
     assert geodesic_distances_between(CUBE, none, none).shape == (0,)
+
+
+def test_a_matrix_of_distances_is_read_from_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAXSMW_CACHE", str(tmp_path))
+    monkeypatch.setattr(geodesics, "_ROWS_IN_CACHE", 30)
+    mesh = make_mesh(*sphere_mesh(1))
+    for method in ("exact", "strips"):
+        matrix = geodesic_matrix(mesh, method=method)
+        expected = geodesic_distances(mesh, np.arange(42), method=method)
+        np.testing.assert_allclose(matrix, expected, rtol=1e-6)
+        assert matrix.dtype == np.float32
+    monkeypatch.setattr(geodesics, "geodesic_distances", lambda *_, **__: pytest.fail("was not cached"))
+    np.testing.assert_array_equal(geodesic_matrix(mesh, method="strips"), matrix)
+    assert len(list(tmp_path.glob("geodesic-rows-*.npz"))) == 4

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from test_datasets import A, C, column, partial, put, shrec19, topology, tosca, two_cuts, two_parts
+from test_datasets import A, C, animals, column, partial, put, shrec19, topology, tosca, two_cuts, two_parts
 
 from jaxsmw import InputError, read_mesh
 from jaxsmw.benchmark import open_data_set, protocol_pairs
@@ -53,6 +53,8 @@ CASES = {
     "shrec16-holes": (partial, 1, ("holes_cat_shape_1", "cat"), "cuts_cat_shape_1"),
     "partial-smal": (two_parts, 3, (A, C), "cat"),
     "cp2p24": (two_cuts, 1, ("cat-01", "cat-02"), "cat"),
+    "shrec20": (animals, 1, ("cow", "bison"), "dog"),
+    "shrec20-partial": (animals, 1, ("dog", "cow"), "bison"),
     "tosca": (tosca, 4, ("cat0", "cat1"), "cat2"),
     "dt4d-intra": (characters, 2, ("crypto/Walk001", "crypto/Walk002"), "pumpkinhulk/Walk001"),
     "dt4d-inter": (characters, 2, ("crypto/Walk001", "ortiz/Walk001"), "pumpkinhulk/Walk001"),
@@ -91,6 +93,15 @@ def test_correspondences_between_classes_lead_through_the_lines_of_a_file(tmp_pa
     truth = pair.ground_truth(*map(read_mesh, pair.meshes))
     assert truth.source_vertices.tolist() == list(range(1, 11))
     assert truth.targets.tolist() == list(range(10, 0, -1))
+
+
+def test_the_test_shapes_of_characters_are_listed(tmp_path):
+    characters(tmp_path)
+    pairs = {pair.names for pair in open_data_set(tmp_path).split("test")}
+    for name in ("dt4d-intra", "dt4d-inter"):
+        assert {pair.names for pair in protocol_pairs(name, open_data_set(tmp_path))} < pairs
+    assert ("pumpkinhulk/Walk001", "pumpkinhulk/Walk002") in pairs
+    assert not any("ortiz/Walk002" in names for names in pairs)
 
 
 def lines_are_wrong(directory: Path, contents: str) -> None:

@@ -1,6 +1,7 @@
 """Data sets, published protocols, and the benchmark of this library's methods beside other methods.
 
-Only the command `jaxsmw benchmark` imports this package. The rest of the library does not need it.
+Only the command `jaxsmw benchmark` imports this package. The rest of the library does not need it. Importing
+`jaxsmw.benchmark.datasets`, and reading data sets with it, does not import JAX.
 """
 
 import lazy_loader

@@ -1,4 +1,13 @@
 from .datasets import DataPair, DataSet, open_data_set
+from .differences import Differences, compare_shapes
 from .protocols import Protocol, protocol_pairs
 
-__all__ = ["DataPair", "DataSet", "Protocol", "open_data_set", "protocol_pairs"]
+__all__ = [
+    "DataPair",
+    "DataSet",
+    "Differences",
+    "Protocol",
+    "compare_shapes",
+    "open_data_set",
+    "protocol_pairs",
+]

@@ -1,7 +1,8 @@
-"""Readers for data sets in their published directory layouts: shapes, pairs and ground truth.
+"""Readers for data sets in their published directory layouts: shapes, pairs, splits and ground truth.
 
 This library contains no data set, because the licences of the data sets do not allow copies.
-`docs/datasets.md` says where to obtain each data set. Importing this module imports neither JAX nor NumPy.
+`docs/datasets.md` says where to obtain each data set. Importing this module imports neither JAX nor NumPy,
+and reading a data set does not import JAX, so any training framework can use this module.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jaxsmw.choices import IndexBase
-from jaxsmw.errors import InputError
+from jaxsmw.choices import IndexBase, Split
+from jaxsmw.errors import InputError, check_choice
 
 if TYPE_CHECKING:
     import numpy as np
@@ -67,6 +68,19 @@ class DataPair:
     def meshes(self) -> tuple[Path, Path]:
         """The mesh files of the source and the target."""
         return self.source_file, self.target_file
+
+    def read(self) -> tuple[Mesh, Mesh, GroundTruth]:
+        """Read the pair. All arrays of the result are NumPy arrays.
+
+        **Returns:** The meshes of X and Y, with `vertices` in the unit of their file and 0-based `faces`, and
+        the direct `GroundTruth`; see `GroundTruth.vertex_pairs`.
+
+        **Raises:** `InputError` if a file cannot be read, or the files do not fit each other.
+        """
+        from jaxsmw.io.meshes import read_mesh
+
+        mesh_x, mesh_y = read_mesh(self.source_file), read_mesh(self.target_file)
+        return mesh_x, mesh_y, self.ground_truth(mesh_x, mesh_y)
 
     def ground_truth(self, mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool = False) -> GroundTruth:
         """Read and return the direct or the mirrored `GroundTruth` of the pair.
@@ -150,6 +164,74 @@ class DataSet:
         """All pairs with ground truth, by the names of their source and target."""
         return {pair.names: pair for pair in (*self.pairs, *self.others)}
 
+    @property
+    def papers(self) -> str:
+        """The papers that published data sets of this layout, and papers that use them."""
+        return LAYOUTS[self.layout].papers
+
+    def split(self, part: Split) -> tuple[DataPair, ...]:
+        """Return all pairs with ground truth between two training shapes, or between two test shapes.
+
+        The published split comes from the first of these sources that exists:
+
+        - a file `train_cat.txt`, `test_cat.txt`, `train.txt` or `test.txt`, which lists the shapes;
+        - the numbers of the shapes of FAUST (tests from `tr_reg_080`) and SCAPE (tests from `mesh052`);
+        - the name of the directory, if both parts circulate in their own directories: a word of the name is
+          `train` or `test`. This concerns SHREC'16 partial, PARTIALSMAL and CP2P24;
+        - SHREC'16 topology, SHREC'19 humans and SHREC'20 contain test shapes only.
+
+        **Arguments:** `part`: `"train"` or `"test"`.
+
+        **Returns:** The pairs, in the order of `known_pairs`. `jaxsmw.benchmark.protocol_pairs` returns the
+        test pairs of a certain published protocol.
+
+        **Raises:** `InputError` for another part, or if the data set has no published split, lacks a listed
+        shape, or has no pair of this part.
+        """
+        check_choice(part, Split, "a part of a data set")
+        shapes = _shapes_of_part(self, part)
+        if missing := [name for name in shapes if name not in self.shapes]:
+            raise InputError(
+                f"{self.directory}: lacks the listed shapes {first_three(missing)}: complete the data set, "
+                "or correct the list."
+            )
+        pairs = tuple(pair for pair in self.known_pairs.values() if set(shapes).issuperset(pair.names))
+        if not pairs:
+            raise InputError(
+                f"{self.directory}: contains no pair of {part} shapes: complete the data set, or choose the "
+                "other part."
+            )
+        return pairs
+
+
+# The first test shape among the numbered shapes of FAUST and SCAPE.
+_FIRST_TESTS = {"tr_reg_": 80, "mesh": 52}
+
+
+def _shapes_of_part(data_set: DataSet, part: Split) -> list[str]:
+    """Return the names of the training shapes or the test shapes; see `DataSet.split`."""
+    directory, shapes = data_set.directory, data_set.shapes
+    for name in (f"{part}_cat.txt", f"{part}.txt"):
+        if (path := directory / name).is_file():
+            return read_shapes(path)
+    if data_set.layout in ("SHREC'16 topology", "SHREC'19 humans", "SHREC'20"):
+        return list(shapes) if part == "test" else []
+    if data_set.layout in ("SHREC'16 partial", "PARTIALSMAL", "CP2P24"):
+        if part in re.split("[^a-z]+", data_set.name.lower()):
+            return list(shapes)
+        raise InputError(
+            f"{directory}: its name does not say that it is the {part} half of {data_set.layout}: open the "
+            f"directory of this half, whose name must contain the word {part}, or use the attribute pairs."
+        )
+    numbers = {name: re.fullmatch(r"(tr_reg_|mesh)(\d{3})", name) for name in shapes}
+    if not all(numbers.values()):
+        raise InputError(
+            f"{directory}: has no published split: write the names of the {part} shapes into {part}.txt in "
+            "this directory, or use the attribute pairs."
+        )
+    is_test = {name: int(match[2]) >= _FIRST_TESTS[match[1]] for name, match in numbers.items() if match}
+    return [name for name in shapes if is_test[name] == (part == "test")]
+
 
 # The lists `pairs` and `others` of a `DataSet`.
 _Pairs = tuple[list[DataPair], list[DataPair]]
@@ -177,6 +259,12 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
       vertex of B is 1 if the vertex has a counterpart on A, and otherwise 0.
     - **SHREC'16 topology** (Lähner et al. 2016): the mesh `kid00` is the target of all pairs. The sources are
       the other meshes `kidNN`, each with a file `kidNN_ref.txt`.
+    - In the **copies of Cao et al. (2023)** of both SHREC'16 sets, the meshes are in folders `off/`, and the
+      ground truth is in folders `corres/`, in files `PART.vts` and `kidNN_ref.vts`. Line i contains the
+      vertex of the target that corresponds to the i-th vertex of the source, counted from 1.
+    - **SHREC'20** (non-isometric animals; Dyke et al. 2020): `models/` contains the meshes, and `test-sets/`
+      contains five lists of pairs. A second directory, beside the first and with `_gts` at the end of its
+      name, contains a file `NAME.mat` for each mesh, with about 50 landmarks.
     - **DeformingThings4D** (remeshed characters, DT4D-H; Magnet et al. 2022): one folder (`off/`, …) contains
       a folder of meshes for each class, and `corres/CLASS/` contains a file `NAME.vts` for each mesh. A file
       `A_B.vts` in `corres/cross_category_corres/` lists the line in the `.vts` files of class B that
@@ -204,7 +292,8 @@ def open_data_set(directory: str | os.PathLike[str]) -> DataSet:
         raise InputError(f"{directory}: is not a directory: give the directory of an unpacked data set.")
     directory = Path(directory)
     try:
-        inner = [folder for folder in sorted(directory.iterdir()) if folder.is_dir() and _is_a_set(folder)]
+        folders = (folder for folder in sorted(directory.iterdir()) if folder.is_dir())
+        inner = [folder for folder in folders if _is_a_set(folder)]
         recognised = _recognise(directory) if len(inner) < 2 else None
     except OSError as error:
         raise InputError(
@@ -381,6 +470,8 @@ def _remeshed(directory: Path) -> _Pairs | None:
     plain = {name: file for name, file in files.items() if not name.endswith(".sym")}
     if not plain:
         return None
+    if (directory.resolve().parent / "null").is_dir():
+        raise InputError(f"{directory}: is only a part of a data set: give {directory.resolve().parent}.")
     folders = (folder for folder in sorted(directory.iterdir()) if folder.is_dir() and folder != truths)
     shapes = next((meshes for meshes in map(_meshes, folders) if meshes.keys() & plain.keys()), {})
     if not shapes:
@@ -438,9 +529,14 @@ def _shrec19(directory: Path) -> _Pairs | None:
     return _listed_first(pair, _listed_pairs(directory, shapes), with_truth)
 
 
+_PARTIAL_FOLDERS = ("null", "cuts", "holes")
+
+
 def _partial(directory: Path) -> _Pairs | None:
-    full = _meshes(directory / "null")
-    partial = {**_meshes(directory / "cuts"), **_meshes(directory / "holes")}
+    full, cuts, holes = (
+        _meshes(directory / folder) or _meshes(directory / folder / "off") for folder in _PARTIAL_FOLDERS
+    )
+    partial = cuts | holes
     if not full and not partial:
         return None
     if not full or not partial:
@@ -456,10 +552,12 @@ def _partial(directory: Path) -> _Pairs | None:
                 "is the name of its full shape and N is a number."
             )
         truth, mirrored = (file.with_suffix(suffix) for suffix in (".baryc_gt", ".baryc_gt_sym"))
+        if not truth.is_file() and file.parent.name == "off":
+            truth = file.parents[1] / "corres" / f"{name}.vts"
         if not truth.is_file():
             raise InputError(f"{truth}: the ground truth of {file} is missing: add this file.")
         target, sides = match[1], (mirrored,) if mirrored.is_file() else None
-        pairs.append(DataPair(name, target, file, full[target], (truth,), sides, partial=True))
+        pairs.append(DataPair(name, target, file, full[target], (truth,), sides, index_base=1, partial=True))
     return pairs, []
 
 
@@ -518,10 +616,41 @@ def _topology(directory: Path) -> _Pairs | None:
     pairs = []
     for name, file in shapes.items():
         truth = file.with_name(f"{name}_ref.txt")
+        if not truth.is_file() and file.parent.name == "off":
+            truth = file.parents[1] / "corres" / f"{name}_ref.vts"
         if not truth.is_file():
             raise InputError(f"{truth}: the ground truth of {file} is missing: add this file.")
-        pairs.append(DataPair(name, "kid00", file, full, (truth,)))
+        pairs.append(DataPair(name, "kid00", file, full, (truth,), index_base=1))
     return pairs, []
+
+
+def _landmarks(directory: Path) -> _Pairs | None:
+    shapes = _meshes(directory / "models")
+    lists = sorted((directory / "test-sets").glob("test-set*.txt"))
+    if not shapes or not lists:
+        return None
+    # The ground truth is in an archive of its own, which may be unpacked beside or inside the data set.
+    name = f"{directory.resolve().name}_gts"
+    folders = (directory.resolve().with_name(name), directory / name)
+    truths = {file.stem: file for folder in folders for file in folder.rglob("*.mat")}
+
+    def pair(x: str, y: str, partial: bool) -> DataPair:
+        if missing := [shape for shape in (x, y) if shape not in truths]:
+            raise InputError(
+                f"{folders[0] / missing[0]}.mat: the ground truth of {shapes[missing[0]]} is missing: unpack "
+                f"{name} beside the data set, or remove the shape from the lists of pairs."
+            )
+        files = (truths[x], truths[y])
+        return DataPair(x, y, shapes[x], shapes[y], files, index_base=1, partial=partial)
+
+    # The list test-set0 contains the pairs of a partial scan and a full scan.
+    listed = {
+        names: file.stem.endswith("0") for file in lists for names in dict.fromkeys(read_pairs(file, shapes))
+    }
+    parts = {x for (x, _), partial in listed.items() if partial}
+    whole = [shape for shape in shapes if shape in truths and shape not in parts]
+    others = [pair(x, y, False) for x, y in permutations(whole, 2) if (x, y) not in listed]
+    return [pair(*names, partial) for names, partial in listed.items()], others
 
 
 # This folder of DeformingThings4D contains the correspondences between classes.
@@ -578,23 +707,64 @@ class Layout(NamedTuple):
     """A layout of data sets: the files by which it is recognised, as text for messages, and its reader.
 
     The reader returns the lists `pairs` and `others` of a `DataSet`, or None if it has another layout.
+    `papers` names the papers that published such data sets, and papers that use them.
     """
 
     files: str
     open: Callable[[Path], _Pairs | None]
+    papers: str
 
 
 _TOSCA = r"(cat|centaur|david|dog|gorilla|horse|lioness|michael|seahorse|victoria|wolf)\d+"
 LAYOUTS = {
-    "a remeshed set": Layout("off/NAME.off with corres/NAME.vts", _remeshed),
-    "SHREC'19 humans": Layout("NAME.obj with FARMgt_txt/NAME_NAME.txt", _shrec19),
-    "SHREC'16 partial": Layout("null/ with cuts/ or holes/", _partial),
-    "PARTIALSMAL": Layout("shapes/NAME.off with maps/NAME_NAME.vts", _two_parts("shapes", ".vts")),
-    "CP2P24": Layout("off/NAME.off with maps/NAME_NAME.map", _two_parts("off", ".map")),
-    "SHREC'16 topology": Layout("kid00.off with kidNN_ref.txt", _topology),
-    "DeformingThings4D": Layout("off/CLASS/NAME.off with corres/CLASS/NAME.vts", _characters),
-    "FAUST registrations": Layout("tr_reg_NNN.ply", _identical(r"tr_reg_\d{3}")),
-    "SCAPE": Layout("meshNNN.ply", _identical(r"mesh\d{3}")),
-    "TOSCA": Layout("cat0.mat or cat0.off", _identical(_TOSCA)),
+    "SHREC'16 partial": Layout(
+        "null/ with cuts/ or holes/",
+        _partial,
+        "Cosmo 2016; Rodolà 2017 (PFM), Attaiki 2021 (DPFM), Cao 2023 (ULRSSM)",
+    ),
+    "SHREC'16 topology": Layout(
+        "kid00.off with kidNN_ref.txt",
+        _topology,
+        "Lähner 2016; Eisenberger 2020 (smooth shells), Cao 2023 (ULRSSM)",
+    ),
+    "SHREC'20": Layout(
+        "models/NAME.obj with test-sets/test-set0.txt and NAME.mat in DIRECTORY_gts/ beside it",
+        _landmarks,
+        "Dyke 2020; Eisenberger 2021 (NeuroMorph), Cao 2023 (ULRSSM)",
+    ),
+    "a remeshed set": Layout(
+        "off/NAME.off with corres/NAME.vts",
+        _remeshed,
+        "Ren 2018; Donati 2020, Hu 2021 (MWP), Li 2022 (AttentiveFMaps), Cao 2023 (ULRSSM), Bastian 2024",
+    ),
+    "SHREC'19 humans": Layout(
+        "NAME.obj with FARMgt_txt/NAME_NAME.txt",
+        _shrec19,
+        "Melzi 2019; Li 2022 (AttentiveFMaps), Cao 2023 (ULRSSM)",
+    ),
+    "PARTIALSMAL": Layout(
+        "shapes/NAME.off with maps/NAME_NAME.vts",
+        _two_parts("shapes", ".vts"),
+        "Ehm 2024; Xie 2025 (EchoMatch)",
+    ),
+    "CP2P24": Layout(
+        "off/NAME.off with maps/NAME_NAME.map", _two_parts("off", ".map"), "Xie 2025 (EchoMatch)"
+    ),
+    "DeformingThings4D": Layout(
+        "off/CLASS/NAME.off with corres/CLASS/NAME.vts",
+        _characters,
+        "Li 2021, Magnet 2022; Li 2022 (AttentiveFMaps), Cao 2023 (ULRSSM)",
+    ),
+    "FAUST registrations": Layout(
+        "tr_reg_NNN.ply",
+        _identical(r"tr_reg_\d{3}"),
+        "Bogo 2014; Litany 2017 (deep functional maps)",
+    ),
+    "SCAPE": Layout("meshNNN.ply", _identical(r"mesh\d{3}"), "Anguelov 2005; Kim 2011, Ovsjanikov 2012"),
+    "TOSCA": Layout(
+        "cat0.mat or cat0.off",
+        _identical(_TOSCA),
+        "Bronstein 2008; Kim 2011, Ovsjanikov 2012, Hu 2021 (MWP)",
+    ),
 }
 """A dictionary from the names of the layouts to the layouts, in the order in which they are tried."""

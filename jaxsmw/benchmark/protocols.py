@@ -114,6 +114,17 @@ def _kind(kind: str) -> Callable[[DataSet], list[DataPair]]:
     return choose
 
 
+def _scans(partial: bool) -> Callable[[DataSet], list[DataPair]]:
+    """Return a function that chooses the listed pairs whose source is a partial scan, or is not."""
+
+    def choose(data_set: DataSet) -> list[DataPair]:
+        if pairs := [pair for pair in data_set.pairs if pair.partial == partial]:
+            return pairs
+        raise _MissingError(f"lacks {'test-set0.txt' if partial else 'test-set1.txt'}, a list of its pairs")
+
+    return choose
+
+
 # Li 2022 and Cao 2023 leave this class out.
 _IGNORED_CLASS = "pumpkinhulk"
 
@@ -142,6 +153,7 @@ def _listed(data_set: DataSet) -> list[DataPair]:
 _REMESHED, _CHARACTERS = ("a remeshed set",), ("DeformingThings4D",)
 _REN = "https://github.com/llorz/SGA18_orientation_BCICP_dataset"
 _CAO = "https://github.com/dongliangcao/Unsupervised-Learning-of-Robust-Spectral-Shape-Matching"
+_DYKE = "http://robertodyke.com/shrec2020/"
 _TRAINED = "Donati 2020, Li 2022 (AttentiveFMaps), Cao 2023 (ULRSSM), Bastian 2024 (hybrid functional maps)"
 
 PROTOCOLS: dict[str, Protocol] = {
@@ -216,6 +228,22 @@ PROTOCOLS: dict[str, Protocol] = {
         "every pair of two cuts with ground truth",
         "Xie 2025 (EchoMatch)",
         "https://huggingface.co/datasets/xieyizheng/CP2P24",
+    ),
+    "shrec20": Protocol(
+        ("SHREC'20",),
+        _scans(partial=False),
+        "SHREC'20 with models/ and test-sets/, and its ground truth in a second directory",
+        "the pairs of full scans in test-set1.txt to test-set4.txt",
+        "Dyke 2020",
+        _DYKE,
+    ),
+    "shrec20-partial": Protocol(
+        ("SHREC'20",),
+        _scans(partial=True),
+        "SHREC'20 with models/ and test-sets/, and its ground truth in a second directory",
+        "the pairs of a partial scan and a full scan in test-set0.txt",
+        "Dyke 2020",
+        _DYKE,
     ),
     "tosca": Protocol(
         ("TOSCA", "a remeshed set"),

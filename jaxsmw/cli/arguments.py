@@ -15,7 +15,10 @@ from jaxsmw.errors import InputError
 _LARGEST_NUMBER = 2**31 - 1
 _LONGEST_SHOWN = 60
 
-MAP_FORMS = "a text file with one target vertex per line, a .npy file, or a .mat file (counted from 1)"
+MAP_FORMS = (
+    "a text file with one target vertex per line, a .npy, .npz or .safetensors file, or a .mat file (counted "
+    "from 1)"
+)
 
 
 def whole_number(least: int, most: int = _LARGEST_NUMBER) -> Callable[[str], int]:

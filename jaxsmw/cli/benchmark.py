@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+from jaxsmw.benchmark.datasets import DataPair, DataSet, choose_pairs
 from jaxsmw.benchmark.opponents.registry import METHODS, PEERS
-from jaxsmw.benchmark.protocols import PROTOCOLS
+from jaxsmw.benchmark.protocols import PROTOCOLS, protocol_pairs
 from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MATCH_INIT, MatchInit, Template
 from jaxsmw.cli.arguments import add_paths, add_processes, add_seed, option_of, path, whole_number
 from jaxsmw.cli.console import report_progress, show
@@ -85,6 +87,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "methods or with --methods, and compare the errors; nothing is stored",
         },
     )
+    parser.add_argument(
+        "--describe",
+        action="store_true",
+        help="match nothing, and print a table of how many pairs have shapes that are rotated against each "
+        "other, of different scale, or triangulated differently",
+    )
     add_processes(
         parser,
         default=os.cpu_count() or 1,
@@ -96,12 +104,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Match and measure all pairs that have no results yet, then write and print the tables of all pairs.
 
-    With `--verify`, measure a tenth of stored results again instead, and print a comparison.
+    With `--verify`, measure a tenth of stored results again instead, and print a comparison. With
+    `--describe`, match nothing, and print how the shapes of the pairs differ.
 
     **Raises:** `InputError` if an option cannot be used or a needed package is not installed. If a pair
     cannot be measured, `InputError` is raised after the results of all other pairs are written.
     `ArithmeticError` if stored results do not hold.
     """
+    if options.describe:
+        _describe(options)
+        return
     from jaxsmw.report.figures import check_drawable
 
     check_drawable()
@@ -122,18 +134,14 @@ def run(options: argparse.Namespace) -> None:
 
 def _measure(options: argparse.Namespace) -> None:
     from jaxsmw.benchmark.benchmark import run_benchmark
-    from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
+    from jaxsmw.benchmark.datasets import open_data_set
     from jaxsmw.benchmark.measurement import Settings
     from jaxsmw.benchmark.opponents.registry import find_methods, suited_methods
-    from jaxsmw.benchmark.protocols import protocol_pairs
     from jaxsmw.benchmark.tables import markdown_table, write_tables
     from jaxsmw.runtime.workers import open_executor
 
     data_set = open_data_set(options.data)
-    if options.protocol is None:
-        pairs = choose_pairs(data_set, options.pairs, options.seed)
-    else:
-        pairs = protocol_pairs(options.protocol, data_set)
+    pairs = _chosen_pairs(data_set, options)
     init = options.init or DEFAULT_MATCH_INIT
     settings = Settings(init, options.mirrored, options.evaluation_samples, options.seed)
     methods = find_methods(options.methods) if options.methods else suited_methods(pairs)
@@ -152,6 +160,37 @@ def _measure(options: argparse.Namespace) -> None:
     results.check()
 
 
+def _chosen_pairs(data_set: DataSet, options: argparse.Namespace) -> list[DataPair]:
+    if options.protocol is None:
+        return choose_pairs(data_set, options.pairs, options.seed)
+    return protocol_pairs(options.protocol, data_set)
+
+
+def _refuse(options: argparse.Namespace, names: Sequence[str], reason: str) -> None:
+    """Raise `InputError` if one of the options is given, although it has no effect."""
+    for name in names:
+        if getattr(options, name) not in (None, False):
+            raise InputError(f"{reason}, so {option_of(name)} has no effect: leave it out.")
+
+
+def _describe(options: argparse.Namespace) -> None:
+    from tqdm import tqdm
+
+    from jaxsmw.benchmark.datasets import open_data_set
+    from jaxsmw.benchmark.differences import compare_shapes, differences_row
+    from jaxsmw.benchmark.tables import markdown
+
+    without_effect = ("methods", "init", "mirrored", "evaluation_samples", "output", "verify")
+    _refuse(options, without_effect, "--describe matches nothing")
+    data_set = open_data_set(options.data)
+    pairs = _chosen_pairs(data_set, options)
+    progress = tqdm(pairs, unit="pair", disable=options.quiet)
+    differences = [compare_shapes(*pair.read()) for pair in progress]
+    header = ["set", "layout", "rotated", "rescaled", "re-triangulated", "papers"]
+    row = [data_set.name, data_set.layout, *differences_row(differences), data_set.papers]
+    show(markdown([header, row]).rstrip("\n"))
+
+
 def _verify(options: argparse.Namespace) -> None:
     from jaxsmw.benchmark.datasets import open_data_set
     from jaxsmw.benchmark.opponents.registry import find_methods, known_methods
@@ -159,12 +198,8 @@ def _verify(options: argparse.Namespace) -> None:
     from jaxsmw.benchmark.verification import StoredResults
     from jaxsmw.runtime.workers import open_executor
 
-    for name in ("pairs", "protocol", "mirrored", "evaluation_samples", "output"):
-        if getattr(options, name) not in (None, False):
-            raise InputError(
-                f"--verify uses the settings of the stored results, so {option_of(name)} has no effect: "
-                "leave it out."
-            )
+    without_effect = ("pairs", "protocol", "mirrored", "evaluation_samples", "output")
+    _refuse(options, without_effect, "--verify uses the settings of the stored results")
     data_set = open_data_set(options.data)
     stored = StoredResults(Path(options.verify), options.init)
     pairs = stored.draw(data_set, options.seed)

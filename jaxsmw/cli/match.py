@@ -55,8 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=path,
         required=True,
         help="write the map to this file: the target vertex of each source vertex, one per line, counted "
-        "from 0; if the suffix is .npy, a NumPy array, counted from 0; if the suffix is .mat, the column "
-        "vector T12 for MATLAB, counted from 1",
+        "from 0; if the suffix is .npy, .npz or .safetensors, an array, counted from 0; if the suffix is "
+        ".mat, the column vector T12 for MATLAB, counted from 1",
     )
     add_paths(
         parser,
@@ -157,7 +157,7 @@ def _check(options: argparse.Namespace) -> None:
             f"{points}: surface points are written as .baryc_gt: choose a name that ends in .baryc_gt."
         )
     for file, contents in ((expected, "expected errors are"), (overlap, "the overlap is")):
-        if file and Path(file).suffix.lower() in (".npy", ".mat"):
+        if file and Path(file).suffix.lower() in (".npy", ".npz", ".safetensors", ".mat"):
             raise InputError(f"{file}: {contents} written as text: choose another suffix, such as .txt.")
     alternatives = [_alternative_file(options.output, k + 1) for k in range(options.alternatives or 0)]
     beside = _beside(overlap, "target") if overlap else None

@@ -31,8 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         {
             "--output FILE": "write the eigenbasis of the surface, scaled to area 1, to this file: a .npz "
-            "file with the arrays eigenvalues, eigenvectors and vertex_areas, or a .mat file with a struct S "
-            "with the fields evals, evecs, A and surface",
+            "or .safetensors file with the arrays eigenvalues, eigenvectors and vertex_areas, or a .mat file "
+            "with a struct S with the fields evals, evecs, A and surface",
             "--figure FILE": "draw the filters as functions of the eigenvalue to this file (.png, .pdf or "
             ".svg)",
         },
@@ -48,9 +48,11 @@ def run(options: argparse.Namespace) -> None:
     check_inputs(options.mesh)
     check_outputs([options.mesh], files=[options.output], figures=[options.figure])
     if options.output:
+        from jaxsmw.io.formats.named_arrays import check_writable
         from jaxsmw.io.spectra import SPECTRUM_SUFFIXES
 
         check_suffix(options.output, "spectra", *SPECTRUM_SUFFIXES)
+        check_writable(options.output)
     bank = make_bank(options.bank, options.filters)
     from jaxsmw.geometry.eigenbasis import as_spectrum, eigenpairs
     from jaxsmw.geometry.laplacian import choose_laplacian

@@ -20,6 +20,7 @@ from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
+from jaxsmw.io.formats.mat import is_mat_file, read_variables
 from jaxsmw.io.maps import Table
 from jaxsmw.runtime.files import atomic_write
 
@@ -56,6 +57,16 @@ class GroundTruth:
         """Return the ground truth in which entry i of `targets` (m,) is the true point of vertex i of X."""
         return cls(np.arange(len(targets)), targets)
 
+    def vertex_pairs(self, mesh_y: Mesh) -> Int64[np.ndarray, "p 2"]:
+        """Return the vertices of X and their true vertices of Y (p, 2), 0-based.
+
+        A true point on a face of Y is replaced by the nearest corner of the face.
+        """
+        targets = self.targets
+        if isinstance(targets, SurfacePoints):
+            targets = targets.nearest_corners(mesh_y)
+        return np.stack([self.source_vertices, targets], axis=1)
+
     def everywhere(self, mesh_x: Mesh) -> Int64[np.ndarray, " m"]:
         """Extend the ground truth to all vertices of X. Return a map X -> Y (m,), as 0-based vertices of Y.
 
@@ -84,6 +95,9 @@ def read_ground_truth(
       vertices in line i of the two files correspond to each other.
     - Three `.vts` files: line i of the third file contains the line of the second file, counted from 1, that
       corresponds to line i of the first file.
+    - Two `.mat` files with `points` (l,), the names of l landmarks as integers: landmarks of the same name
+      correspond. `verts` (l,) contains their vertices. `baryc` (l, 4) contains their faces and barycentric
+      weights, which take precedence on the target. All are counted from 1 (SHREC'20; Dyke et al. 2020).
     - Two files with other suffixes: the lines have the same meaning. Vertices are counted from 1 in `.mat`
       files, and from 0 in all other files.
     - One `.baryc_gt` or `.baryc_gt_sym` file: line i contains the true point of the i-th vertex of the
@@ -133,7 +147,8 @@ def _read_all(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBa
         raise InputError(f"ground truth: {len(files)} files were given: give one to three files.")
 
     if len(files) > 1:
-        return _read_lines(files, mesh_x, mesh_y, index_base)
+        read = _read_named_points if _have_named_points(files) else _read_lines
+        return read(files, mesh_x, mesh_y, index_base)
 
     (file,) = files
     if file.suffix in (".baryc_gt", ".baryc_gt_sym"):
@@ -260,6 +275,46 @@ def _read_lines(files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: Index
     if len(files) == 3:
         targets = targets[last.indices(0, len(targets), f"lines of {files[1]}", bases[2])]
     return GroundTruth(sources, targets)
+
+
+def _have_named_points(files: list[Path]) -> bool:
+    return len(files) == 2 and all(is_mat_file(file) and "points" in read_variables(file) for file in files)
+
+
+def _read_named_points(
+    files: list[Path], mesh_x: Mesh, mesh_y: Mesh, index_base: IndexBase | None
+) -> GroundTruth:
+    """Read two `.mat` files with named landmarks; landmarks of the same name correspond."""
+    names, vertices = (
+        [_variable(file, variable, columns=1) for file in files] for variable in ("points", "verts")
+    )
+    for name, vertex in zip(names, vertices, strict=True):
+        if name.rows != vertex.rows:
+            raise InputError(
+                f"{name.path}: has {name.rows} points but {vertex.rows} verts: give the file of this data "
+                "set."
+            )
+    shared, rows_x, rows_y = np.intersect1d(names[0].values[:, 0], names[1].values[:, 0], return_indices=True)
+    if len(shared) == 0:
+        raise InputError(f"{files[1]}: has no point in common with {files[0]}: give files of one data set.")
+    base = vertices[0].index_base(index_base)
+    sources = vertices[0].vertices(0, mesh_x, base)[rows_x]
+    if "baryc" not in read_variables(files[1]):
+        return GroundTruth(sources, vertices[1].vertices(0, mesh_y, base)[rows_y])
+    table = _variable(files[1], "baryc", columns=4)
+    if table.rows != names[1].rows:
+        raise InputError(
+            f"{files[1]}: has {names[1].rows} points but {table.rows} rows of baryc: give the file of this "
+            "data set."
+        )
+    points = SurfacePoints(_faces(table, 0, mesh_y, base), _weights(table, 1))
+    return GroundTruth(sources, points[rows_y])
+
+
+def _variable(file: Path, name: str, *, columns: int) -> Table:
+    if name not in read_variables(file):
+        raise InputError(f"{file}: contains points, but no {name}: give the file of this data set.")
+    return Table(file, columns=columns, variable=name)
 
 
 def write_ground_truth(path: str | os.PathLike[str], ground_truth: GroundTruth, mesh_y: Mesh) -> None:

@@ -1,7 +1,7 @@
 from .assignment import one_to_one_map
 from .creases import crease_eigenvectors
 from .eigenbasis import compute_spectrum
-from .geodesics import geodesic_distances
+from .geodesics import geodesic_distances, geodesic_matrix
 from .mesh import Mesh, diagnose, make_mesh
 from .point_cloud import triangulate_points
 from .sampling import farthest_point_samples
@@ -23,6 +23,7 @@ __all__ = [
     "estimate_scale",
     "farthest_point_samples",
     "geodesic_distances",
+    "geodesic_matrix",
     "make_mesh",
     "nearest_surface_points",
     "one_to_one_map",

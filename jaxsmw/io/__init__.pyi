@@ -1,3 +1,4 @@
+from .exchange import ImportedMap, make_functional_map, to_geomfum, to_pyfm, to_torch
 from .landmark_files import read_landmark_file, write_landmark_file
 from .landmarks import FrameDistances, LandmarkMatch, Landmarks, check_frame, find_frame, match_landmarks
 from .maps import read_landmarks, read_pointwise_map, write_pointwise_map
@@ -7,6 +8,7 @@ from .spectra import make_spectrum, read_functional_map, read_spectrum, write_fu
 
 __all__ = [
     "FrameDistances",
+    "ImportedMap",
     "LandmarkMatch",
     "Landmarks",
     "MeshData",
@@ -14,6 +16,7 @@ __all__ = [
     "Texture",
     "check_frame",
     "find_frame",
+    "make_functional_map",
     "make_spectrum",
     "match_landmarks",
     "read_functional_map",
@@ -23,6 +26,9 @@ __all__ = [
     "read_mesh_data",
     "read_pointwise_map",
     "read_spectrum",
+    "to_geomfum",
+    "to_pyfm",
+    "to_torch",
     "write_functional_map",
     "write_landmark_file",
     "write_mesh",

@@ -1,7 +1,8 @@
 """Readers and writers of pointwise maps, and readers of landmarks.
 
-A file has one of three formats: text with one row per line, NumPy's `.npy`, or MATLAB's `.mat`. Files do not
-say whether their indices count from 0 or from 1, so the argument `index_base` overrides the default.
+A file has one of these formats: text with one row per line, NumPy's `.npy` and `.npz`, safetensors, or
+MATLAB's `.mat`. Files do not say whether their indices count from 0 or from 1, so the argument `index_base`
+overrides the default.
 """
 
 from __future__ import annotations
@@ -18,6 +19,13 @@ from jaxsmw.choices import IndexBase
 from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.formats.mat import POINTWISE_MAP, is_mat_file, read_matrix, write_variables
+from jaxsmw.io.formats.named_arrays import (
+    ARRAY_SUFFIXES,
+    check_writable,
+    is_array_file,
+    read_named_array,
+    write_named_arrays,
+)
 from jaxsmw.io.formats.npz import read_array
 from jaxsmw.io.formats.text import is_number
 from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
@@ -25,14 +33,17 @@ from jaxsmw.io.meshes import MESH_SUFFIXES, POINT_CLOUD_SUFFIXES
 from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
 
-# Suffixes of other kinds of files. The programs that open such files cannot open a map. The suffixes `.mat`
-# and `.npy` are not in this set, because maps are also written in these formats.
+# The name of a map in a file of named arrays.
+_NAME = "pointwise_map"
+
+# Suffixes of other kinds of files. The programs that open such files cannot open a map. The suffixes of
+# formats in which maps are also written are not in this set.
 _NOT_MAPS = {
-    *(".npz", ".baryc_gt", ".vts", ".json"),
+    *(".baryc_gt", ".vts", ".json"),
     *(".png", ".jpg", ".jpeg", ".gif", ".bmp", ".tif", ".tiff", ".webp", ".svg", ".pdf", ".eps", ".ps"),
     *(".html", ".htm", ".xhtml"),
     *(*MESH_SUFFIXES, *POINT_CLOUD_SUFFIXES, *LANDMARK_SUFFIXES),
-} - {".mat", ".npy"}
+} - {".mat", ".npy", *ARRAY_SUFFIXES}
 
 
 def read_pointwise_map(
@@ -42,8 +53,8 @@ def read_pointwise_map(
 
     **Arguments:**
 
-    - `path`: a `.npy` file, a `.mat` file, or a text file with one target vertex per line. A `.mat` file
-      contains either a single list of numbers, or a list called `T12` among other variables. The name `T12`
+    - `path`: a `.npy`, `.npz`, `.safetensors` or `.mat` file, or a text file with one target vertex per line.
+      If a file contains several arrays, the map is `pointwise_map`, or `T12` in a `.mat` file. The name `T12`
       means that X is shape 1 and Y is shape 2.
     - `mesh_x`, `mesh_y`: the source X (m vertices) and the target Y, each a `Mesh`.
     - `index_base`: the index of the first vertex in the file, 0 or 1. The default None means 1 for `.mat`
@@ -86,8 +97,9 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
     **Arguments:**
 
     - `path`: the file to create or to replace. A `.mat` file contains the column `T12` of 1-based vertices,
-      as is usual in MATLAB. A `.npy` file contains an array (m,) of 0-based vertices. A file with any other
-      suffix is text with one 0-based vertex per line.
+      as is usual in MATLAB. A `.npy` file contains an array (m,) of 0-based vertices; a `.npz` or
+      `.safetensors` file contains this array as `pointwise_map`. A file with any other suffix is text with
+      one 0-based vertex per line.
     - `pointwise_map`: the target vertex of each source vertex, as 0-based integers (m,).
 
     **Raises:** `InputError` if the array is not a list of non-negative integers, the file cannot be written,
@@ -103,6 +115,9 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
     if is_mat_file(path):
         write_variables(path, {POINTWISE_MAP: targets.astype(np.float64) + 1})
         return
+    if is_array_file(path):
+        write_named_arrays(path, {_NAME: targets.astype(np.int64)})
+        return
     with atomic_write(path) as temporary:
         if _is_npy_file(path):
             np.save(temporary, targets.astype(np.int64))
@@ -111,13 +126,14 @@ def write_pointwise_map(path: str | os.PathLike[str], pointwise_map: ArrayLike) 
 
 
 def check_map_name(path: str | os.PathLike[str]) -> None:
-    """Refuse the suffixes of other kinds of files, such as pictures and meshes, as the name of a map."""
+    """Refuse the suffix of another kind of file, such as a mesh, or of a format that needs a package."""
     suffix = Path(path).suffix.lower()
     if suffix in _NOT_MAPS:
         raise InputError(
-            f"{path}: maps are written as text, .npy or .mat, not as {suffix}: choose a name with another "
-            "suffix, such as .txt."
+            f"{path}: maps are written as text, .npy, .npz, .safetensors or .mat, not as {suffix}: choose a "
+            "name with another suffix, such as .txt."
         )
+    check_writable(path)
 
 
 def _is_npy_file(path: str | os.PathLike[str]) -> bool:
@@ -125,30 +141,34 @@ def _is_npy_file(path: str | os.PathLike[str]) -> bool:
 
 
 class Table:
-    """The numbers of a `.npy` file, a `.mat` file or a text file as a matrix `values`, float64.
+    """The numbers of a file of arrays or a text file as a matrix `values`, float64.
 
     Each row of the matrix is one line of a text file, or one row of an array in a file. In text files, spaces
     or tabs separate numbers. Commas are refused, because `3,5` could be a number with a decimal comma or the
-    two vertices 3 and 5. `columns` is the required number of columns, or None for any number.
+    two vertices 3 and 5. `columns` is the required number of columns, or None for any number. `variable` is
+    the name of the matrix in a `.mat` file with several matrices.
     """
 
-    def __init__(self, path: Path, *, columns: int | None = None) -> None:
+    def __init__(self, path: Path, *, columns: int | None = None, variable: str = POINTWISE_MAP) -> None:
         self.path = path
-        self._is_text = not is_mat_file(path) and not _is_npy_file(path)
+        self._is_text = not (is_mat_file(path) or _is_npy_file(path) or is_array_file(path))
         if self._is_text:
             self._words = self._read_text(columns)
             self.values = np.array(self._words, dtype=np.float64)
         elif is_mat_file(path):
-            self.values = read_matrix(path, POINTWISE_MAP, columns=columns)
+            self.values = read_matrix(path, variable, columns=columns)
         else:
             self.values = self._read_array(columns)
         self.rows, self.columns = self.values.shape
 
     def _read_array(self, columns: int | None) -> Float64[np.ndarray, "rows columns"]:
         """Read an array as a matrix. A list becomes one column, and so does a row if `columns` is 1."""
-        data = read_bytes(self.path)
-        with naming(self.path):
-            array = read_array(data)
+        if is_array_file(self.path):
+            array = read_named_array(self.path, _NAME)
+        else:
+            data = read_bytes(self.path)
+            with naming(self.path):
+                array = read_array(data)
         is_list = array.ndim == 1 or (columns == 1 and array.shape[:-1] == (1,))
         table = array.reshape(-1, 1) if is_list else array
         fits = table.ndim == 2 and columns in (None, table.shape[1]) and table.size

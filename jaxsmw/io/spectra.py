@@ -7,7 +7,6 @@ attributes and does not import these libraries.
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -27,11 +26,19 @@ from jaxsmw.io.formats.mat import (
     read_variables,
     write_variables,
 )
-from jaxsmw.io.formats.npz import read_arrays
-from jaxsmw.runtime.files import atomic_write, read_bytes
+from jaxsmw.io.formats.named_arrays import (
+    ARRAY_SUFFIXES,
+    is_array_file,
+    read_named_array,
+    read_named_arrays,
+    write_named_arrays,
+)
 
-SPECTRUM_SUFFIXES = (".npz", ".mat")
-"""The suffixes of files with a spectrum."""
+SPECTRUM_SUFFIXES = (*ARRAY_SUFFIXES, ".mat")
+"""The suffixes of files with a spectrum or a functional map."""
+
+# The name of a functional map in a file of named arrays.
+_FUNCTIONAL_MAP = "functional_map"
 
 # The docstring of `make_spectrum` lists the accepted objects.
 SpectrumLike: TypeAlias = Any
@@ -80,16 +87,25 @@ def make_spectrum(
     orthonormal, or an object of another library has no eigenbasis.
     """
     with naming(name):
-        if eigenvectors is None and vertex_areas is None:
-            eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues)
-        values, vectors = _real(eigenvalues, "eigenvalues"), _real(eigenvectors, "eigenvectors")
-        areas = _real(_lumped(vertex_areas, vectors.shape), "vertex areas")
+        values, vectors, areas = eigenbasis_arrays(eigenvalues, eigenvectors, vertex_areas)
         _check_basis(values, vectors, areas)
     total, vectors = areas.sum(), np.where(areas[:, None] > 0, vectors, 0)
     arrays = np.maximum(values, 0) * total, vectors * np.sqrt(total), areas / total, areas > 0
     import jax
 
     return jax.device_put(Spectrum(*arrays))
+
+
+def eigenbasis_arrays(
+    eigenvalues: ArrayLike | SpectrumLike,
+    eigenvectors: ArrayLike | None = None,
+    vertex_areas: ArrayLike | MassMatrix | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the eigenvalues, eigenvectors and vertex areas of `make_spectrum` as float64, unscaled."""
+    if eigenvectors is None and vertex_areas is None:
+        eigenvalues, eigenvectors, vertex_areas = _parts(eigenvalues)
+    values, vectors = real_array(eigenvalues, "eigenvalues"), real_array(eigenvectors, "eigenvectors")
+    return values, vectors, real_array(_lumped(vertex_areas, vectors.shape), "vertex areas")
 
 
 def _check_basis(values: np.ndarray, vectors: np.ndarray, areas: np.ndarray) -> None:
@@ -152,7 +168,7 @@ def _lumped(areas: Any, shape: tuple[int, ...]) -> Any:
     return areas
 
 
-def _real(values: Any, what: str) -> np.ndarray:
+def real_array(values: Any, what: str) -> np.ndarray:
     """Convert values to a float64 array of any shape, and check that all numbers are finite."""
     try:
         array = np.asarray(to_host(values))
@@ -167,12 +183,12 @@ def _real(values: Any, what: str) -> np.ndarray:
 
 
 def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
-    """Read the eigenbasis of a shape from a `.mat` file or a `.npz` file (see `write_spectrum`).
+    """Read the eigenbasis of a shape from a `.npz`, `.safetensors` or `.mat` file (see `write_spectrum`).
 
-    A `.npz` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas` (n,). A `.mat` file
-    contains the following variables, or one struct with fields of these names. `evals` (k) are the
-    eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are either `A`, which is the lumped
-    mass matrix (n, n) or its diagonal, or a list `area` (n).
+    A `.npz` or `.safetensors` file contains `eigenvalues` (k,), `eigenvectors` (n, k) and `vertex_areas`
+    (n,). A `.mat` file contains the following variables, or one struct with fields of these names. `evals`
+    (k) are the eigenvalues, and `evecs` (n, k) are the eigenvectors. The vertex areas are either `A`, which
+    is the lumped mass matrix (n, n) or its diagonal, or a list `area` (n).
 
     **Returns:** A `Spectrum`, as from `make_spectrum`.
 
@@ -191,13 +207,12 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
         if not areas:
             raise InputError(f"{name}: contains evecs but no areas: save the mass matrix as A.")
         return make_spectrum(struct["evals"], struct["evecs"], areas[0], name=name)
-    if Path(path).suffix.lower() != ".npz":
+    if not is_array_file(path):
         raise InputError(
-            f"{path}: spectra are read from .npz and .mat files: give a file of one of these types."
+            f"{path}: spectra are read from .npz, .safetensors and .mat files: give a file of one of these "
+            "types."
         )
-    data = read_bytes(path, largest=None)
-    with naming(path):
-        arrays = read_arrays(data)
+    arrays = read_named_arrays(path)
     fields = "eigenvalues", "eigenvectors", "vertex_areas"
     if missing := [field for field in fields if field not in arrays]:
         raise InputError(f"{path}: lacks {', '.join(missing)}: write the spectrum again.")
@@ -205,10 +220,10 @@ def read_spectrum(path: str | os.PathLike[str]) -> Spectrum:
 
 
 def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh | None = None) -> None:
-    """Write the spectrum of a shape to a `.npz` file, or as a struct `S` to a `.mat` file for MATLAB.
+    """Write the spectrum of a shape as named arrays, or as a struct `S` to a `.mat` file for MATLAB.
 
-    A `.npz` file contains the arrays that `read_spectrum` lists. In a `.mat` file, `S` has the following
-    fields.
+    A `.npz` or `.safetensors` file contains the arrays that `read_spectrum` lists. In a `.mat` file, `S` has
+    the following fields.
 
     - `evals` (k) and `evecs` (n, k) are the eigenvalues and eigenvectors.
     - `A` (n, n) is the lumped mass matrix, as a sparse matrix.
@@ -223,7 +238,8 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
 
     **Arguments:**
 
-    - `path`: the file to create or to replace. The suffix, `.npz` or `.mat`, determines the format.
+    - `path`: the file to create or to replace. The suffix, `.npz`, `.safetensors` or `.mat`, determines the
+      format.
     - `spectrum`: a `Spectrum` (n vertices, k eigenvectors), whose positions, normals, mask and descriptors
       are not written.
     - `mesh`: the mesh of the spectrum (n vertices), or None.
@@ -242,8 +258,7 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
         )
     check_suffix(path, "spectra", *SPECTRUM_SUFFIXES)
     if not is_mat_file(path):
-        with atomic_write(path) as temporary:
-            np.savez(temporary, eigenvalues=values, eigenvectors=vectors, vertex_areas=areas)
+        write_named_arrays(path, {"eigenvalues": values, "eigenvectors": vectors, "vertex_areas": areas})
         return
     area = areas.sum()
     struct: dict[str, Any] = {
@@ -264,12 +279,13 @@ def write_spectrum(path: str | os.PathLike[str], spectrum: Spectrum, mesh: Mesh 
 def read_functional_map(
     path: str | os.PathLike[str], spectrum_x: Spectrum, spectrum_y: Spectrum
 ) -> Float64[np.ndarray, "k_x k_y"]:
-    """Read a functional map, a pullback that takes functions on Y to functions on X, from a `.mat` file.
+    """Read a functional map, a pullback that takes functions on Y to functions on X.
 
     **Arguments:**
 
-    - `path`: the file. The file contains either a single matrix, or a matrix `C21` among other variables. The
-        name `C21` means that X is shape 1 and Y is shape 2.
+    - `path`: a `.npz`, `.safetensors` or `.mat` file. The file contains either a single matrix, or a matrix
+        `functional_map` among other arrays, which is called `C21` in a `.mat` file. The name `C21` means that
+        X is shape 1 and Y is shape 2.
     - `spectrum_x`, `spectrum_y`: the spectra of X and Y, each a `Spectrum`. The functional map may have fewer
         rows and columns than the spectra have eigenvectors.
 
@@ -280,29 +296,42 @@ def read_functional_map(
     **Raises:** `InputError` if the file cannot be read or contains no suitable matrix, or if the matrix is
     too large for the spectra or has entries that are not finite.
     """
-    matrix = read_matrix(path, FUNCTIONAL_MAP)
+    if is_array_file(path):
+        with naming(path):
+            matrix = real_array(read_named_array(path, _FUNCTIONAL_MAP), "entries of the functional map")
+    else:
+        matrix = read_matrix(path, FUNCTIONAL_MAP)
+    check_functional_map(path, matrix, spectrum_x, spectrum_y)
+    return matrix
+
+
+def check_functional_map(
+    name: str | os.PathLike[str], matrix: np.ndarray, spectrum_x: Spectrum, spectrum_y: Spectrum
+) -> None:
+    """Raise `InputError` if an array is not a finite matrix (at most k_X, at most k_Y)."""
+    if matrix.ndim != 2:
+        raise InputError(f"{name}: has shape {matrix.shape}: give a functional map, which is a matrix.")
     most = spectrum_x.eigenvalues.shape[0], spectrum_y.eigenvalues.shape[0]
     if np.greater(matrix.shape, most).any():
         cure = "compute more eigenvectors, or remove the last rows and columns of the map"
         if np.less_equal(matrix.shape[::-1], most).all():
             cure = "transpose the map"
         raise InputError(
-            f"{path}: the functional map has shape {matrix.shape}, but the shape of a map from "
+            f"{name}: the functional map has shape {matrix.shape}, but the shape of a map from "
             f"functions on Y to functions on X can be at most {most}: {cure}."
         )
     if not np.isfinite(matrix).all():
-        raise InputError(f"{path}: the functional map is not finite: compute the map again.")
-    return matrix
+        raise InputError(f"{name}: the functional map is not finite: compute the map again.")
 
 
 def write_functional_map(
     path: str | os.PathLike[str], functional_map: Float[Array, "k_x k_y"] | Float[np.ndarray, "k_x k_y"]
 ) -> None:
-    """Write a functional map as the matrix `C21` to a `.mat` file.
+    """Write a functional map as the array `functional_map`, or as the matrix `C21` to a `.mat` file.
 
     **Arguments:**
 
-    - `path`: the file to create or to replace, with the suffix `.mat`.
+    - `path`: the file to create or to replace, with the suffix `.npz`, `.safetensors` or `.mat`.
     - `functional_map`: the pullback C (k_X, k_Y), without unit. The eigenbases must belong to surfaces of
         area 1, as the spectra of this library do.
 
@@ -310,6 +339,9 @@ def write_functional_map(
     cannot be written.
     """
     with naming("functional map"):
-        matrix = _real(functional_map, "entries")
-    check_suffix(path, "functional maps", ".mat")
-    write_variables(path, {FUNCTIONAL_MAP: matrix})
+        matrix = real_array(functional_map, "entries")
+    check_suffix(path, "functional maps", *SPECTRUM_SUFFIXES)
+    if is_array_file(path):
+        write_named_arrays(path, {_FUNCTIONAL_MAP: matrix})
+    else:
+        write_variables(path, {FUNCTIONAL_MAP: matrix})

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from jaxsmw.choices import Backend
 from jaxsmw.core.arrays import is_traced, namespace
+from jaxsmw.core.functional_map import encode
 from jaxsmw.core.refinement import Refinement
 from jaxsmw.core.results import RESULTS, sentence
 from jaxsmw.core.spectrum import Spectrum
@@ -196,6 +197,46 @@ class Correspondence:
     def functional_map(self) -> Float[np.ndarray, "k_out k_in"]:
         """The functional map of the last iteration; see `jaxsmw.Refinement`."""
         return np.asarray(self.refinement.functional_map)
+
+    def to_pyfm(self) -> Any:
+        """Return a `FunctionalMapping` of pyFM, in which `mesh1` is Y, `mesh2` is X, and `FM_12` is set.
+
+        Both meshes have their spectra and their own units, as from `jaxsmw.io.to_pyfm`, and the functional
+        map fits these units. `jaxsmw.io.make_functional_map` converts in the opposite direction.
+
+        **Raises:** `InputError` if pyFM is not installed, or a spectrum belongs to a cut mesh.
+        """
+        from jaxsmw.io.exchange import to_pyfm, to_pyfm_mapping
+
+        shape_x, shape_y = (to_pyfm(*side) for side in self._sides)
+        return to_pyfm_mapping(shape_x, shape_y, self._map_in_units())
+
+    def to_geomfum(self) -> tuple[Any, Any, Float[np.ndarray, "k_x k_y"]]:
+        """Return shape `a`, which is Y, shape `b`, which is X, and the functional map of geomfum.
+
+        Both shapes are as from `jaxsmw.io.to_geomfum`, and the functional map fits their units.
+
+        **Raises:** `InputError` if geomfum is not installed, or a spectrum belongs to a cut mesh.
+        """
+        from jaxsmw.io.exchange import to_geomfum
+
+        shape_x, shape_y = (to_geomfum(*side) for side in self._sides)
+        return shape_y, shape_x, self._map_in_units()
+
+    @property
+    def _sides(self) -> tuple[tuple[Mesh, Spectrum], tuple[Mesh, Spectrum]]:
+        return (self.mesh_x, self.spectrum_x), (self.mesh_y, self.spectrum_y)
+
+    def _map_in_units(self) -> Float[np.ndarray, "k_x k_y"]:
+        """Return the pullback between the eigenbases in the units of the meshes, float64."""
+        from jaxsmw.io.exchange import unit_factor
+
+        matrix = np.asarray(self.functional_map, np.float64)
+        if self.stage.refiner.convention != "pullback":
+            encoded = encode(self.pointwise_map, self.spectrum_x, self.spectrum_y)
+            matrix = np.asarray(encoded, np.float64)
+        factor_x, factor_y = (unit_factor(*side) for side in self._sides)
+        return matrix * np.sqrt(factor_x / factor_y)
 
     def surface_points(self) -> SurfacePoints:
         """Compute the match of every vertex of X as a point on a triangle of Y.
