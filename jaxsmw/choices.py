@@ -30,7 +30,7 @@ EDGES_PER_SHAPE = 4
 Scale = Literal["unknown"]
 """The name of a scale of a partial pair that must be estimated; see `jaxsmw.match`."""
 
-Template = Literal["quadruped", "biped"]
+Template = Literal["mammal"]
 """The names of built-in full shapes through which two partial shapes can be matched; see `jaxsmw.match`."""
 
 Laplacian = Literal["auto", "cotangent", "robust"]

@@ -389,6 +389,30 @@ _QUADRUPED_POSES = {
 }
 
 
+def _mammal(body: _Body) -> None:
+    """Build a heavy quadruped with the joints of the fox, between a dog, a cow and a lion."""
+    add, limb = body.add, body.limb
+    limb("hips chest", "", "0 .9 -.5 .24, 0 .88 -.05 .25, 0 .9 .36 .26", blend=0.1)
+    add("0 .78 -.15 .2, 0 .76 .32 .22", blend=0.1)  # belly and breast
+    add(".14 .96 .34 .12, .2 .72 .38 .11", blend=0.1)  # shoulder blade
+    limb("nape neck", "chest", "0 .98 .48 .22, 0 1.08 .64 .19, 0 1.12 .76 .18", blend=0.1)
+    limb("head", "neck", "0 1.15 .84 .2, 0 1.12 .98 .17", blend=0.06)
+    add("0 1.08 1.02 .13, 0 1.02 1.2 .1", blend=0.06)  # snout
+    add("0 1 .98 .1, 0 .94 1.14 .06", blend=0.03)  # jaw
+    add(".12 1.1 .9 .1, .15 1.06 .9 .07", blend=0.05)  # cheek
+    ear = ".12 1.28 .8 .08, .19 1.38 .78 .07, .22 1.45 .77 .025"
+    add(ear, blend=0.04, normal=(0.35, 0.0, 1.0), thickness=0.04, joint="head")
+    tail = "0 1.02 -.7 .075, 0 .95 -.88 .06, 0 .8 -1.02 .055, 0 .62 -1.1 .05, 0 .48 -1.14 .03"
+    limb("tail1 tail2 tail3 tail4", "hips", tail, blend=0.06)
+    foreleg = ".16 .74 .38 .15, .18 .46 .31 .09, .17 .2 .34 .06, .17 .07 .35 .065"
+    limb("shoulder elbow wrist", "chest", foreleg, blend=0.08)
+    limb("paw", "wrist", ".17 .06 .36 .07, .17 .055 .45 .062", blend=0.03)
+    hindleg = ".14 .8 -.5 .2, .19 .5 -.4 .12, .17 .27 -.6 .06, .17 .07 -.55 .065"
+    limb("hip knee hock", "hips", hindleg, blend=0.08)
+    limb("foot", "hock", ".17 .06 -.54 .07, .17 .055 -.45 .062", blend=0.03)
+    add(".17 .29 -.62 .045, .17 .33 -.66 .03", blend=0.03)  # heel
+
+
 def _biped(body: _Body) -> None:
     """Build a goblin."""
     add, limb = body.add, body.limb
@@ -538,6 +562,7 @@ _KINDS: dict[str, tuple[Callable[[_Body], None], dict[str, str]]] = {
     "quadruped": (_quadruped, _QUADRUPED_POSES),
     "biped": (_biped, _BIPED_POSES),
     "dragon": (_dragon, _DRAGON_POSES),
+    "mammal": (_mammal, {pose: _QUADRUPED_POSES[pose] for pose in ("stand", "walk", "look")}),
 }
 
 CREATURES: Mapping[str, tuple[str, ...]] = {kind: ("rest", *poses) for kind, (_, poses) in _KINDS.items()}
@@ -555,7 +580,8 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
 
     **Arguments:**
 
-    - `kind`: `"quadruped"` (a fox), `"biped"` (a goblin) or `"dragon"`.
+    - `kind`: `"quadruped"` (a fox), `"biped"` (a goblin), `"dragon"`, or `"mammal"` (a heavy quadruped with
+      average proportions of mammals).
     - `vertices`: the number of vertices, at least 500.
     - `pose`: one of the poses that `CREATURES` lists for this kind.
     - `seed`: an integer of at least 0, which determines the proportions, the triangulation, and the small

@@ -78,7 +78,15 @@ def test_a_template_is_recommended_for_uncertain_parts(joined):
     uncertain = replace(joined, probability=0.1)
     for match_of_parts, recommended in ((uncertain, False), (replace(uncertain, shared=None), True)):
         (text,) = advice(match_of_parts, partial=True)
-        assert ("template=mesh" in text) == recommended
+        assert ("template=mesh" in text) == ('template="mammal"' in text) == recommended
+
+
+def test_uncertain_maps_of_two_parts_cause_one_warning(parts):
+    x, y, _ = parts
+    with pytest.warns(UserWarning, match="wrong as a whole") as caught:
+        found = match(x, y, template=creature("quadruped", vertices=800, seed=0), preset=QUICK)
+    (warning,) = [str(one.message) for one in caught if "wrong as a whole" in str(one.message)]
+    assert found.pair.name in warning and found.probability < 0.5
 
 
 def test_points_are_matched_where_they_meet_on_the_template():

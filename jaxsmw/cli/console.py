@@ -55,7 +55,7 @@ def say(message: str) -> None:
 
 # An argument that a message of the library recommends.
 _ARGUMENT = re.compile(
-    r"\b(coordinates|index_base|laplacian|mirror|partial|preset|scale|weld)="
+    r"\b(coordinates|index_base|laplacian|mirror|partial|preset|scale|template|weld)="
     r"(?:True|([01])(?!\.?\w)|([\"'])(\w+)\3)"
 )
 

@@ -100,7 +100,8 @@ def match(
       template makes `partial` True. The default is None, to match X to Y directly.
 
         - a mesh in the unit of length of Y.
-        - `"quadruped"`, `"biped"`: a built-in synthetic body. Its scale is estimated.
+        - `"mammal"`: a built-in synthetic body for parts of four-legged animals; see `jaxsmw.creature`. Its
+          scale is estimated.
 
     - `mirror`: whether X and Y are of opposite hands, such as a left and a right tooth. If they are, the
       mirror image of X is matched instead of X. Whether X is mirrored or not, entry i of the map is the match
@@ -128,32 +129,35 @@ def match(
     """
     check_choice(mirror, Mirror, "a mirror setting")
     check_choice(backend, Backend, "a backend")
-    if template is not None:
-        if not isinstance(init, str):
-            raise InputError(
-                "an initial map from X to Y cannot be used with a template: leave out the one or the other."
-            )
-        x, y = as_mesh(mesh_x, "source mesh"), as_mesh(mesh_y, "target mesh")
-        whole, scale_x, scale_y = scales_to_template(x, y, template, scale)
-        to_template = functools.partial(
-            match,
-            mesh_y=whole,
-            preset=preset,
-            init=init,
-            laplacian=laplacian,
-            eigensolver=eigensolver,
-            partial=True,
-            mirror=mirror,
-            backend=backend,
+    matched = functools.partial(
+        _matched,
+        preset=preset,
+        laplacian=laplacian,
+        eigensolver=eigensolver,
+        mirror=mirror,
+        history=history,
+        backend=backend,
+    )
+    if template is None:
+        correspondence = matched(Pair.make(mesh_x, mesh_y, partial=partial, scale=scale), init=init)
+    elif not isinstance(init, str):
+        raise InputError(
+            "an initial map from X to Y cannot be used with a template: leave out the one or the other."
         )
+    else:
+        parts = as_mesh(mesh_x, "source mesh"), as_mesh(mesh_y, "target mesh")
+        whole, *scales = scales_to_template(*parts, template, scale)
+        pairs = [
+            Pair.make(part, whole, partial=True, scale=unit) for part, unit in zip(parts, scales, strict=True)
+        ]
         seconds: dict[str, float] = {}
         with timed("source to template", seconds):
-            x_to_template = to_template(x, scale=scale_x)
+            x_to_template = matched(pairs[0], init=init)
         with timed("target to template", seconds):
-            y_to_template = to_template(y, scale=scale_y)
-        method = choose_preset(preset)
+            y_to_template = matched(pairs[1], init=init)
         with timed("source to target", seconds), one_blas_thread():
-            joined = join(
+            method = choose_preset(preset)
+            correspondence = join(
                 x_to_template,
                 y_to_template,
                 method.with_history() if history else method,
@@ -161,8 +165,24 @@ def match(
                 eigensolver=eigensolver,
                 backend=backend,
             )
-        return replace(joined, seconds=seconds)
-    pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
+        correspondence = replace(correspondence, seconds=seconds)
+    for text in advice(correspondence, partial=partial or template is not None):
+        warnings.warn(text, stacklevel=2)
+    return correspondence
+
+
+def _matched(
+    pair: Pair,
+    *,
+    preset: PresetName | Preset | Stage | Sequence[Stage],
+    init: MatchInit | ArrayLike | SurfacePoints,
+    laplacian: Laplacian,
+    eigensolver: Eigensolver,
+    mirror: Mirror,
+    history: bool,
+    backend: Backend,
+) -> Correspondence:
+    """Match a pair without a template, and without advice; see `match`."""
     adapts = isinstance(preset, str | Preset)
     method = choose_preset(preset)
     surfaces = pair.without_shortcuts() if method.cuts_shortcuts else pair
@@ -175,7 +195,7 @@ def match(
     automatic = isinstance(init, str) and init == "auto"
     first_init = check_initial_map(pair, DEFAULT_INITIAL_MAP if automatic else init)
 
-    seconds = {}
+    seconds: dict[str, float] = {}
     step = functools.partial(timed, seconds=seconds)
     release_freed_memory()
     # Searches and preparation use all cores, for which threads of the linear algebra would only wait.
@@ -200,8 +220,6 @@ def match(
         correspondence = match_prepared(
             prepared, start, method, mirror=mirror, hypotheses=automatic, step=step
         )
-    for text in advice(correspondence, partial=partial):
-        warnings.warn(text, stacklevel=2)
     return replace(correspondence, seconds=seconds)
 
 
