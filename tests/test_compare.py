@@ -259,7 +259,7 @@ def test_bad_input_gets_one_sentence(pairs, unchecked):
         (one, 3, "pairs is 3"),
         (one, "no-such-directory", "is not a directory"),
         (one, [(x, y)], "pair 0 is tuple without ground truth"),
-        (one, [(x, y, truth[1:])], "do not fit the 642 vertices"),
+        (one, [(x, y, truth[1:])], "641 true points for the 642 vertices"),
         (one, [pairs[0], pairs[0]], "body 0 to body 1 is listed twice"),
         ({"f": wrong_length}, pairs[:1], "the map of the method f has 641 entries"),
         ({"f": broken}, pairs[:1], "the method f raised KeyError at .*test_compare.py, line"),
@@ -296,3 +296,20 @@ def test_the_plot_shows_every_difference(pairs, tmp_path):
     assert (tmp_path / "differences.png").stat().st_size > 1000
     with pytest.raises(InputError, match="'c' is not a method"):
         comparison.plot(tmp_path / "other.png", reference="c")
+
+
+def test_interval_is_a_confidence_interval_of_the_mean():
+    sample = np.random.default_rng(3).normal(2, 1, 400)
+    mean, low, high = mean_interval(sample, seed=0)
+    half = 1.96 * sample.std() / 20
+    assert mean == pytest.approx(sample.mean())
+    assert low == pytest.approx(mean - half, abs=0.1 * half) and high == pytest.approx(
+        mean + half, abs=0.1 * half
+    )
+    assert mean_interval(sample, seed=0) == (mean, low, high)
+    assert mean_interval(sample, seed=1) != (mean, low, high)
+    assert mean_interval(np.full(5, 0.25), seed=0) == (0.25, 0.25, 0.25)
+    assert np.isnan(mean_interval(np.full(1, 0.25), seed=0)).tolist() == [False, True, True]
+    mean, low, high = mean_interval(np.array([1.0, 2.0]), seed=0)
+    assert mean == 1.5 and np.isnan(low) and np.isnan(high)
+    assert np.isnan(mean_interval(np.array([]), seed=0)).all()

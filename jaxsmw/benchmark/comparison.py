@@ -6,6 +6,7 @@ import inspect
 import itertools
 import os
 import pickle
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
@@ -13,14 +14,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from jaxtyping import Float64, Int
 
 from jaxsmw.benchmark.benchmark import Results, run_benchmark
 from jaxsmw.benchmark.datasets import AnyPair, DataPair, DataSet, MeshPair, open_data_set
-from jaxsmw.benchmark.intervals import CONFIDENCE, Interval, mean_interval
+from jaxsmw.benchmark.intervals import Interval, mean_interval
 from jaxsmw.benchmark.journal import Journal
 from jaxsmw.benchmark.measurement import RESULT_COLUMNS, Settings, shapes_of
 from jaxsmw.benchmark.opponents.base import Method, MethodInput, PointwiseMap
@@ -42,6 +43,9 @@ from jaxsmw.report.figures import draw_intervals, save_figure
 from jaxsmw.runtime.files import make_directory
 from jaxsmw.runtime.provenance import value_digest
 from jaxsmw.runtime.workers import Workers
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MapFunction = Callable[[Spectrum, Spectrum, Int[Array, " m"]], PointwiseMap]
 """A function that takes the spectra of X and Y and an initial map X -> Y (m,), and returns a map X -> Y (m,).
@@ -224,14 +228,23 @@ class Comparison:
         summaries = summarize_methods(self.results, seed=self.seed, reference=reference)
         return markdown_table(summaries, reference)
 
-    def plot(self, path: str | os.PathLike[str], reference: str | None = None) -> None:
-        """Draw the `differences` with their intervals to a file, such as `"frames.png"`.
+    def plot(self, path: str | os.PathLike[str] | None = None, reference: str | None = None) -> Figure:
+        """Draw the `differences` with their 95 % intervals, and return the figure.
 
-        **Raises:** `InputError` if the file cannot be written, or if matplotlib is missing.
+        **Arguments:**
+
+        - `path`: a file to which the figure is saved, such as `"frames.png"`; None to save nothing.
+        - `reference`: the reference, by default the first method.
+
+        **Raises:** `InputError` if the file cannot be written, if matplotlib is missing, or if there is no
+        other method.
         """
         reference = self._checked(reference)
-        label = f"error minus that of {reference} (x 10⁻³ √area), {CONFIDENCE:.0%} intervals"
-        save_figure(path, draw_intervals(self.differences(reference), label))
+        label = f"difference from {reference} (x 10⁻³ √area)"
+        figure = draw_intervals(self.differences(reference), label)
+        if path is not None:
+            save_figure(path, figure)
+        return figure
 
     def select(
         self, methods: Iterable[str] | None = None, pairs: Iterable[tuple[str, str]] | None = None
@@ -381,16 +394,15 @@ def _known_pair(number: int, pair: Any, names: dict[int, str]) -> AnyPair:
             "CreaturePair, or a tuple of the source, the target and the true points on the target."
         )
     meshes = as_mesh(pair[0], "source mesh"), as_mesh(pair[1], "target mesh")
-    truth = pair[2]
+    truth, m = pair[2], len(meshes[0].vertices)
     if not isinstance(truth, GroundTruth):
-        if len(np.atleast_1d(truth) if not isinstance(truth, SurfacePoints) else truth) != len(
-            meshes[0].vertices
-        ):
+        targets = truth if isinstance(truth, SurfacePoints) else np.atleast_1d(truth)
+        if len(targets) != m:
             raise InputError(
-                f"pair {number}: the true points do not fit the {len(meshes[0].vertices)} vertices of the "
-                "source: give one true point for each vertex, or a GroundTruth."
+                f"pair {number}: there are {len(targets)} true points for the {m} vertices of the source: "
+                "give one true point for each vertex, or a GroundTruth."
             )
-        truth = GroundTruth.of_all_vertices(truth if isinstance(truth, SurfacePoints) else np.asarray(truth))
+        truth = GroundTruth.of_all_vertices(targets)
     source, target = (names.setdefault(id(mesh), _free_name(mesh, names)) for mesh in meshes)
     return MeshPair(source, target, *meshes, truth)
 
@@ -403,9 +415,11 @@ def _free_name(mesh: Mesh, names: Mapping[int, str]) -> str:
 
 def _check_sendable(methods: Mapping[str, Method]) -> None:
     """Raise `InputError` if a method cannot be sent to a worker process."""
+    interactive = not hasattr(sys.modules["__main__"], "__file__")
     for name, method in methods.items():
         try:
-            pickle.dumps(method)
+            if b"__main__" in pickle.dumps(method) and interactive:
+                raise TypeError("it is defined in a notebook or an interactive session")
         except Exception as error:  # pickle raises errors of many types
             raise InputError(
                 f"the method {name!r} cannot be sent to worker processes ({error}): define its function at "

@@ -37,7 +37,7 @@ from jaxsmw.benchmark.opponents.base import (
     PointwiseMap,
     successful,
 )
-from jaxsmw.choices import Template
+from jaxsmw.choices import DEFAULT_BACKEND, Backend, Template
 from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
@@ -131,11 +131,13 @@ class Staged(Method):
         return _successful_map(run(self.stages, pair.spectra, _start(pair)))
 
     def measure_all(self, pairs: Sequence[MethodInput]) -> list[Measured | ArithmeticError]:
-        """Measure several pairs, in batches if JAX has an accelerator.
+        """Measure several pairs, in batches where JAX refines them.
 
-        The seconds of each pair in a batch are those of the batch, divided by the number of pairs.
+        Batches pad shapes to a few sizes, so that JAX compiles few programs. The seconds of each pair in a
+        batch are those of the batch, divided by the number of pairs.
         """
-        if len(pairs) == 1 or chosen_backend("auto") == "numpy" or any(p.spectra.partial for p in pairs):
+        by_numpy = chosen_backend("auto") == "numpy" and all(s.refiner.uses_namespaces for s in self.stages)
+        if by_numpy or any(pair.spectra.partial for pair in pairs):
             return super().measure_all(pairs)
         began = time.perf_counter()
         outcomes = run_batches(self.stages, [(pair.spectra, _start(pair)) for pair in pairs])
@@ -170,6 +172,7 @@ class Matched(Method):
     preset: PresetName | Preset
     template: str | None = None
     partial_only: bool = False
+    backend: Backend = DEFAULT_BACKEND
     number_of_eigenvectors: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -195,6 +198,7 @@ class Matched(Method):
                 init=pair.init,
                 partial=pair.spectra.partial,
                 template=None if self.template is None else _template(self.template),
+                backend=self.backend,
             )
 
 
