@@ -3,11 +3,11 @@
     python scripts/compare_frames.py DATA_DIRECTORY [--output DIR] [--pairs N] [--workers N] [--quick]
 
 DATA_DIRECTORY contains `faust_r` and `tosca_r` (docs/datasets.md). The pairs are evenly spread over the lists
-of both sets. `jaxsmw.benchmark.compare` stores the results of each pair in two directories of DIR, from which
-docs/frame_study.md makes its tables: `variants` (all frames and controls) and `parameters` (the numbers of
-eigenvectors, filters and iterations, on a quarter of the pairs). The script writes both tables to
-`summary.md`. After an interruption, the same command continues. With `--quick`, the script compares every
-twentieth variant on one pair of each set.
+of both sets. `jaxsmw.benchmark.compare` stores the results of each pair in three directories of DIR, from
+which docs/frame_study.md makes its tables: `variants` (all frames and controls), and on a quarter of the
+pairs `parameters` (the numbers of eigenvectors, filters and iterations) and `times` (a few variants in a
+single process). The script writes all tables to `summary.md`. After an interruption, the same command
+continues. With `--quick`, the script compares every twentieth variant on one pair of each set.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ SOLUTIONS: dict[str, Solution] = {
     "least squares, Frobenius norm": LeastSquares(norm="frobenius"),
     "regularized": RegularizedLeastSquares(),
 }
+TIMED = (*(f"Meyer: {name}" for name in SOLUTIONS), "cubic spline: filtering", "cubic spline: least squares")
 EIGENVECTORS = (20, 40, 60, 80, 100, 120, 150)
 
 
@@ -152,14 +153,19 @@ def main() -> None:
     ]
     try:
         sets = [open_data_set(options.data / name).pairs for name in ("faust_r", "tosca_r")]
-        for title, methods, share in (("variants", variants(), 1), ("parameters", parameters(), 4)):
+        timed = {name: variants()[name] for name in TIMED}
+        for title, methods, share, workers in (
+            ("variants", variants(), 1, options.workers),
+            ("parameters", parameters(), 4, options.workers),
+            ("times", timed, 4, 1),
+        ):
             pairs = [pair for of_set in sets for pair in evenly_spread(of_set, -(-count // share))]
             comparison = compare(
                 dict(list(methods.items())[::every]),
                 pairs,
                 iterations=ITERATIONS,
                 evaluated_points=1000,
-                workers=options.workers,
+                workers=workers,
                 output=make_directory(options.output) / title,
             )
             parts.append(f"## {title.capitalize()}, {len(comparison.pairs)} pairs\n\n{comparison}")

@@ -8,7 +8,7 @@ import compare_frames
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compare_frames import FILTERS, BandMask, Scaled, frames, parameters, variants
+from compare_frames import FILTERS, TIMED, BandMask, Scaled, frames, parameters, variants
 from synthetic import random_spectrum
 
 from jaxsmw import Meyer, WaveletPreservation
@@ -59,6 +59,7 @@ def test_the_stored_results_belong_to_the_variants():
     stored = Comparison.read(ROOT / "docs/frames/variants")
     assert set(stored.methods) == set(variants()) and len(stored.pairs) == 80
     assert set(Comparison.read(ROOT / "docs/frames/parameters").methods) == set(parameters())
+    assert set(Comparison.read(ROOT / "docs/frames/times").methods) == set(TIMED)
     tight = [
         name
         for name, bank in frames().items()

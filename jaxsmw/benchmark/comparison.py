@@ -37,7 +37,7 @@ from jaxsmw.creature import CreaturePair
 from jaxsmw.errors import InputError, check_whole_number
 from jaxsmw.evaluation.ground_truth import GroundTruth
 from jaxsmw.geometry.mesh import Mesh, as_mesh
-from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map
+from jaxsmw.geometry.surface_points import SurfacePoints, check_points, check_pointwise_map
 from jaxsmw.matching.stages import Preset, Stage, choose_preset
 from jaxsmw.report.figures import draw_intervals, save_figure
 from jaxsmw.runtime.files import make_directory
@@ -396,7 +396,7 @@ def _known_pair(number: int, pair: Any, names: dict[int, str]) -> AnyPair:
     meshes = as_mesh(pair[0], "source mesh"), as_mesh(pair[1], "target mesh")
     truth, m = pair[2], len(meshes[0].vertices)
     if not isinstance(truth, GroundTruth):
-        targets = truth if isinstance(truth, SurfacePoints) else np.atleast_1d(truth)
+        targets = check_points(truth, meshes[1], f"pair {number}: ground truth")
         if len(targets) != m:
             raise InputError(
                 f"pair {number}: there are {len(targets)} true points for the {m} vertices of the source: "

@@ -15,7 +15,7 @@ import re
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
@@ -115,12 +115,13 @@ def _feed(update: Callable[[bytes], None], value: Any, seen: set[int]) -> None:
     if id(value) in seen:
         return
     seen = seen | {id(value)}
+    update(f"\n{type(value).__name__} ".encode())
     function = inspect.unwrap(value) if callable(value) else value
     children: Iterable[Any] = ()
     if is_array(value):
         update(f"{value.dtype}{value.shape}".encode() + np.asarray(value).tobytes())
     elif isinstance(value, tuple | list):
-        children = value
+        children = (len(value), *value)
     elif isinstance(value, Mapping):
         children = value.items()
     elif isinstance(value, partial):
@@ -130,7 +131,7 @@ def _feed(update: Callable[[bytes], None], value: Any, seen: set[int]) -> None:
         update(_written(function))
         children = [*cells, function.__defaults__, function.__kwdefaults__]
     elif is_dataclass(value) and not isinstance(value, type):
-        children = type(value), *vars(value).items()
+        children = type(value), *((field.name, getattr(value, field.name)) for field in fields(value))
     elif isinstance(value, type):
         update(value.__qualname__.encode())
         if value.__module__.partition(".")[0] != "jaxsmw":  # the code of the library has its own digest
