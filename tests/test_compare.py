@@ -272,6 +272,8 @@ def test_bad_input_gets_one_sentence(pairs, unchecked):
         ("workers", 0),
         ("number_of_eigenvectors", 0),
         ("iterations", 0),
+        ("evaluated_points", 0),
+        ("seed", -1),
         ("init", "nothing"),
     ):
         with pytest.raises(InputError, match=f"{option}|nothing"):

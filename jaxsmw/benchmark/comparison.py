@@ -9,6 +9,7 @@ import pickle
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -96,7 +97,9 @@ def compare(
     - `pairs`: a data set (a `DataSet` or its directory), or pairs with ground truth: each is a `DataPair`, a
       `CreaturePair`, or a tuple `(mesh_x, mesh_y, truth)`. In a tuple, `truth` is a `GroundTruth`, or the
       true points of all vertices of X: a map (m,) or `SurfacePoints`.
-    - `number_of_eigenvectors`, `iterations`: the numbers for refiners without levels, and for functions.
+    - `number_of_eigenvectors`: the number for refiners without levels, and for functions. Each shape gets at
+      least as many eigenvectors.
+    - `iterations`: the number for refiners without levels.
     - `init`: the initial map of all methods, a name that `jaxsmw.match` accepts, or a directory with maps in
       files `X_Y.map`. With `"auto"` (the default), it is `"shot"`; presets may also try others.
     - `evaluated_points`: the number of ground-truth points at which all maps are evaluated; None for all.
@@ -113,32 +116,39 @@ def compare(
     **Raises:** `InputError` if there are no methods or pairs, if a method or pair is of no known kind, if a
     pair has no ground truth, or if two pairs or two different meshes have the same name. `InputError` is also
     raised if `output` contains results of other data, settings, methods or versions, if an argument is out of
-    range, or if no pair could be measured. The same error is raised if a function cannot be sent to workers,
-    raises an error or returns no map.
+    range, if a method cannot be sent to workers, if the workers end abruptly, or if no pair could be
+    measured, for example because a function raises an error or returns no map.
     """
     check_whole_number("number_of_eigenvectors", number_of_eigenvectors, 1)
     check_whole_number("iterations", iterations, 1)
-    if workers is not None:
-        check_whole_number("workers", workers, 1)
+    check_whole_number("seed", seed, 0)
+    for name, number in (("evaluated_points", evaluated_points), ("workers", workers)):
+        if number is not None:
+            check_whole_number(name, number, 1)
     every = _named_methods(methods, number_of_eigenvectors, iterations)
     chosen = _known_pairs(pairs)
     settings = Settings(init, evaluated_points=evaluated_points, seed=seed)
     if workers is not None:
         _check_sendable(every)
+    most = max(number_of_eigenvectors, *(method.number_of_eigenvectors for method in every.values()))
     with _directory(output) as directory, nullcontext() if workers is None else Workers(workers) as executor:
-        results = run_benchmark(
-            None,
-            chosen,
-            directory,
-            every,
-            settings,
-            executor,
-            quiet=quiet,
-            number_of_eigenvectors=max(
-                number_of_eigenvectors, *(method.number_of_eigenvectors for method in every.values())
-            ),
-            timed_shapes=False,
-        )
+        try:
+            results = run_benchmark(
+                None,
+                chosen,
+                directory,
+                every,
+                settings,
+                executor,
+                quiet=quiet,
+                number_of_eigenvectors=most,
+                timed_shapes=False,
+            )
+        except BrokenProcessPool as error:
+            raise InputError(
+                "the worker processes ended abruptly: let scripts call compare below "
+                "`if __name__ == '__main__':`, or use fewer workers if memory is short."
+            ) from error
     if not results.rows:
         results.check()
     for cause in results.causes():
