@@ -10,14 +10,14 @@ import re
 import shlex
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from jaxsmw.benchmark.datasets import DataSet, open_data_set
+from jaxsmw.benchmark.datasets import DataPair, DataSet, open_data_set
 from jaxsmw.benchmark.journal import Journal
 from jaxsmw.errors import InputError
 from jaxsmw.io import Landmarks, read_landmark_file
@@ -77,6 +77,12 @@ def data_sets(directory: Path) -> Iterator[DataSet]:
     for place in sorted(directory.iterdir()):
         with suppress(InputError):
             yield open_data_set(place)
+
+
+def evenly_spread(pairs: Sequence[DataPair], number: int) -> list[DataPair]:
+    """Return a number of pairs (at most all), evenly spread from the first to the last."""
+    places = np.linspace(0, len(pairs) - 1, min(number, len(pairs)))
+    return [pairs[int(place)] for place in np.round(places)]
 
 
 def write_text(path: Path, text: str) -> None:

@@ -1,270 +1,177 @@
-"""Compares frames, conventions and ways to compute the functional map, on remeshed FAUST and TOSCA.
+"""Compares frames, ways to compute the functional map, and conventions, on remeshed FAUST and TOSCA.
 
-    python scripts/compare_frames.py DATA_DIRECTORY [--output DIRECTORY] [--pairs N] [--seed N]
-                                     [--workers N] [--quick]
+    python scripts/compare_frames.py DATA_DIRECTORY [--output DIR] [--pairs N] [--workers N] [--quick]
 
-The script needs the extra `dev`: `pip install -e ".[dev]"`.
-
-DATA_DIRECTORY contains `faust_r` and `tosca_r`, the remeshed sets of Ren et al. (2018). Each set consists of
-meshes (`off/NAME.off`), ground truth (`corres/NAME.vts`), and the file `test_pairs.txt` with two names per
-line. The script writes the figures and these files to the output directory:
-
-- `summary.md`: all tables;
-- `results.csv`: the results of each variant on each pair;
-- `parameters.csv`: the errors for each combination of the numbers of eigenvectors, filters and iterations;
-- `invariance.csv`: the similarity of wavelets around corresponding points;
-- `times.csv`: the times of each way to compute the functional map, and of the nearest-neighbour search;
-- `provenance.json`: versions, machine, seeds and settings.
-
-After an interruption, the same command continues from the saved results.
+DATA_DIRECTORY contains `faust_r` and `tosca_r` (docs/datasets.md). The pairs are evenly spread over the lists
+of both sets. `jaxsmw.benchmark.compare` stores the results of each pair in three directories of DIR, from
+which docs/frame_study.md makes its tables: `variants` (all frames and controls), and on a quarter of the
+pairs `parameters` (the numbers of eigenvectors, filters and iterations) and `times` (a few variants in a
+single process). The script writes all tables to `summary.md`. After an interruption, the same command
+continues. With `--quick`, the script compares every twentieth variant on one pair of each set.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
-import sys
-import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
-from functools import partial
-from pathlib import Path
 
-import jax
 import numpy as np
-from common import make_parser
-from frame_study import measurement, variants
-from frame_study.drawing import draw_figures
-from frame_study.measurement import (
-    DATA_SETS,
-    INVARIANCE_FRAMES,
-    PairName,
-    Settings,
-    Task,
-    files_of,
-    measure,
-    measure_times,
-)
-from frame_study.summary import Study, write_summary
-from frame_study.variants import QUICK_FRAMES, Variant, frames, twins
-from tqdm import tqdm
+from common import evenly_spread, make_parser, write_text
+from jaxtyping import Float
 
-from jaxsmw import InputError
-from jaxsmw.benchmark.journal import Journal, Row
-from jaxsmw.report.figures import check_drawable
-from jaxsmw.report.summary import provenance
-from jaxsmw.runtime.files import atomic_write, make_directory
-from jaxsmw.runtime.provenance import claimed_directory, code_digest, measured_code
-from jaxsmw.runtime.workers import Workers, run_tasks
+from jaxsmw import InputError, LeastSquares, Stage, WaveletPreservation, banks
+from jaxsmw.banks import CubicSpline, FilterBank, Identity, Meyer, SpectralDistribution, Warped, tighten
+from jaxsmw.benchmark import compare, open_data_set
+from jaxsmw.benchmark.comparison import Compared
+from jaxsmw.core.arrays import Array, namespace
+from jaxsmw.core.functional_map import WaveletProblem
+from jaxsmw.core.solutions.closed_form import Filtering, NearestOrthogonal, PreparedFiltering, Solution
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
+from jaxsmw.runtime.files import make_directory
+from jaxsmw.runtime.provenance import made_with
 
-QUICK = Settings(
-    pairs=2,
-    iterations=2,
-    evaluated_points=200,
-    wavelet_centers=20,
-    frames=QUICK_FRAMES,
-    parameter_pairs=1,
-    parameter_eigenvectors=(20, 40),
-    parameter_filters=(2, 6),
-    parameter_iterations=2,
-)
+FILTERS, ITERATIONS = 6, 5
+SOLUTIONS: dict[str, Solution] = {
+    "filtering": Filtering(),
+    "least squares": LeastSquares(),
+    "least squares, Frobenius norm": LeastSquares(norm="frobenius"),
+    "regularized": RegularizedLeastSquares(),
+}
+TIMED = (*(f"Meyer: {name}" for name in SOLUTIONS), "cubic spline: filtering", "cubic spline: least squares")
+EIGENVECTORS = (20, 40, 60, 80, 100, 120, 150)
 
 
-def evenly_spread(items: Sequence, count: int) -> list:
-    """Return `count` items, spread evenly from the first to the last, or all items if there are fewer."""
-    places = np.linspace(0, len(items) - 1, min(count, len(items)))
-    return [items[int(place)] for place in np.round(places)]
+class Scaled(FilterBank):
+    """A bank, multiplied by a number that gives its frame function this mean over a shape's eigenvalues.
 
-
-def select_pairs(data: Path, count: int) -> list[PairName]:
-    pairs = []
-    for data_set in DATA_SETS:
-        listing = data / data_set / "test_pairs.txt"
-        if not listing.is_file():
-            raise InputError(f"{listing}: does not exist: give the directory that holds {data_set}.")
-        lines = [line.split() for line in listing.read_text("utf-8").splitlines() if line.strip()]
-        if wrong := [line for line in lines if len(line) != 2]:
-            raise InputError(f"{listing}: {' '.join(wrong[0])!r} does not name two shapes: correct the line.")
-        pairs += [PairName(data_set, *line) for line in evenly_spread(lines, count)]
-    return pairs
-
-
-def digest(data: Path, pairs: list[PairName]) -> str:
-    """Return a hash of the contents of all files of the pairs."""
-    found = hashlib.sha256()
-    for pair in pairs:
-        for name in pair[1:]:
-            mesh, truth = files_of(data, pair.data_set, name)
-            found.update(mesh.read_bytes())
-            found.update(truth.read_bytes())
-    return found.hexdigest()[:16]
-
-
-class Journals:
-    """The result tables of a study, and the rows that each table must contain when the study is complete."""
-
-    def __init__(self, output: Path, pairs: list[PairName], settings: Settings, measured: list[Variant]):
-        self.pairs, self.settings, self.measured = pairs, settings, measured
-        self.parameters_of = {
-            pair
-            for data_set in DATA_SETS
-            for pair in evenly_spread([p for p in pairs if p.data_set == data_set], settings.parameter_pairs)
-        }
-        self.parameters_wanted = [
-            (k, filters) for k in settings.parameter_eigenvectors for filters in settings.parameter_filters
-        ]
-        self.invariance_wanted = [
-            (frame, scale) for frame in INVARIANCE_FRAMES for scale in range(settings.number_of_filters)
-        ]
-        self.results = Journal(output / "results.csv", [*PairName._fields, *Variant._fields])
-        self.parameters = Journal(output / "parameters.csv", [*PairName._fields, "eigenvectors", "filters"])
-        self.invariance = Journal(output / "invariance.csv", [*PairName._fields, "frame", "scale"])
-
-    def missing(self) -> Iterator[Task]:
-        """Yield one task for each pair with missing rows."""
-        for pair in self.pairs:
-            parameters = self.parameters_wanted if pair in self.parameters_of else []
-            task = Task(
-                pair,
-                [variant for variant in self.measured if (*pair, *variant) not in self.results],
-                [cell for cell in parameters if (*pair, *cell) not in self.parameters],
-                [cell for cell in self.invariance_wanted if (*pair, *cell) not in self.invariance],
-            )
-            if task.variants or task.parameters or task.wavelets:
-                yield task
-
-    def append(self, results: list[Row], parameters: list[Row], invariance: list[Row]) -> None:
-        self.results.append(results)
-        self.parameters.append(parameters)
-        self.invariance.append(invariance)
-
-    def sort(self) -> None:
-        """Sort all rows, so that their order does not depend on the order in which workers finish."""
-        self.results.sort((*pair, *variant) for pair in self.pairs for variant in self.measured)
-        self.parameters.sort(
-            (*pair, *cell)
-            for pair in self.pairs
-            if pair in self.parameters_of
-            for cell in self.parameters_wanted
-        )
-        self.invariance.sort((*pair, *cell) for pair in self.pairs for cell in self.invariance_wanted)
-
-
-def run(data: Path, journals: Journals, workers: int) -> None:
-    """Measure the missing rows pair by pair in worker processes, and save the rows after each pair.
-
-    **Raises:** `InputError` if some pairs could not be measured. All other pairs are measured before the
-    error is raised.
+    `Filtering` with the scaled Meyer frame therefore multiplies the functional map C by the mean.
     """
-    tasks = list(journals.missing())
-    if not tasks:
-        return
-    progress = tqdm(
-        total=len(journals.pairs),
-        initial=len(journals.pairs) - len(tasks),
-        desc="pairs",
-        unit="pair",
-        smoothing=0,
-    )
-    failed: list[str] = []
-    named = {" ".join(task.name): task for task in tasks}
-    with progress, Workers(min(workers, len(tasks))) as executor:
-        for name, result in run_tasks(partial(measure, data, settings=journals.settings), named, executor):
-            if isinstance(result, BaseException):
-                failed.append(f"{name} ({result})")
-            else:
-                journals.append(*result)
-            progress.update()
-    if failed:
-        raise InputError(
-            f"{len(failed)} pairs could not be measured ({'; '.join(failed)}), and the results of the other "
-            "pairs are kept: repair the files of the failed pairs, and run the same command again."
-        )
+
+    bank: FilterBank
+    mean: float = 1.0
+
+    def __call__(
+        self, points: Float[Array, " p"], eigenvalues: Float[Array, " k"]
+    ) -> Float[Array, "filters p"]:
+        mean = banks.frame_function(self.bank(eigenvalues, eigenvalues)).mean()
+        return self.bank(points, eigenvalues) * (self.mean / mean) ** 0.5
 
 
-def measured_times(
-    output: Path, data: Path, pairs: list[PairName], measured: list[Variant], settings: Settings
-) -> list[Row]:
-    """Return the time of each way to compute the functional map, from `times.csv` if this file exists.
+class BandMask(Filtering):
+    """`Filtering` with a smooth mask around the diagonal in place of the kernel of a frame.
 
-    If the file does not exist, a single worker process measures the times. No other measurements run at
-    the same time.
+    With d the distance from the diagonal in octaves, divided by a half-width, the mask is 1 for d <= 0.5,
+    falls like a cosine, and is 0 for d >= 1.5. Octaves count from the edge of the Meyer scaling function. The
+    entries of the mask and of the kernel have the same sum. No filter bank has this mask as its kernel,
+    because for equal spectra the mask has negative eigenvalues.
     """
-    path = output / "times.csv"
-    key = [*PairName._fields, *Variant._fields]
-    if not path.exists():
-        print("measuring the time of each update", file=sys.stderr)
-        firsts = [next(pair for pair in pairs if pair.data_set == data_set) for data_set in DATA_SETS]
-        with Workers(1) as executor:
-            rows = executor.submit(measure_times, data, firsts, measured, settings).result()
-        with atomic_write(path) as temporary:
-            Journal(temporary, key).append(rows)
-    return Journal(path, key).rows
+
+    def prepare(self, problem: WaveletProblem) -> PreparedFiltering:
+        prepared = super().prepare(problem)
+        xp, total = namespace(prepared.kernel), prepared.kernel.sum()
+        octaves_out, octaves_in = (
+            xp.log2(xp.maximum(spectrum.eigenvalues / spectrum.eigenvalues[-1] * 2.0 ** (FILTERS - 1), 1))
+            for spectrum in problem.spectra
+        )
+        distance = abs(octaves_out[:, None] - octaves_in[None, :])
+
+        def mask(half_width: Array) -> Array:
+            return 0.5 * (1 + xp.cos(np.pi * xp.clip(distance / half_width - 0.5, 0, 1)))
+
+        low, high = xp.full_like(total, 1e-3), xp.full_like(total, 100)
+        for _ in range(40):  # bisection
+            middle = (low + high) / 2
+            narrow = mask(middle).sum() < total
+            low, high = xp.where(narrow, middle, low), xp.where(narrow, high, middle)
+        return prepared._replace(kernel=mask(high))
+
+
+def frames() -> dict[str, FilterBank]:
+    """Return the compared banks by name, with `FILTERS` filters if their number can be chosen."""
+    not_tight = {
+        "cubic spline": CubicSpline(FILTERS),
+        "Mexican hat": banks.MexicanHat(FILTERS),
+        "heat": banks.Heat(2.0 ** np.arange(FILTERS)),  # one octave apart, as in the Meyer frame
+        "Gabor": banks.Gabor(FILTERS),
+    }
+    return {
+        "Meyer": Meyer(FILTERS),
+        "simple tight": banks.SimpleTight(FILTERS),
+        "itersine": banks.Itersine(FILTERS),
+        "half-cosine": banks.HalfCosine(FILTERS),
+        "Meyer, warped by the spectrum": Warped(Meyer(FILTERS), SpectralDistribution()),
+        "itersine, warped by the spectrum": Warped(banks.Itersine(FILTERS), SpectralDistribution()),
+        "half-cosine, warped by a logarithm": Warped(banks.HalfCosine(FILTERS), banks.Logarithm()),
+        "Held (2 filters)": banks.Held(),
+        "Simoncelli (2 filters)": banks.Simoncelli(),
+        "Papadakis (2 filters)": banks.Papadakis(),
+        "regular (2 filters)": banks.Regular(),
+        **not_tight,
+        **{f"{name}, scaled": Scaled(bank) for name, bank in not_tight.items()},
+        **{f"{name}, tightened": tighten(bank) for name, bank in not_tight.items()},
+        "exponential window (1 filter)": banks.ExponentialWindow(),
+        "low-pass (1 filter)": banks.LowPass(),
+        "no filter": Identity(),
+    }
+
+
+def variants() -> dict[str, Compared]:
+    """Return all frames with all solutions, and the controls, by names such as `Meyer: least squares`."""
+    grid = [(frame, name) for frame in frames() for name in SOLUTIONS]
+    parts = {f"{frame}: {name}": (frames()[frame], SOLUTIONS[name]) for frame, name in grid}
+    for factor in (0.7, 1.2, 1.5, 2, 3):
+        parts[f"Meyer x {factor}: filtering"] = Scaled(Meyer(FILTERS), factor), Filtering()
+    parts["Meyer: nearest orthogonal"] = Meyer(FILTERS), NearestOrthogonal()
+    reversed_ = {name: pair for name, pair in parts.items() if name.endswith((": filtering", "orthogonal"))}
+    parts["no filter: nearest orthogonal"] = Identity(), NearestOrthogonal()
+    parts["band mask: filtering"] = Meyer(FILTERS), BandMask()
+    refiners: dict[str, Compared] = {name: WaveletPreservation(*pair) for name, pair in parts.items()}
+    for name, pair in reversed_.items():
+        refiners[f"{name}, pushforward"] = WaveletPreservation(*pair, convention="pushforward")
+    return refiners
+
+
+def parameters() -> dict[str, Compared]:
+    """Return stages of the Meyer frame with several numbers of eigenvectors, filters and iterations."""
+    numbers = [(k, filters, 10) for k in EIGENVECTORS for filters in range(2, 9)]
+    numbers += [(k, FILTERS, iterations) for k in EIGENVECTORS for iterations in range(1, 10)]
+    return {
+        f"k = {k}, {filters} filters, {iterations} iterations": Stage(
+            WaveletPreservation(Meyer(filters)), number_of_eigenvectors=k, iterations=iterations
+        )
+        for k, filters, iterations in numbers
+    }
 
 
 def main() -> None:
-    parser = make_parser(__doc__, data="DATA_DIRECTORY", seed=True)
-    parser.add_argument(
-        "--output",
-        type=Path,
-        help="output directory (default: docs/frames, with --quick a new temporary directory)",
-    )
-    parser.add_argument(
-        "--pairs", type=int, help="number of pairs from each data set (default: 40, with --quick 2)"
-    )
-    parser.add_argument(
-        "--workers",
-        type=int,
-        default=os.cpu_count(),
-        help="number of worker processes (default: %(default)s)",
-    )
-    parser.add_argument("--quick", action="store_true", help="run a small study that exercises all parts")
+    parser = make_parser(__doc__, data="DATA_DIRECTORY", output="docs/frames", pairs=40)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--quick", action="store_true", help="few variants on one pair of each set")
     options = parser.parse_args()
-    settings = replace(QUICK if options.quick else Settings(), seed=options.seed)
-    if options.pairs is not None:
-        settings = replace(settings, pairs=options.pairs)
-    output = options.output or (
-        Path(tempfile.mkdtemp(prefix="jaxsmw-frames-")) if options.quick else Path("docs/frames")
-    )
+    count, every = (1, 20) if options.quick else (options.pairs, 1)
+    parts = [
+        f"# Frames compared\n\nThe [frame study](../frame_study.md) discusses these tables. {made_with()}"
+    ]
     try:
-        if settings.pairs < 1 or options.workers < 1 or settings.seed < 0:
-            raise InputError("--pairs and --workers must be at least 1, and --seed at least 0.")
-        study(options.data, output, settings, options.workers)
-    except InputError as error:
-        sys.exit(f"compare_frames: {error}")
-    except KeyboardInterrupt:
-        sys.exit(f"\ninterrupted; the same command with --output {output} continues from the saved results")
-
-
-def study(data: Path, output: Path, settings: Settings, workers: int) -> None:
-    """Run the study: measure all pairs, write the summary, and draw the figures."""
-    check_drawable()
-    jax.config.update("jax_platforms", "cpu")
-    pairs = select_pairs(data, settings.pairs)
-    code = [*measured_code(), Path(variants.__file__), Path(measurement.__file__)]
-    origin = {
-        "settings": asdict(settings),
-        "versions": {**provenance(), "code": code_digest(code)},
-        "data": {"digest of the pairs' files": digest(data, pairs)},
-    }
-    with claimed_directory(make_directory(output), origin):
-        every = variants.variants(settings.frames)
-        same = twins(every, frames(settings.number_of_filters))
-        measured = [variant for variant in every if variant not in same]
-        journals = Journals(output, pairs, settings, measured)
-        run(data, journals, workers)
-        journals.sort()
-        times = measured_times(output, data, pairs, measured, settings)
-        if code_digest(code) != origin["versions"]["code"]:
-            raise InputError(
-                f"{output}: its results come from different versions of the code, because the code changed "
-                "during the study: remove this directory, and start again."
+        sets = [open_data_set(options.data / name).pairs for name in ("faust_r", "tosca_r")]
+        timed = {name: variants()[name] for name in TIMED}
+        for title, methods, share, workers in (
+            ("variants", variants(), 1, options.workers),
+            ("parameters", parameters(), 4, options.workers),
+            ("times", timed, 4, 1),
+        ):
+            pairs = [pair for of_set in sets for pair in evenly_spread(of_set, -(-count // share))]
+            comparison = compare(
+                dict(list(methods.items())[::every]),
+                pairs,
+                iterations=ITERATIONS,
+                evaluated_points=1000,
+                workers=workers,
+                output=make_directory(options.output) / title,
             )
-        whole = Study(journals.results.rows, times, pairs, every, same, settings)
-        with atomic_write(output / "summary.md") as temporary:
-            temporary.write_text(write_summary(whole, journals.invariance.rows), "utf-8")
-        draw_figures(output, data, whole, journals.parameters.rows)
-    print(output / "summary.md")
+            parts.append(f"## {title.capitalize()}, {len(comparison.pairs)} pairs\n\n{comparison}")
+            write_text(options.output / "summary.md", "\n\n".join(parts))
+    except InputError as error:
+        parser.exit(2, "\n".join([*error.lines(), ""]))
 
 
 if __name__ == "__main__":

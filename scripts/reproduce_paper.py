@@ -45,7 +45,7 @@ from jaxsmw.benchmark.benchmark import Results, run_benchmark
 from jaxsmw.benchmark.datasets import DataPair, DataSet, choose_pairs, class_of, open_data_set
 from jaxsmw.benchmark.measurement import Settings
 from jaxsmw.benchmark.opponents.base import Method
-from jaxsmw.benchmark.opponents.baselines import PublishedMaps
+from jaxsmw.benchmark.opponents.baselines import PublishedMaps, Staged
 from jaxsmw.benchmark.opponents.registry import METHODS, suited_methods
 from jaxsmw.benchmark.tables import MethodSummary, markdown, write_tables
 from jaxsmw.choices import DEFAULT_MATCH_INIT
@@ -195,6 +195,8 @@ def other_settings() -> dict[str, Method]:
                 _NAMES.get(setting, setting): value for setting, value in change.items()
             }
             label = ", ".join(f"{setting} = {value}" for setting, value in change.items())
+            if isinstance(method, Staged):
+                changed = {"stages": tuple(dataclasses.replace(stage, **changed) for stage in method.stages)}
             variants[f"{name}: {label}"] = dataclasses.replace(
                 method, reference=f"{reference}, with {label}", **changed
             )

@@ -585,7 +585,7 @@ def test_times_exclude_compilation(monkeypatch):
         method = Slow(seconds)
         with measurement._compilation_seconds() as compilation:
             began = time.perf_counter()
-            measured = measurement._timed(name, method, pair).seconds
+            measured = measurement._timed(name, method, [pair])[0].seconds
             elapsed = time.perf_counter() - began
         assert method.runs == runs
         assert sum(compilation) > 0

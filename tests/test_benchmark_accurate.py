@@ -14,7 +14,7 @@ from test_shortcuts import bent_tube
 
 from jaxsmw import Correspondence, Mesh, creature_pair, geodesic_error, make_mesh, match, read_mesh
 from jaxsmw.benchmark.datasets import DataPair, open_data_set
-from jaxsmw.benchmark.measurement import FIGURES, OPTIONAL_FIGURES, Settings, measure_pair, measure_shape
+from jaxsmw.benchmark.measurement import FIGURES, OPTIONAL_FIGURES, Settings, measure_pairs, measure_shape
 from jaxsmw.benchmark.opponents.baselines import _SHARED_STEPS, Unrefined
 from jaxsmw.benchmark.opponents.registry import METHODS
 from jaxsmw.evaluation import coverage, overlap_scores
@@ -94,7 +94,7 @@ def test_the_method_accurate_gives_the_map_of_match(case, tmp_path):
     np.savetxt(tmp_path / "x_y.map", np.arange(len(source.vertices)) + 1, fmt="%d")
     pair = DataPair("x", "y", *files, partial=partial)
     settings = Settings(str(tmp_path) if init == "map" else init, evaluated_points=300)
-    (row,) = measure_pair((pair, {"accurate": METHODS["accurate"]}), settings, 30)
+    (row,) = measure_pairs([(pair, {"accurate": METHODS["accurate"]})], settings, 30)
 
     meshes = [read_mesh(path) for path in files]
     start = np.arange(len(source.vertices)) if init == "map" else init
@@ -146,7 +146,7 @@ def test_a_method_that_fails_does_not_stop_other_methods(tmp_path):
     write_mesh(tmp_path / "x.off", bumpy_mesh(3))
     pair = DataPair("x", "x", tmp_path / "x.off", tmp_path / "x.off")
     methods = {"broken": Broken(), "initial": METHODS["initial"]}
-    broken, initial = measure_pair((pair, methods), Settings("hks", evaluated_points=50), 10)
+    broken, initial = measure_pairs([(pair, methods)], Settings("hks", evaluated_points=50), 10)
     assert broken["result"] == "it went wrong" and broken["mean"] == broken["seconds"] == "nan"
     assert initial["result"] == "successful" and float(initial["mean"]) < 0.1
 
@@ -162,7 +162,7 @@ def test_the_overlap_of_two_real_parts_is_measured(shared):
     data_set = open_data_set(shared / "data" / "partial_smal")
     pair = data_set.known_pairs["cuts_19_cow_04", "cuts_9_dog_01"]
     methods = {name: METHODS[name] for name in ("initial", "accurate")}
-    initial, accurate = measure_pair((pair, methods), Settings(evaluated_points=100), 100)
+    initial, accurate = measure_pairs([(pair, methods)], Settings(evaluated_points=100), 100)
     assert {initial[name] for name in OPTIONAL_FIGURES} == {"nan"} != initial["mean"]
     meshes = [read_mesh(path) for path in pair.meshes]
     with warnings.catch_warnings():

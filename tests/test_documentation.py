@@ -34,7 +34,6 @@ REFINEMENTS = {
     "docs/frames.md": 3,
     "docs/exchange.md": 1,
     "docs/gradients.md": 1,
-    "docs/how_to/comparing_frames.md": 1,
     "docs/how_to/gpu.md": 1,
     "docs/how_to/many_pairs.md": 1,
     "docs/how_to/parts.md": 2,
@@ -123,6 +122,10 @@ def test_code_blocks_run(page, pair, tmp_path, monkeypatch, small_pictures):
         assert namespace["error"].mean < 0.05 < namespace["initial"].mean
     if page == "docs/evaluation.md":
         assert namespace["perfect"].mean < namespace["nearest"].mean < 0.05
+    if page == "README.md":
+        assert np.isfinite(namespace["comparison"].differences()["cubic spline"].mean)
+    if page == "docs/how_to/comparing_frames.md":
+        assert len(namespace["comparison"].methods) == 6
     if page == "docs/how_to/many_pairs.md":
         assert set(namespace["maps"]) == set(namespace["pairs"])
 

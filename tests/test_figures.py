@@ -11,6 +11,7 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.image import imread
 from report_helpers import TALL, renumbered, uniform
+from synthetic import bumpy_mesh
 
 from jaxsmw.errors import InputError
 from jaxsmw.report import figures
@@ -18,6 +19,8 @@ from jaxsmw.report.figures import (
     draw_correspondence,
     draw_filters,
     draw_functional_map,
+    draw_functions,
+    draw_intervals,
     draw_mesh,
     draw_quality_curves,
     save_figure,
@@ -318,3 +321,32 @@ def test_matplotlib_is_imported_on_first_use_and_without_pyplot() -> None:
         "f.draw_functional_map([[1.0]]); assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", script], check=True, cwd=ROOT)
+
+
+def test_interval_figure_shows_every_estimate() -> None:
+    figure = draw_intervals(
+        {"p": (1.0, 0.5, 2.0), "q": (np.nan,) * 3, "r": (-20.0, -30.0, -10.0)}, "difference"
+    )
+    (axes,) = figure.axes
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["p", "q", "r"]
+    (drawn,) = (line.get_xdata() for line in axes.lines if len(line.get_xdata()) == 3)
+    np.testing.assert_array_equal(drawn, [1, np.nan, -20])
+    low, high = axes.get_xlim()
+    assert low < -30 and high > 2
+    with pytest.raises(InputError, match="nothing to draw"):
+        draw_intervals({}, "difference")
+
+
+def test_functions_on_bodies_are_red_above_and_blue_below_zero() -> None:
+    mesh = bumpy_mesh(3)
+    up = np.sign(mesh.vertices[:, 2])
+    figure = draw_functions([mesh, mesh], [np.stack([up, -up])] * 2, titles=["f", "g"], marked=[0, 1], up="z")
+    pictures = [np.asarray(axes.images[0].get_array(), dtype=float) for axes in figure.axes]
+    assert len(pictures) == 4
+    for picture, sign in zip(pictures, (1, 1, -1, -1), strict=True):
+        seen = picture[..., 3] == 255
+        redness = np.where(seen, picture[..., 0] - picture[..., 2], 0)
+        half = len(redness) // 2
+        assert sign * redness[: half - 20].sum() > 0 > sign * redness[half + 20 :].sum()
+    with pytest.raises(InputError, match="shape"):
+        draw_functions([mesh], [up[None]], titles=["f", "g"], marked=[0])

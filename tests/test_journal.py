@@ -3,13 +3,16 @@
 import errno
 import json
 import os
+from functools import partial
 
+import numpy as np
 import pytest
 from messages import refused
 
-from jaxsmw import InputError
+from jaxsmw import InputError, Meyer, Stage, WaveletPreservation
+from jaxsmw.banks import SoftmaxFrame
 from jaxsmw.benchmark.journal import Journal
-from jaxsmw.runtime.provenance import claimed_directory
+from jaxsmw.runtime.provenance import claimed_directory, code_digest, value_digest
 
 COLUMNS = {"name": str, "value": float}
 
@@ -105,3 +108,101 @@ def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch, number):
     with pytest.raises(InputError, match="on a file system with locks"), claimed_directory(tmp_path, {}):
         pass
     assert not list(tmp_path.iterdir())
+
+
+def row(name: str, value: float) -> dict[str, object]:
+    return {"name": name, "value": value}
+
+
+def test_journal_keeps_only_complete_rows(tmp_path):
+    path = tmp_path / "table.csv"
+    journal = Journal(path, ["name"])
+    journal.append([row("a, with a comma", 1), row("b", 2)])
+    whole = path.read_bytes()
+    for torn in (b"c", b"c,3", b'"c, wi'):
+        path.write_bytes(whole + torn)
+        again = Journal(path, ["name"])
+        assert again.rows == [{"name": "a, with a comma", "value": "1"}, {"name": "b", "value": "2"}]
+        assert ["b"] in again and ["c"] not in again
+        again.append([row("c", 3.5)])
+        assert [r["value"] for r in Journal(path, ["name"]).rows] == ["1", "2", "3.5"]
+
+
+def test_journal_survives_an_incomplete_header_and_repeated_rows(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_bytes(b"name,val")
+    Journal(path, ["name"]).append([row("a", 1)])
+    Journal(path, ["name"]).append([row("a", 2), row("b", 3)])
+    journal = Journal(path, ["name"])
+    assert [r["value"] for r in journal.rows] == ["1", "3"]
+
+
+def test_results_of_different_origin_are_never_mixed(tmp_path):
+    origin = {"settings": {"seed": 0, "frames": ("Meyer",)}, "versions": {"jax": "1.0"}}
+    for _ in range(2):
+        claim(tmp_path, origin)
+    for group, name, value in (
+        ("settings", "seed", 1),
+        ("settings", "new", 1),
+        ("settings", "frames", ("Meyer", "heat")),
+        ("versions", "jax", "1.1"),
+    ):
+        with pytest.raises(InputError, match=name):
+            claim(tmp_path, {**origin, group: {**origin[group], name: value}})
+    with (
+        claimed_directory(tmp_path, origin),
+        pytest.raises(InputError, match="another process is adding results"),
+    ):
+        claim(tmp_path, origin)
+    (tmp_path / "provenance.json").write_text("{")
+    with pytest.raises(InputError, match="is damaged"):
+        claim(tmp_path, origin)
+    (tmp_path / "provenance.json").unlink()
+    (tmp_path / "results.csv").touch()
+    with pytest.raises(InputError, match="unknown origin"):
+        claim(tmp_path, origin)
+
+
+def claim(directory, origin):
+    with claimed_directory(directory, origin):
+        pass
+
+
+def test_code_digest_depends_on_code_but_not_on_comments_or_layout(tmp_path):
+    path = tmp_path / "code.py"
+
+    def digest(text: str) -> str:
+        path.write_text(text)
+        return code_digest([path])
+
+    plain = digest("def f(x):\n    return x + 1\n")
+    assert digest('"""Doc."""\n\n# why\ndef f(x):\n    """More."""\n    return (x + 1)  # so\n') == plain
+    assert digest("def f(x):\n    return x + 2\n") != plain
+
+
+def scaled(factor):
+    return lambda x: factor * x
+
+
+def test_value_digest_depends_on_numbers_and_code():
+    digests = [
+        value_digest(value)
+        for value in (
+            WaveletPreservation(),
+            WaveletPreservation(Meyer(5)),
+            WaveletPreservation(SoftmaxFrame(np.zeros((3, 4)))),
+            WaveletPreservation(SoftmaxFrame(np.ones((3, 4)))),
+            Stage(number_of_eigenvectors=50),
+            scaled(1),
+            scaled(2),
+            partial(max, 1),
+            partial(max, 2),
+            max,
+        )
+    ]
+    assert len(set(digests)) == len(digests)
+    assert value_digest(WaveletPreservation(Meyer(6))) == digests[0]
+    assert value_digest(scaled(2)) == digests[6]
+    itself: list[object] = []
+    itself.append(itself)
+    assert value_digest(itself)

@@ -9,7 +9,7 @@ from scipy.spatial.distance import cdist
 from synthetic import bumpy_mesh, random_spectrum
 
 from jaxsmw.benchmark.opponents.base import HostMethod, MethodInput
-from jaxsmw.benchmark.opponents.baselines import Refined, Unrefined, ZoomOut
+from jaxsmw.benchmark.opponents.baselines import Staged, Unrefined, ZoomOut
 from jaxsmw.benchmark.opponents.registry import METHODS, PEERS, known_methods
 from jaxsmw.benchmark.opponents.smooth_shells import SmoothShells
 from jaxsmw.core.spectrum import Spectrum
@@ -67,7 +67,8 @@ def test_spectral_icp_takes_the_nearest_rotation(pair):
         ]
         u, _, v = np.linalg.svd(c)
         t = nearest(np.asarray(x.eigenvectors), np.asarray(y.eigenvectors) @ (u @ v).T)
-    found = Refined("", icp.refiner, number_of_eigenvectors=K, iterations=4)(pair)
+    (stage,) = icp.stages
+    found = Staged("", (replace(stage, number_of_eigenvectors=K, iterations=4),))(pair)
     np.testing.assert_array_equal(found, t)
 
 

@@ -38,8 +38,8 @@ def data(tmp_path_factory) -> Path:
 
 def test_every_changed_setting_belongs_to_its_method():
     found = reproduce_paper.other_settings()
-    assert found["mwp: k = 200, iterations = 10"].iterations == 10
-    assert found["mwp: k = 200, iterations = 10"].number_of_eigenvectors == 200
+    (stage,) = found["mwp: k = 200, iterations = 10"].stages
+    assert (stage.number_of_eigenvectors, stage.iterations) == (200, 10)
     assert found["zoomout: first = 50"].first == 50 and found["zoomout: step = 1"].step == 1
     assert len(set(found.values())) == len(found) > 20
 

@@ -122,7 +122,7 @@ def test_the_error_is_at_most_the_error_of_the_authors_program(shared):
     given = MethodInput.prepare(
         Pair(mesh_x, mesh_y),
         names=pair.names,
-        number_of_eigenvectors=30,
+        sizes=Sizes(30, number_of_samples=1000),
         number_of_descriptors=method.number_of_descriptors,
     )
     found = replace(method, last_level=200)(given)

@@ -15,20 +15,24 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from jaxsmw.benchmark.datasets import DataPair, DataSet, first_three
+from jaxsmw.benchmark.datasets import AnyPair, DataSet, first_three
 from jaxsmw.benchmark.journal import Journal, Row
 from jaxsmw.benchmark.measurement import (
     OPTIONAL_FIGURES,
     RESULT_COLUMNS,
     SHAPE_COLUMNS,
     Settings,
-    file_digest,
-    measure_pair,
+    Task,
+    measure_pairs,
     measure_shape,
+    shape_digest,
+    shapes_of,
 )
 from jaxsmw.benchmark.opponents.base import Method
 from jaxsmw.benchmark.opponents.registry import METHODS
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.runtime.backends import chosen_backend
 from jaxsmw.runtime.provenance import claimed_directory, code_digest, commit, measured_code, versions
 from jaxsmw.runtime.workers import run_tasks
 
@@ -52,27 +56,33 @@ class Results(NamedTuple):
         """Raise `InputError` if a measurement failed, with one note for each cause."""
         if not self.failures:
             return
-        causes: dict[str, list[str]] = {}
-        for name, cause in self.failures.items():
-            causes.setdefault(cause, []).append(name)
         error = InputError(
             "some shapes or pairs could not be measured: correct these faults, and run the same benchmark "
             "again (all other results are kept):"
         )
-        for cause, names in causes.items():
-            error.add_note(f"{first_three(names)}: {cause}")
+        for cause in self.causes():
+            error.add_note(cause)
         raise error
+
+    def causes(self) -> list[str]:
+        """Return a text for each cause of failed measurements, with the names of the shapes or pairs."""
+        causes: dict[str, list[str]] = {}
+        for name, cause in self.failures.items():
+            causes.setdefault(cause, []).append(name)
+        return [f"{first_three(names)}: {cause}" for cause, names in causes.items()]
 
 
 def run_benchmark(
-    data_set: DataSet,
-    pairs: Sequence[DataPair],
+    data_set: DataSet | None,
+    pairs: Sequence[AnyPair],
     output: Path,
     methods: Mapping[str, Method],
     settings: Settings,
-    executor: Executor,
+    executor: Executor | None,
     *,
     quiet: bool = False,
+    number_of_eigenvectors: int | None = None,
+    timed_shapes: bool = True,
 ) -> Results:
     """Run every method on every pair, and store the errors and times in CSV files.
 
@@ -81,28 +91,39 @@ def run_benchmark(
 
     **Arguments:**
 
-    - `data_set`, `pairs`: the `DataSet`, and its pairs to match.
-    - `output`: an existing directory for the files `results.csv`, `shapes.csv` and `provenance.json`.
+    - `data_set`, `pairs`: the `DataSet`, and its pairs to match; None for pairs of any origin.
+    - `output`: an existing directory for the files `results.csv`, `shapes.csv`, `methods.csv` and
+      `provenance.json`.
     - `methods`: the methods by name, for example `METHODS`.
     - `settings`: the `Settings`, which must be those of all results that `output` contains.
-    - `executor`: the executor that runs the tasks; see `jaxsmw.runtime.workers.open_executor`.
+    - `executor`: the executor that runs the tasks; see `jaxsmw.runtime.workers.open_executor`. With None,
+      this process runs the tasks, in batches of pairs if JAX has an accelerator.
     - `quiet`: whether to hide the progress bars.
+    - `number_of_eigenvectors`: the number that is computed for each shape; by default, it suffices for the
+      `methods` and for all of `METHODS`.
+    - `timed_shapes`: whether to compute shapes anew and measure the time; if False, the cache is used.
 
     **Raises:** `InputError` if `output` contains damaged results, or results that were measured with other
-    data, settings or software versions. `InputError` is also raised if another process is adding results to
-    `output`, if a method cannot match a pair, or if a file with a map is missing.
+    data, settings, methods or software versions. `InputError` is also raised if another process is adding
+    results to `output`, if a method cannot match a pair, or if a file with a map is missing.
     """
     for method in methods.values():
         method.check(pairs)
     settings.check(pairs)
-    number_of_eigenvectors = _most_eigenvectors(methods)
-    with claimed_directory(output, _origin(settings, number_of_eigenvectors), {"commit": commit()}):
-        store = _Store(output, data_set, pairs)
-        measure = partial(measure_shape, number_of_eigenvectors=number_of_eigenvectors)
+    number = number_of_eigenvectors or _most_eigenvectors(methods)
+    with claimed_directory(output, _origin(settings, number), {"commit": commit()}):
+        store = _Store(output, data_set, pairs, methods)
+        measure = partial(measure_shape, number_of_eigenvectors=number, timed=timed_shapes)
         failed = _measure_all("shapes", measure, store.missing_shapes(), executor, store.shapes, quiet)
-        measure = partial(measure_pair, settings=settings, number_of_eigenvectors=number_of_eigenvectors)
-        failed |= _measure_all("pairs", measure, store.missing_pairs(methods), executor, store.results, quiet)
+        measure = partial(measure_pairs, settings=settings, number_of_eigenvectors=number)
+        at_once = _PAIRS_AT_ONCE if executor is None and chosen_backend("auto") == "jax" else 1
+        tasks = store.missing_pairs(methods)
+        failed |= _measure_in_batches(measure, tasks, at_once, executor, store.results, quiet)
         return store.collected(methods, failed)
+
+
+# The number of pairs that are prepared together for a batch on an accelerator.
+_PAIRS_AT_ONCE = 64
 
 
 def _most_eigenvectors(methods: Mapping[str, Method]) -> int:
@@ -124,33 +145,49 @@ def _origin(settings: Settings, number_of_eigenvectors: int) -> dict[str, dict[s
 class _Store:
     """The result files of a benchmark, which must fit the data set and its present mesh files."""
 
-    def __init__(self, output: Path, data_set: DataSet, pairs: Sequence[DataPair]):
+    def __init__(
+        self,
+        output: Path,
+        data_set: DataSet | None,
+        pairs: Sequence[AnyPair],
+        methods: Mapping[str, Method],
+    ):
         self.pairs = pairs
-        self.files = {
-            name: file for pair in pairs for name, file in zip(pair.names, pair.meshes, strict=True)
-        }
+        self.files = dict(shapes_of(pairs))
         key = ["source", "target", "method"]
         self.results = Journal(output / "results.csv", key, RESULT_COLUMNS, optional=OPTIONAL_FIGURES)
         self.shapes = Journal(output / "shapes.csv", ["shape"], SHAPE_COLUMNS)
-        own = data_set.shapes
-        if strangers := [row["shape"] for row in self.shapes.rows if row["shape"] not in own]:
-            raise InputError(
-                f"{output}: contains results of another data set, with a shape {strangers[0]} that is not in "
-                f"{data_set.directory}: give another --output."
-            )
-        for name, file in self.files.items():
-            if (name,) in self.shapes and self.shapes[(name,)]["digest"] != file_digest(file):
+        self.methods = Journal(output / "methods.csv", ["method"], {"method": str, "reference": str})
+        if data_set is not None:
+            own = data_set.shapes
+            if strangers := [row["shape"] for row in self.shapes.rows if row["shape"] not in own]:
                 raise InputError(
-                    f"{file}: has changed since results in {output} were measured: give another --output."
+                    f"{output}: contains results of another data set, with a shape {strangers[0]} that is "
+                    f"not in {data_set.directory}: give another --output."
                 )
+        for name, file in self.files.items():
+            if (name,) in self.shapes and self.shapes[(name,)]["digest"] != shape_digest(file):
+                raise InputError(
+                    f"{file if isinstance(file, Path) else name}: has changed since results in {output} were "
+                    "measured: give another --output."
+                )
+        new = {name: method.reference for name, method in methods.items() if (name,) not in self.methods}
+        for name, method in methods.items():
+            if name not in new and self.methods[(name,)]["reference"] != method.reference:
+                raise InputError(
+                    f"{output}: contains results of another method {name}, "
+                    f"{self.methods[(name,)]['reference']}, but now it is {method.reference}: give another "
+                    "name or another --output."
+                )
+        self.methods.append([{"method": name, "reference": text} for name, text in new.items()])
 
-    def missing_shapes(self) -> dict[str, tuple[str, Path]]:
-        """Return the name and the mesh file of each unmeasured shape, by name."""
+    def missing_shapes(self) -> dict[str, tuple[str, Path | Mesh]]:
+        """Return the name and the mesh or its file of each unmeasured shape, by name."""
         return {name: (name, file) for name, file in self.files.items() if (name,) not in self.shapes}
 
-    def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, tuple[DataPair, dict[str, Method]]]:
+    def missing_pairs(self, methods: Mapping[str, Method]) -> dict[str, Task]:
         """Return the unfinished pairs by name, each with the methods that have no result."""
-        tasks = {}
+        tasks: dict[str, Task] = {}
         for pair in self.pairs:
             missing = {name: methods[name] for name in methods if (*pair.names, name) not in self.results}
             if missing:
@@ -169,11 +206,30 @@ class _Store:
         )
 
 
+def _measure_in_batches(
+    measure: Callable[[list[Task]], list[Row]],
+    tasks: Mapping[str, Task],
+    at_once: int,
+    executor: Executor | None,
+    journal: Journal,
+    quiet: bool,
+) -> dict[str, BaseException]:
+    """Measure batches of pairs as `_measure_all` does, and the pairs of a failed batch one by one."""
+    names = list(tasks)
+    batches = {names[i]: names[i : i + at_once] for i in range(0, len(names), at_once)}
+    of_batches = {first: [tasks[name] for name in batch] for first, batch in batches.items()}
+    failed = _measure_all("pairs", measure, of_batches, executor, journal, quiet)
+    if at_once == 1:
+        return failed
+    alone = {name: tasks[name] for first in failed for name in batches[first]}
+    return _measure_in_batches(measure, alone, 1, executor, journal, quiet)
+
+
 def _measure_all(
     what: str,
     measure: Callable[[Any], list[Row]],
     tasks: Mapping[str, Any],
-    executor: Executor,
+    executor: Executor | None,
     journal: Journal,
     quiet: bool,
 ) -> dict[str, BaseException]:
@@ -181,11 +237,13 @@ def _measure_all(
     if not tasks:
         return {}
     failed: dict[str, BaseException] = {}
-    with tqdm(total=len(tasks), desc=what, unit=what[:-1], smoothing=0, disable=quiet) as progress:
+    sizes = {name: len(task) if isinstance(task, list) else 1 for name, task in tasks.items()}
+    total = sum(sizes.values())
+    with tqdm(total=total, desc=what, unit=what[:-1], smoothing=0, disable=quiet) as progress:
         for name, result in run_tasks(measure, tasks, executor):
             if isinstance(result, BaseException):
                 failed[name] = result
             else:
                 journal.append(result)
-            progress.update()
+            progress.update(sizes[name])
     return {name: failed[name] for name in tasks if name in failed}

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from jaxsmw.choices import IndexBase, Split
 from jaxsmw.errors import InputError, check_choice
@@ -127,6 +127,53 @@ class DataPair:
         if not self.both_partial:
             return None
         return read_true_overlap(self.truth[0], mesh_x, mesh_y, reverse=self.reverse_truth)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPair:
+    """A pair of meshes in memory with ground truth, which a benchmark measures like a `DataPair`.
+
+    **Attributes:**
+
+    - `source`, `target`: the names of the source X and the target Y.
+    - `mesh_x`, `mesh_y`: the meshes of X and Y.
+    - `truth`: the ground truth.
+    """
+
+    source: str
+    target: str
+    mesh_x: Mesh
+    mesh_y: Mesh
+    truth: GroundTruth
+    partial: ClassVar[bool] = False
+
+    @property
+    def meshes(self) -> tuple[Mesh, Mesh]:
+        """The meshes of X and Y."""
+        return self.mesh_x, self.mesh_y
+
+    @property
+    def name(self) -> str:
+        """The text "SOURCE to TARGET" with the names of both shapes."""
+        return f"{self.source} to {self.target}"
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """The names of the source and the target."""
+        return self.source, self.target
+
+    def ground_truth(self, mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool = False) -> GroundTruth:
+        """Return the ground truth. `InputError` is raised for a mirrored one, which does not exist."""
+        if mirrored:
+            raise InputError(f"{self.name}: has no mirrored ground truth: use the direct ground truth.")
+        return self.truth
+
+    def true_overlap(self, mesh_x: Mesh, mesh_y: Mesh) -> None:
+        """Return None, because both shapes are full."""
+
+
+AnyPair = DataPair | MeshPair
+"""A pair that a benchmark measures."""
 
 
 @dataclass(frozen=True)

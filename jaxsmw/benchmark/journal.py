@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from jaxsmw.errors import InputError
-from jaxsmw.runtime.files import atomic_write
 
 Row = dict[str, Any]
 """A row of a journal, by column names. In rows from a file, all values are text."""
@@ -115,15 +114,6 @@ class Journal:
             ) from error
         self._fields = fields
         self._remember({name: str(value) for name, value in row.items()} for row in rows)
-
-    def sort(self, keys: Iterable[Sequence[Any]]) -> None:
-        """Sort the rows of the file, which workers finish in any order, by `keys`, and remove all others."""
-        texts = (tuple(map(str, key)) for key in keys)
-        self._rows = {key: self._rows[key] for key in texts}
-        with atomic_write(self.path) as temporary, temporary.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self._fields, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(self.rows)
 
     def _read(self, contents: bytes, columns: Columns) -> None:
         """Parse complete lines, check their values, and store their rows in memory."""

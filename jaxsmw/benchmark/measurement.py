@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -15,9 +15,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.datasets import AnyPair
 from jaxsmw.benchmark.journal import Row
-from jaxsmw.benchmark.opponents.base import Measured, Method, MethodInput
+from jaxsmw.benchmark.opponents.base import MOST_SAMPLES, Measured, Method, MethodInput
 from jaxsmw.benchmark.opponents.baselines import PublishedMaps, read_published_map
 from jaxsmw.choices import DEFAULT_MATCH_INIT, MatchInit
 from jaxsmw.errors import InputError
@@ -35,6 +35,7 @@ from jaxsmw.geometry.shot import shot_descriptors
 from jaxsmw.io.meshes import read_mesh
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.pair import Pair
+from jaxsmw.matching.stages import Sizes
 from jaxsmw.runtime.cache import recomputing
 from jaxsmw.runtime.provenance import machine
 from jaxsmw.runtime.threads import one_blas_thread
@@ -145,14 +146,24 @@ class Settings:
         """Whether the initial maps are computed, and not read from a directory."""
         return self.init in get_args(MatchInit)
 
-    def check(self, pairs: Sequence[DataPair]) -> None:
+    def check(self, pairs: Sequence[AnyPair]) -> None:
         """Raise `InputError` if the directory `init` does not contain a map for every pair."""
         if not self.is_named:
             PublishedMaps(Path(self.init)).check(pairs)
 
 
-def file_digest(file: Path) -> str:
-    """Return a short hash of the contents of a file."""
+def shapes_of(pairs: Iterable[AnyPair]) -> Iterator[tuple[str, Path | Mesh]]:
+    """Yield the name of each shape of the pairs, and its mesh or mesh file. Shapes can repeat."""
+    for pair in pairs:
+        x, y = pair.meshes
+        yield pair.source, x
+        yield pair.target, y
+
+
+def shape_digest(file: Path | Mesh) -> str:
+    """Return a short hash of the contents of a mesh file, or of a mesh."""
+    if isinstance(file, Mesh):
+        return hashlib.sha256(file.vertices.tobytes() + file.faces.tobytes()).hexdigest()[:16]
     try:
         return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
     except OSError as error:
@@ -161,16 +172,24 @@ def file_digest(file: Path) -> str:
         ) from error
 
 
-def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[Row]:
-    """Compute and cache the spectrum and SHOT of a shape (name, mesh file), and measure their wall times.
+def _mesh(file: Path | Mesh) -> Mesh:
+    return file if isinstance(file, Mesh) else read_mesh(file)
+
+
+def measure_shape(
+    shape: tuple[str, Path | Mesh], number_of_eigenvectors: int, *, timed: bool = True
+) -> list[Row]:
+    """Compute and cache the spectrum and SHOT of a shape (name, mesh or its file), and measure their times.
+
+    Unless `timed`, what the cache contains is not computed again, and the times are NaN.
 
     **Returns:** A list with one row, which has the keys of `SHAPE_COLUMNS`.
 
     **Raises:** `InputError` if the file cannot be read, or if its spectrum cannot be computed.
     """
     name, file = shape
-    with recomputing():
-        seconds, mesh = {}, read_mesh(file)
+    with recomputing() if timed else nullcontext():
+        seconds, mesh = {}, _mesh(file)
         for what, compute, refusals in (
             ("spectrum", lambda: compute_spectrum(mesh, number_of_eigenvectors), []),
             # A mesh can be too coarse for SHOT. Methods that need no SHOT can match this mesh nevertheless.
@@ -179,65 +198,101 @@ def measure_shape(shape: tuple[str, Path], number_of_eigenvectors: int) -> list[
             began = time.perf_counter()
             with suppress(*refusals):
                 compute()
-            seconds[f"seconds_{what}"] = f"{time.perf_counter() - began:.4f}"
-    return [{"shape": name, "digest": file_digest(file), "vertices": len(mesh.vertices), **seconds}]
+            seconds[f"seconds_{what}"] = f"{time.perf_counter() - began:.4f}" if timed else "nan"
+    return [{"shape": name, "digest": shape_digest(file), "vertices": len(mesh.vertices), **seconds}]
 
 
-def measure_pair(
-    task: tuple[DataPair, Mapping[str, Method]], settings: Settings, number_of_eigenvectors: int
-) -> list[Row]:
-    """Match a pair with several methods, given by name, and measure the errors of the maps.
+Task = tuple[AnyPair, Mapping[str, Method]]
+"""A pair, and the methods by name that match it."""
 
-    **Returns:** A list with one row for each method, which has the keys of `RESULT_COLUMNS`. The statistics
-    and the seconds of a method that failed are NaN.
 
-    **Raises:** `InputError` if a file cannot be read, or if the pair cannot be prepared; `ArithmeticError` if
+def measure_pairs(tasks: Sequence[Task], settings: Settings, number_of_eigenvectors: int) -> list[Row]:
+    """Match pairs with several methods each, and measure the errors of the maps.
+
+    **Returns:** A list with one row for each pair and method, which has the keys of `RESULT_COLUMNS`. The
+    statistics and the seconds of a method that failed are NaN.
+
+    **Raises:** `InputError` if a file cannot be read, or if a pair cannot be prepared; `ArithmeticError` if
     the computation of an initial map fails numerically.
     """
-    data, methods = task
-    mesh_x, mesh_y = (read_mesh(file) for file in data.meshes)
-    truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
-    if settings.mirrored:
-        truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
-    true_overlap = data.true_overlap(mesh_x, mesh_y)
-    init: Any = settings.init
-    if not settings.is_named:
-        init = read_published_map(Path(settings.init), data.names, (mesh_x, mesh_y))
-    pair = MethodInput.prepare(
-        Pair(mesh_x, mesh_y, data.partial),
-        names=data.names,
-        init=init,
-        number_of_eigenvectors=number_of_eigenvectors,
-        number_of_descriptors=max(method.number_of_descriptors for method in methods.values()),
-    )
+    prepared = [_PreparedTask.of(*task, settings, number_of_eigenvectors) for task in tasks]
     rows = []
-    for name, method in methods.items():
-        try:
-            measured = _timed(name, method, pair)
-            seconds, ending = measured.seconds, "successful"
-            pointwise_map = np.asarray(measured.pointwise_map)[: len(mesh_x.vertices)]
-            figures = _evaluate(mesh_y, pointwise_map, truths, settings)
-            figures |= _evaluate_prediction(measured.correspondence, true_overlap)
-        except ArithmeticError as error:
-            seconds, ending, figures = np.nan, str(error), _NO_FIGURES
-        identity = {"source": data.source, "target": data.target, "method": name, "machine": machine()}
-        rows.append(identity | {"result": ending, "seconds": f"{seconds:.5f}"} | figures)
+    for name in dict.fromkeys(name for _, methods in tasks for name in methods):
+        matched = [one for one, (_, methods) in zip(prepared, tasks, strict=True) if name in methods]
+        method = next(methods[name] for _, methods in tasks if name in methods)
+        results = _timed(name, method, [one.input for one in matched])
+        for one, measured in zip(matched, results, strict=True):
+            rows.append(one.row(name, measured, settings))
     return rows
 
 
-def _timed(name: str, method: Method, pair: MethodInput) -> Measured:
+@dataclass(frozen=True, eq=False)
+class _PreparedTask:
+    """A prepared pair with all that is known about its true map."""
+
+    input: MethodInput
+    truths: Mapping[str, GroundTruth]
+    true_overlap: tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " n"]] | None
+
+    @classmethod
+    def of(
+        cls,
+        data: AnyPair,
+        methods: Mapping[str, Method],
+        settings: Settings,
+        number_of_eigenvectors: int,
+    ) -> _PreparedTask:
+        mesh_x, mesh_y = (_mesh(file) for file in data.meshes)
+        truths = {"direct": data.ground_truth(mesh_x, mesh_y)}
+        if settings.mirrored:
+            truths["mirrored"] = data.ground_truth(mesh_x, mesh_y, mirrored=True)
+        init: Any = settings.init
+        if not settings.is_named:
+            init = read_published_map(Path(settings.init), data.names, (mesh_x, mesh_y))
+        pair = MethodInput.prepare(
+            Pair(mesh_x, mesh_y, data.partial),
+            names=data.names,
+            init=init,
+            sizes=Sizes(
+                number_of_eigenvectors,
+                max(method.number_of_crease_eigenvectors for method in methods.values()),
+                MOST_SAMPLES,
+            ),
+            number_of_descriptors=max(method.number_of_descriptors for method in methods.values()),
+        )
+        return cls(pair, truths, data.true_overlap(mesh_x, mesh_y))
+
+    def row(self, name: str, measured: Measured | ArithmeticError, settings: Settings) -> Row:
+        """Return the row of the method with a name."""
+        source, target = self.input.names
+        identity = {"source": source, "target": target, "method": name, "machine": machine()}
+        if isinstance(measured, ArithmeticError):
+            return identity | {"result": str(measured), "seconds": "nan"} | _NO_FIGURES
+        assert self.input.meshes is not None
+        mesh_x, mesh_y = self.input.meshes
+        pointwise_map = np.asarray(measured.pointwise_map)[: len(mesh_x.vertices)]
+        figures = _evaluate(mesh_y, pointwise_map, self.truths, settings)
+        figures |= _evaluate_prediction(measured.correspondence, self.true_overlap)
+        return identity | {"result": "successful", "seconds": f"{measured.seconds:.5f}"} | figures
+
+
+def _timed(name: str, method: Method, pairs: Sequence[MethodInput]) -> list[Measured | ArithmeticError]:
     """Run a method, and return what it has measured, without the seconds of compilation."""
     for _ in range(2):
         with _compilation_seconds() as compilation, one_blas_thread():
-            measured = method.measure(pair)
-        measured = measured._replace(seconds=measured.seconds - sum(compilation))
+            results = method.measure_all(pairs)
+        compiling = sum(compilation) / len(pairs)
+        results = [
+            one if isinstance(one, ArithmeticError) else one._replace(seconds=one.seconds - compiling)
+            for one in results
+        ]
         warm = name in _warm and not compilation
         _warm.add(name)
         # The first run of a method takes longer, for example because of imports, so the method runs a second
         # time. In a long first run, the time for imports is negligible.
-        if warm or measured.seconds > _LONG:
+        if warm or any(isinstance(one, ArithmeticError) or one.seconds > _LONG for one in results):
             break
-    return measured
+    return results
 
 
 # A run that takes longer than this number of seconds is long.

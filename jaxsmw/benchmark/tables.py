@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,23 +55,27 @@ class MethodSummary(NamedTuple):
     curve: Float64[np.ndarray, " t"]
 
 
-def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSummary]:
+def summarize_methods(
+    results: Results, *, seed: int = 0, reference: str = REFERENCE
+) -> dict[str, MethodSummary]:
     """Summarise the results of a benchmark by the names of the methods; `seed` is that of the bootstrap.
 
     Means and medians are NaN if the method failed on all pairs.
     """
     summaries = {}
-    reference = _mean_errors([row for row in results.rows if row["method"] == REFERENCE])
-    for name in dict.fromkeys(row["method"] for row in results.rows):
-        own = [row for row in results.rows if row["method"] == name]
+    by_method: dict[str, list[Row]] = {}
+    for row in results.rows:
+        by_method.setdefault(row["method"], []).append(row)
+    of_reference = pair_errors(by_method.get(reference, ()))
+    for name, own in by_method.items():
         good = [row for row in own if row["result"] == "successful"]
-        errors = _mean_errors(good)
-        compared = errors.keys() & reference.keys() if name != REFERENCE else ()
-        differences = np.array([errors[pair] - reference[pair] for pair in errors if pair in compared])
+        errors = pair_errors(good)
+        compared = errors.keys() & of_reference.keys() if name != reference else ()
+        differences = np.array([errors[pair] - of_reference[pair] for pair in errors if pair in compared])
         means = np.array(list(errors.values()))
         precomputing = np.array([_precomputing(row, results.shapes) for row in good])
         seconds = _column(good, "seconds")
-        curves = np.array([np.array(row["curve"].split(), float) for row in good]).reshape(-1, len(CURVE))
+        curves = [row["curve"].split() for row in good if "curve" in row]
         summaries[name] = MethodSummary(
             mean=_mean(means),
             median=_median(means),
@@ -83,13 +87,13 @@ def summarize_methods(results: Results, *, seed: int = 0) -> dict[str, MethodSum
             seconds=_median(seconds),
             pipeline_seconds=_median(seconds + precomputing),
             failures=len(own) - len(good),
-            curve=curves.mean(axis=0) if len(good) else np.full(len(CURVE), np.nan),
+            curve=np.mean(np.array(curves, float), axis=0) if curves else np.full(len(CURVE), np.nan),
         )
     return summaries
 
 
-def _mean_errors(rows: Sequence[Row]) -> dict[tuple[str, str], float]:
-    """Return the error of each pair (source, target) on which the method did not fail."""
+def pair_errors(rows: Iterable[Row]) -> dict[tuple[str, str], float]:
+    """Return the error of each pair (source, target) on which a method did not fail, in thousandths."""
     return {
         (row["source"], row["target"]): 1e3 * float(row["mean"])
         for row in rows
@@ -110,9 +114,11 @@ def _median(values: Float64[np.ndarray, " r"]) -> float:
 
 
 def _precomputing(row: Row, shapes: Mapping[str, Row]) -> float:
-    """Return the precomputation time of both shapes of a pair, in seconds."""
-    columns = "seconds_spectrum", "seconds_descriptors"
-    return sum(float(shapes[side][column]) for side in {row["source"], row["target"]} for column in columns)
+    """Return the precomputation time of both shapes of a pair, in seconds; NaN if it was not measured."""
+    columns, sides = ("seconds_spectrum", "seconds_descriptors"), {row["source"], row["target"]}
+    return sum(
+        float(shapes[side][column]) if side in shapes else np.nan for side in sides for column in columns
+    )
 
 
 def _text(form: str, value: float) -> str:
@@ -120,10 +126,11 @@ def _text(form: str, value: float) -> str:
 
 
 _Columns = tuple[tuple[str, Callable[[MethodSummary], str]], ...]
+_MINUS = "minus"
 _COLUMNS: _Columns = (
     ("mean error", lambda s: _text("{:.1f}", s.mean)),
     ("median", lambda s: _text("{:.1f}", s.median)),
-    (f"minus {REFERENCE}", lambda s: str(s.difference)),
+    (_MINUS, lambda s: str(s.difference)),
     ("within 0.05", lambda s: _text("{:.1%}", s.within)),
     ("area under curve", lambda s: _text("{:.3f}", s.area_under_curve)),
     ("coverage", lambda s: _text("{:.1%}", s.coverage)),
@@ -134,18 +141,21 @@ _COLUMNS: _Columns = (
 )
 
 
-def _columns(summaries: Mapping[str, MethodSummary]) -> _Columns:
-    """Return the columns of a table, without that of the overlap if no method predicts one."""
-    predicted = any(np.isfinite(summary.overlap) for summary in summaries.values())
-    return tuple(column for column in _COLUMNS if predicted or column[0] != "overlap IoU")
+def _table(summaries: Mapping[str, MethodSummary], reference: str) -> list[list[str]]:
+    """Return the cells of a table with its header, without columns of numbers that no method has."""
+    columns = {title: [text(s) for s in summaries.values()] for title, text in _COLUMNS}
+    kept = {
+        f"{title} {reference}" if title == _MINUS else title: cells
+        for title, cells in columns.items()
+        if title == _MINUS or set(cells) != {"—"}
+    }
+    rows = zip(summaries, *kept.values(), strict=True)
+    return [["method", *kept], *map(list, rows)]
 
 
-def markdown_table(summaries: Mapping[str, MethodSummary]) -> str:
+def markdown_table(summaries: Mapping[str, MethodSummary], reference: str = REFERENCE) -> str:
     """Return a Markdown table with one row for each method in `summaries`."""
-    columns = _columns(summaries)
-    header = ["method", *(title for title, _ in columns)]
-    rows = [[name, *(text(summary) for _, text in columns)] for name, summary in summaries.items()]
-    return markdown([header, *rows])
+    return markdown(_table(summaries, reference))
 
 
 def markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -161,11 +171,11 @@ _LATEX = str.maketrans({"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", "−": "
 def latex_table(summaries: Mapping[str, MethodSummary]) -> str:
     """Return a LaTeX table (with booktabs) with one row for each method. The smallest mean error is bold."""
     best = min((s.mean for s in summaries.values() if np.isfinite(s.mean)), default=np.nan)
-    columns = _columns(summaries)
-    lines = [r"\begin{tabular}{l" + "r" * len(columns) + "}", r"\toprule"]
-    lines += [" & ".join(["method", *(title for title, _ in columns)]) + r" \\", r"\midrule"]
-    for name, summary in summaries.items():
-        cells = [cell.translate(_LATEX) for cell in (name, *(text(summary) for _, text in columns))]
+    header, *rows = _table(summaries, REFERENCE)
+    lines = [r"\begin{tabular}{l" + "r" * (len(header) - 1) + "}", r"\toprule"]
+    lines += [" & ".join(header) + r" \\", r"\midrule"]
+    for row, summary in zip(rows, summaries.values(), strict=True):
+        cells = [cell.translate(_LATEX) for cell in row]
         if summary.mean == best:
             cells[1] = rf"\textbf{{{cells[1]}}}"
         lines.append(" & ".join(cells) + r" \\")

@@ -7,18 +7,24 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import inspect
 import json
 import os
 import platform
+import re
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache
+from dataclasses import fields, is_dataclass
+from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
+from jaxsmw.core.arrays import is_array
 from jaxsmw.errors import InputError
 from jaxsmw.runtime.files import atomic_write, can_lock
 
@@ -91,6 +97,60 @@ def _source_digest(source: str) -> str:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
             del node.body[0]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+def value_digest(value: object) -> str:
+    """Return a hash of a value and of the code in it that does not belong to this library (16 digits).
+
+    The hash covers numbers, texts, arrays, containers and dataclasses, the source code of their classes, and
+    functions with their closures and defaults. It does not cover what functions look up elsewhere.
+    """
+    digest = hashlib.sha256()
+    _feed(digest.update, value, set())
+    return digest.hexdigest()[:16]
+
+
+def _feed(update: Callable[[bytes], None], value: Any, seen: set[int]) -> None:
+    """Call `update` with bytes that depend on the value. `seen` contains the ids of the values around it."""
+    if id(value) in seen:
+        return
+    seen = seen | {id(value)}
+    update(f"\n{type(value).__name__} ".encode())
+    function = inspect.unwrap(value) if callable(value) else value
+    children: Iterable[Any] = ()
+    if is_array(value):
+        update(f"{value.dtype}{value.shape}".encode() + np.asarray(value).tobytes())
+    elif isinstance(value, tuple | list):
+        children = (len(value), *value)
+    elif isinstance(value, Mapping):
+        children = value.items()
+    elif isinstance(value, partial):
+        children = value.func, value.args, value.keywords
+    elif inspect.isfunction(function):
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+        update(_written(function))
+        children = [*cells, function.__defaults__, function.__kwdefaults__]
+    elif is_dataclass(value) and not isinstance(value, type):
+        children = type(value), *((field.name, getattr(value, field.name)) for field in fields(value))
+    elif isinstance(value, type):
+        update(value.__qualname__.encode())
+        if value.__module__.partition(".")[0] != "jaxsmw":  # the code of the library has its own digest
+            update(_written(value))
+    else:
+        update(re.sub(" at 0x[0-9a-f]+", "", repr(value)).encode())
+        if callable(value):
+            children = type(value), getattr(value, "__self__", None), getattr(value, "__dict__", None)
+    for child in children:
+        _feed(update, child, seen)
+
+
+def _written(code: Any) -> bytes:
+    """Return the source code of a function or class; the bytecode of a function without source code."""
+    try:
+        return inspect.getsource(code).encode()
+    except (OSError, TypeError):
+        compiled = getattr(code, "__code__", None)
+        return b"" if compiled is None else compiled.co_code + repr(compiled.co_names).encode()
 
 
 @contextmanager

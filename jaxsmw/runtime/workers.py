@@ -176,12 +176,21 @@ def open_executor(workers: int, scheduler: str | None = None) -> Iterator[Execut
 
 
 def run_tasks(
-    function: Callable[[Task], Result], tasks: Mapping[str, Task], executor: Executor
+    function: Callable[[Task], Result], tasks: Mapping[str, Task], executor: Executor | None
 ) -> Iterator[tuple[str, Result | BaseException]]:
     """Yield the name of each task, and its result or the exception that it raised, as soon as it ends.
 
-    The function and the tasks must be picklable. Warnings of local workers are issued in this process.
+    Without an executor, this process runs the tasks in their order. For an executor, the function and the
+    tasks must be picklable. Warnings of local workers are issued in this process.
     """
+    if executor is None:
+        for name, task in tasks.items():
+            try:
+                outcome: Result | BaseException = function(task)
+            except Exception as fault:
+                outcome = fault
+            yield name, outcome
+        return
     futures = {executor.submit(_run_in_worker, function, task): name for name, task in tasks.items()}
     for future in as_completed(futures):
         # The dictionary must not keep the future, because the future holds the result in memory.

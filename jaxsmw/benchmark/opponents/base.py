@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float64, Int, Int64
 
-from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.datasets import AnyPair
 from jaxsmw.choices import DEFAULT_INITIAL_MAP, DEFAULT_MATCH_INIT
 from jaxsmw.core.arrays import Array
 from jaxsmw.core.results import RESULTS, sentence
@@ -63,19 +63,20 @@ class MethodInput:
         *,
         names: tuple[str, str] = ("X", "Y"),
         init: str | Int64[np.ndarray, " vertices"] = DEFAULT_MATCH_INIT,
-        number_of_eigenvectors: int,
+        sizes: Sizes,
         number_of_descriptors: int = 0,
     ) -> MethodInput:
         """Compute the input that all methods share: spectra, descriptors, the initial map and samples.
 
-        With `"auto"`, the initial map is `"shot"`. The descriptors are principal components of SHOT.
+        With `"auto"`, the initial map is `"shot"`. The descriptors are principal components of SHOT. A small
+        mesh has fewer samples than `sizes` states.
 
         **Raises:** `InputError` if a spectrum, a descriptor or the initial map cannot be computed;
         `ArithmeticError` if the computation of the initial map fails numerically.
         """
         automatic = isinstance(init, str) and init == DEFAULT_MATCH_INIT
-        samples = min(MOST_SAMPLES, pair.fewest_vertices())
-        prepared = prepare(pair, Sizes(number_of_eigenvectors, number_of_samples=samples))
+        samples = min(sizes.number_of_samples, pair.fewest_vertices())
+        prepared = prepare(pair, sizes._replace(number_of_samples=samples))
         start = make_start(prepared, DEFAULT_INITIAL_MAP if automatic else init)
         if number_of_descriptors:
             prepared = prepared.describe(number_of_descriptors)
@@ -105,8 +106,8 @@ class Method(abc.ABC):
     **Attributes:**
 
     - `reference`: the publication and the settings of the method, as text that is printed with the results.
-    - `number_of_eigenvectors`: the largest number of eigenvectors that the method uses.
-    - `number_of_descriptors`: the largest number of descriptors that the method uses.
+    - `number_of_eigenvectors`, `number_of_crease_eigenvectors`, `number_of_descriptors`: the largest numbers
+      that the method uses.
     - `package`: the import name of the optional package that the method needs; an empty text for none.
     - `full_only`: whether the method matches only pairs of full shapes.
     - `partial_only`: whether the method matches only partial pairs.
@@ -114,6 +115,7 @@ class Method(abc.ABC):
 
     reference: str
     number_of_eigenvectors: int
+    number_of_crease_eigenvectors: int = 0
     number_of_descriptors: int = 0
     package: str = ""
     full_only: bool = False
@@ -137,13 +139,26 @@ class Method(abc.ABC):
         pointwise_map = np.asarray(self(pair))  # waits for JAX
         return Measured(pointwise_map, time.perf_counter() - began)
 
-    def check(self, pairs: Sequence[DataPair]) -> None:
+    def measure_all(self, pairs: Sequence[MethodInput]) -> list[Measured | ArithmeticError]:
+        """Measure several pairs, one after another unless a subclass batches them.
+
+        **Returns:** For each pair, what `measure` returns, or the error that it raises if the method fails.
+        """
+        results: list[Measured | ArithmeticError] = []
+        for pair in pairs:
+            try:
+                results.append(self.measure(pair))
+            except ArithmeticError as error:
+                results.append(error)
+        return results
+
+    def check(self, pairs: Sequence[AnyPair]) -> None:
         """Raise `InputError` if the method cannot match a pair. A benchmark checks all pairs at first."""
         if not self.suits(pairs):
             fault = "cannot match partial shapes" if self.full_only else "matches partial shapes only"
             raise InputError(f"{self.reference}: {fault}: remove this method from --methods.")
 
-    def suits(self, pairs: Sequence[DataPair]) -> bool:
+    def suits(self, pairs: Sequence[AnyPair]) -> bool:
         """Return whether the method can match all pairs. Unlike `check`, `suits` does not look for files."""
         partial = [pair.partial for pair in pairs]
         return not (self.full_only and any(partial)) and not (self.partial_only and not all(partial))

@@ -18,6 +18,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ from typing import get_args
 import numpy as np
 from jaxtyping import Int64
 
-from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.datasets import AnyPair
 from jaxsmw.benchmark.opponents.base import (
     MOST_SAMPLES,
     Measured,
@@ -36,11 +37,10 @@ from jaxsmw.benchmark.opponents.base import (
     PointwiseMap,
     successful,
 )
-from jaxsmw.choices import Template
+from jaxsmw.choices import DEFAULT_BACKEND, Backend, Template
 from jaxsmw.core.banks import Identity
 from jaxsmw.core.functional_map import encode
 from jaxsmw.core.pointwise_map import decode
-from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.core.solutions.closed_form import Filtering, NearestOrthogonal
 from jaxsmw.errors import InputError
@@ -48,10 +48,12 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.io.maps import read_pointwise_map
 from jaxsmw.io.meshes import read_mesh
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.matching.executor import refine_stage
+from jaxsmw.matching.executor import refine_stage, run, run_batches
 from jaxsmw.matching.match import match
+from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.spectral_pair import SpectralPair
-from jaxsmw.matching.stages import PRESETS, PresetName, Stage
+from jaxsmw.matching.stages import Preset, PresetName, Stage, choose_preset
+from jaxsmw.runtime.backends import chosen_backend
 from jaxsmw.runtime.cache import recomputing
 
 
@@ -84,7 +86,7 @@ class PublishedMaps(Method):
     def measure(self, pair: MethodInput) -> Measured:
         return Measured(self(pair), np.nan)
 
-    def check(self, pairs: Sequence[DataPair]) -> None:
+    def check(self, pairs: Sequence[AnyPair]) -> None:
         """Raise `InputError` if the directory has no map for a pair."""
         missing = [pair for pair in pairs if not _published_file(self.directory, pair.names).is_file()]
         if missing:
@@ -110,24 +112,51 @@ def _published_file(directory: Path, names: tuple[str, str]) -> Path:
 
 
 @dataclass(frozen=True)
-class Refined(Method):
-    """A method that refines the initial map in one `Stage`, whose attributes have the same names."""
+class Staged(Method):
+    """A method that runs one or several stages, one after another, from the initial map."""
 
     reference: str
-    refiner: Refiner = field(default_factory=WaveletPreservation)
-    number_of_eigenvectors: int = 100
-    iterations: int = 3
-    number_of_samples: int | None = None
+    stages: tuple[Stage, ...] = (Stage(),)
+    number_of_eigenvectors: int = field(init=False)
+    number_of_crease_eigenvectors: int = field(init=False)
+    number_of_descriptors: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        preset = Preset(self.stages)
+        object.__setattr__(self, "number_of_eigenvectors", preset.sizes.number_of_eigenvectors)
+        object.__setattr__(self, "number_of_crease_eigenvectors", preset.sizes.number_of_crease_eigenvectors)
+        object.__setattr__(self, "number_of_descriptors", preset.number_of_descriptors)
 
     def __call__(self, pair: MethodInput) -> PointwiseMap:
-        stage = Stage(
-            self.refiner,
-            number_of_eigenvectors=self.number_of_eigenvectors,
-            iterations=self.iterations,
-            number_of_samples=self.number_of_samples,
-        )
-        refinement = refine_stage(stage, pair.spectra.seen_by(stage), pair.initial_map)
-        return successful(refinement.pointwise_map, refinement.result)
+        return _successful_map(run(self.stages, pair.spectra, _start(pair)))
+
+    def measure_all(self, pairs: Sequence[MethodInput]) -> list[Measured | ArithmeticError]:
+        """Measure several pairs, in batches where JAX refines them.
+
+        Batches pad shapes to a few sizes, so that JAX compiles few programs. The seconds of each pair in a
+        batch are those of the batch, divided by the number of pairs.
+        """
+        by_numpy = chosen_backend("auto") == "numpy" and all(s.refiner.uses_namespaces for s in self.stages)
+        if by_numpy or any(pair.spectra.partial for pair in pairs):
+            return super().measure_all(pairs)
+        began = time.perf_counter()
+        outcomes = run_batches(self.stages, [(pair.spectra, _start(pair)) for pair in pairs])
+        seconds = (time.perf_counter() - began) / len(pairs)
+        results: list[Measured | ArithmeticError] = []
+        for outcome in outcomes:
+            try:
+                results.append(Measured(_successful_map(outcome), seconds))
+            except ArithmeticError as error:
+                results.append(error)
+        return results
+
+
+def _start(pair: MethodInput) -> Start:
+    return Start(np.asarray(pair.initial_map, np.int64))
+
+
+def _successful_map(outcome: Outcome) -> PointwiseMap:
+    return successful(outcome.pointwise_map, outcome.last.refinement.result)
 
 
 @dataclass(frozen=True)
@@ -140,13 +169,14 @@ class Matched(Method):
     """
 
     reference: str
-    preset: PresetName
+    preset: PresetName | Preset
     template: str | None = None
     partial_only: bool = False
+    backend: Backend = DEFAULT_BACKEND
     number_of_eigenvectors: int = field(init=False)
 
     def __post_init__(self) -> None:
-        number = PRESETS[self.preset].sizes.number_of_eigenvectors
+        number = choose_preset(self.preset).sizes.number_of_eigenvectors
         object.__setattr__(self, "number_of_eigenvectors", number)
 
     def __call__(self, pair: MethodInput) -> PointwiseMap:
@@ -168,6 +198,7 @@ class Matched(Method):
                 init=pair.init,
                 partial=pair.spectra.partial,
                 template=None if self.template is None else _template(self.template),
+                backend=self.backend,
             )
 
 
@@ -238,16 +269,17 @@ def _at_samples(pair: SpectralPair) -> SpectralPair:
 
 
 UNREFINED = Unrefined()
-MWP = Refined("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations")
-MWP_SAMPLED = Refined("Hu, Li, Liu, Liu 2021: the method mwp, but on 500 samples", number_of_samples=500)
-NO_FILTER = Refined("MWP without filters: k = 100, 3 iterations", WaveletPreservation(Identity()))
+MWP = Staged("Hu, Li, Liu, Liu 2021: k = 100, Meyer with 6 filters, 3 iterations")
+MWP_SAMPLED = Staged(
+    "Hu, Li, Liu, Liu 2021: the method mwp, but on 500 samples", (Stage(number_of_samples=500),)
+)
+NO_FILTER = Staged("MWP without filters: k = 100, 3 iterations", (Stage(_UNFILTERED),))
 ACCURATE = Matched(
     "jaxsmw.match with its preset accurate, which continues from the result of mwp", "accurate"
 )
-SPECTRAL_ICP = Refined(
+SPECTRAL_ICP = Staged(
     "Ovsjanikov et al. 2012, spectral ICP: k = 100, 10 iterations",
-    WaveletPreservation(Identity(), NearestOrthogonal(Filtering())),
-    iterations=10,
+    (Stage(WaveletPreservation(Identity(), NearestOrthogonal(Filtering())), iterations=10),),
 )
 ZOOMOUT = ZoomOut("Melzi et al. 2019: k = 20, 25, ..., 120")
 ZOOMOUT_SAMPLED = ZoomOut(

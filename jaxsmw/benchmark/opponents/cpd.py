@@ -50,7 +50,7 @@ import jax.scipy as jsp
 from jax import lax
 from jaxtyping import Bool, Float, Int, Int32
 
-from jaxsmw.benchmark.opponents.baselines import Refined
+from jaxsmw.benchmark.opponents.baselines import Staged
 from jaxsmw.core.arrays import Array, replaced
 from jaxsmw.core.banks import FilterBank, Identity
 from jaxsmw.core.linear_algebra import product
@@ -60,6 +60,7 @@ from jaxsmw.core.refiner import State
 from jaxsmw.core.refiners.wavelet_preservation import PreparedWavelets, WaveletPreservation
 from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.matching.stages import Stage
 
 # The number of data points whose probabilities are in memory at the same time.
 _BLOCK = 128
@@ -358,8 +359,7 @@ def _variance(expected: _Expected, data: Float[Array, "m d"], moved: Float[Array
     return jnp.abs(squares) / (explained * data.shape[1])
 
 
-CPD = Refined(
+CPD = Staged(
     "Rodolà, Moeller, Cremers 2015: k = 30, 3 iterations, recovery by Coherent Point Drift",
-    DriftRecovery(),
-    number_of_eigenvectors=30,
+    (Stage(DriftRecovery(), number_of_eigenvectors=30),),
 )

@@ -11,7 +11,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
-from jaxsmw.benchmark.datasets import DataPair
+from jaxsmw.benchmark.datasets import AnyPair
 from jaxsmw.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def known_methods() -> dict[str, Method]:
     return {**METHODS, **{name: peer for name, peer in PEERS.items() if peer.is_available}}
 
 
-def suited_methods(pairs: Sequence[DataPair]) -> dict[str, Method]:
+def suited_methods(pairs: Sequence[AnyPair]) -> dict[str, Method]:
     """Return the known methods that can match all pairs."""
     return {name: method for name, method in known_methods().items() if method.suits(pairs)}
 

@@ -1,1 +1,0 @@
-"""The parts of `scripts/compare_frames.py`: variants, measurements, summary and figures."""
