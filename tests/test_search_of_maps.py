@@ -157,6 +157,20 @@ def test_a_one_to_one_map_and_its_reverse_map_have_the_same_evidence(pair):
         assert getattr(first, name) == pytest.approx(getattr(second, name))
 
 
+def test_a_map_to_a_part_is_measured_where_the_part_lies(pair):
+    """What the map does with the rest of the whole shape is hardly any evidence."""
+    mesh, _, _ = pair
+    lower = mesh.vertices[:, 2] < np.quantile(mesh.vertices[:, 2], 0.5)
+    part = mesh.without_faces(~lower[mesh.faces].all(axis=1))
+    reading = read(mesh, part, partial=True)
+    distances, nearest = KDTree(reading.y.positions).query(reading.x.positions)
+    inside = distances < 0.05
+    collapsed = np.where(inside, nearest, nearest[inside][0])
+    evidence = Evidence.of(reading, collapsed)
+    assert 0.2 < inside.mean() < 0.8 and evidence.uncovered == 0
+    assert evidence.deformation < 0.3 * deformation(reading.x, reading.y, collapsed).mean()
+
+
 def test_a_map_to_a_part_of_the_target_leaves_the_rest_uncovered(pair):
     mesh, _, _ = pair
     reading = read(mesh, mesh)
@@ -480,3 +494,19 @@ def test_halves_of_a_brain_are_matched(shared):
     found = match(left, right)
     assert found.mirrored and not found.suspicious
     assert mean_error(right, found.pointwise_map, np.arange(len(left.vertices))) < 0.01
+
+
+@pytest.mark.sampled
+@pytest.mark.filterwarnings("ignore:.*(looks like a part of|have fewer than 3 neighbours)")
+@pytest.mark.parametrize("names", [("mask", "head"), ("head", "mask")], ids=" to ".join)
+def test_a_mask_is_matched_with_a_head(shared, names):
+    folder = shared / "data" / "open_shells"
+    columns = ("mask", "head")
+    landmarks = np.loadtxt(folder / "landmarks.csv", delimiter=",", skiprows=1, dtype=np.int64).T
+    at = dict(zip(columns, landmarks, strict=True))
+    source, target = (jaxsmw.read_mesh(folder / f"{name}.off") for name in names)
+    found = match(source, target)
+    matched = target.vertices[found.pointwise_map[at[names[0]]]]
+    errors = np.linalg.norm(matched - target.vertices[at[names[1]]], axis=1)
+    assert found.pair.partial and not found.suspicious
+    assert errors.mean() < 0.1 * target.area**0.5

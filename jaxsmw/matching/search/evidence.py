@@ -39,7 +39,8 @@ class Evidence(NamedTuple):
     A map that is right has a right reverse map, in which each sample of Y has the sample of X whose match is
     nearest. The deformation is the mean over the map and its reverse map. The discontinuity is that of the
     map that tears less: the right map tears a surface that is fused with itself, but its reverse map does
-    not. If one shape is a part of the other, both are those of the map.
+    not. If one shape is a part of the other, both are those of the map. If X is the whole, they are measured
+    on the samples of X to which the reverse map takes the part.
 
     **Attributes:**
 
@@ -63,13 +64,15 @@ class Evidence(NamedTuple):
     def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
         """Measure a map of samples (s,)."""
         x, y, pair = reading.x, reading.y, reading.prepared.pair
-        share_x, share_y = (min(pair.areas) / area if pair.partial else 1.0 for area in pair.areas)
-        of_x = deformation(x, y, matches)
-        areas_x = _overlapping_areas(x, of_x, share_x)
-        deformed, torn = [areas_x @ of_x], [discontinuity(x, y, matches, areas_x)]
         to_matches = y.distances[:, matches]
-        if not pair.partial:  # a part and its whole have no reverse map
-            reverse = to_matches.argmin(axis=1)
+        reverse, areas_x, lacking = to_matches.argmin(axis=1), x.areas, 0.0
+        if pair.partial and pair.areas[0] > pair.areas[1]:
+            areas_x = np.bincount(reverse, y.areas, len(x.areas))
+        elif pair.partial:
+            lacking = 1 - pair.areas[0] / pair.areas[1]
+        deformed = [areas_x @ deformation(x, y, matches)]
+        torn = [discontinuity(x, y, matches, areas_x)]
+        if not pair.partial:
             deformed.append(y.areas @ deformation(y, x, reverse))
             torn.append(discontinuity(y, x, reverse, y.areas))
         uncovered = float(y.areas @ (to_matches.min(axis=1) > _COVERED))
@@ -78,7 +81,7 @@ class Evidence(NamedTuple):
             deformation=float(np.mean(deformed)),
             in_place=bool(areas_x @ offsets < _NEAR * y.unit) and not x.mirrored,
             discontinuity=min(torn),
-            uncovered=max(0.0, uncovered - (1 - share_y)),
+            uncovered=max(0.0, uncovered - lacking),
             agreement=reading.agreement(matches),
         )
 
@@ -120,20 +123,6 @@ def probabilities(
         preferences = odds + _INCONSISTENCY * np.log(np.maximum(inconsistencies, _CONSISTENT))
     shares = np.exp(_CONTRAST * (preferences - preferences.max()))
     return shares / shares.sum() / (1 + np.exp(-odds[preferences.argmax()]))
-
-
-def _overlapping_areas(
-    side: Proxy, deformations: Float[np.ndarray, " s"], share: float
-) -> Float[np.ndarray, " s"]:
-    """Return the areas of the samples of a shape that count, with the sum 1.
-
-    If the other shape is a part of this one, only the least deformed patches count, on a share of the area.
-    """
-    order = np.argsort(deformations, kind="stable")
-    before = np.cumsum(side.areas[order]) - side.areas[order]
-    counted = np.zeros(len(side.areas))
-    counted[order] = np.where(before < share, side.areas[order], 0)
-    return counted / counted.sum()
 
 
 def discontinuity(source: Proxy, target: Proxy, matches: SampleMap, areas: Float[np.ndarray, " s"]) -> float:

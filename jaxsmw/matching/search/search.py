@@ -59,8 +59,8 @@ class Judged(Candidate):
     def inconsistency(self) -> float:
         """The sum of the `stretch` and the mean detour, averaged over the map and its reverse map.
 
-        It is infinite after a failure. It is 1 for all maps of a pair if no stage has run, because there is
-        no reverse map.
+        If one shape is a part of the other, only the map of the part counts. The inconsistency is infinite
+        after a failure. It is 1 for all maps of a pair if no stage has run, because there is no reverse map.
         """
         if not self.outcome.successful:
             return np.inf
@@ -69,7 +69,9 @@ class Judged(Candidate):
         pair = self.reading.prepared.pair
         forward = extend_to_unreferenced(pair.mesh_x, self.pointwise_map)
         reverse = extend_to_unreferenced(pair.mesh_y, self.outcome.last.reverse_map())
-        directions = (pair, forward, reverse), (pair.reversed(), reverse, forward)
+        directions = [(pair, forward, reverse), (pair.reversed(), reverse, forward)]
+        if pair.partial:
+            directions = [directions[pair.areas[0] > pair.areas[1]]]
         lengths = [
             stretch(sides, there) + sides.mesh_x.average(detours(sides, there, back))
             for sides, there, back in directions
