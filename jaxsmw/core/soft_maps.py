@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int32
 from jaxsmw.core.arrays import Array, in_blocks
 from jaxsmw.core.checks import as_parameter, check_between, check_integer
 from jaxsmw.core.linear_algebra import product
-from jaxsmw.core.module import Module, field
+from jaxsmw.core.module import Module, field, jitted
 from jaxsmw.core.search import nearest_neighbor
 
 # The number of queries per block. The distances from all queries of a block to all database rows are stored
@@ -328,6 +328,7 @@ class _SinkhornState(NamedTuple):
     iterations: Int32[Array, ""]
 
 
+@jitted
 def _sinkhorn_map(transport: _Transport, iterations: int, tolerance: float | Float[Array, ""]) -> SoftMap:
     queries, database, a, b, temperature = transport
     dtype, (m, d) = queries.dtype, queries.shape

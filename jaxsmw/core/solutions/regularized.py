@@ -18,7 +18,7 @@ from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import as_parameter, check_between, check_option
 from jaxsmw.core.functional_map import FunctionalMap, Norm, PointwiseMap, QuadraticEnergy, WaveletProblem
 from jaxsmw.core.linear_algebra import cholesky, product, rounding, solve_lower
-from jaxsmw.core.module import field
+from jaxsmw.core.module import field, jitted
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.solutions.closed_form import Solution
 from jaxsmw.core.solutions.descriptors import DescriptorPair
@@ -145,6 +145,7 @@ class RegularizedLeastSquares(Solution[None]):
         eigenvalues = (spectrum.eigenvalues for spectrum in problem.spectra)
         return oriented.minimize(energy, *eigenvalues, initial=previous)
 
+    @jitted
     def minimize(
         self,
         energy: QuadraticEnergy | None,
