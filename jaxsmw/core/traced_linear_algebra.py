@@ -59,8 +59,10 @@ def _cholesky_derivative(
     return factor, product(factor, lower)
 
 
-def solve_positive_definite(matrix: Float[Array, "k k"], right: Float[Array, "k c"]) -> Float[Array, "k c"]:
-    factor = _cholesky(lax.stop_gradient(matrix).T)
+def solve_positive_definite(
+    matrix: Float[Array, "k k"], right: Float[Array, "k c"], factor: Float[Array, "k k"] | None = None
+) -> Float[Array, "k c"]:
+    factor = _cholesky(lax.stop_gradient(matrix).T) if factor is None else lax.stop_gradient(factor)
     return lax.custom_linear_solve(
         partial(product, matrix),
         right,
