@@ -304,7 +304,7 @@ def sinkhorn(
       squared distances, this error is the temperature, and derivatives with respect to the temperature are
       zero. If the temperature is not positive, the result is NaN.
     - `iterations`: the maximum number of iterations, an integer of at least 1. Iterations after convergence
-      are skipped. Under `jax.vmap`, they run but change nothing.
+      are skipped. Under `jax.vmap` on accelerators, they run but change nothing.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, the share of misplaced
       area, is at most the tolerance.
 

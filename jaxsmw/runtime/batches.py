@@ -104,8 +104,8 @@ def refine_pairs(
     - `pointwise_maps`: for each pair, the initial map T: X -> Y (m,), 0-based vertices of Y.
     - `samples`: for each shape, the samples (s,), as 0-based vertices; s must be the same for all shapes.
     - `batch_size`: the number of pairs that each device receives at the same time. The default on CPUs is 1,
-      because larger batches save no time there. On other devices, it is the number of pairs that fit into
-      `memory`, but at most 64.
+      because CPUs compute the pairs of a batch one after the other. On other devices, it is the number of
+      pairs that fit into `memory`, but at most 64.
     - `memory`: the memory in bytes that a batch may use on each device if `batch_size` is None. The default
       is half of the device's memory.
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
