@@ -223,7 +223,8 @@ def methods(options: argparse.Namespace) -> Iterator[Part]:
     ]
     x, y, maps = zip(*pairs, strict=True)
     batch = stack(x), stack(y), jnp.stack(maps)
-    samples = tuple(jnp.arange(start, n, max(1, n // 1000)) for start in (0, 1))
+    step = max(1, n // 1000)
+    samples = jnp.arange(0, n - step, step), jnp.arange(1, n - step + 1, step)
     levels = tuple(range(min(20, k), k, 20))
     refiners: dict[str, Refiner] = {
         "Filtering": WaveletPreservation(),

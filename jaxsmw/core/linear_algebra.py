@@ -27,7 +27,7 @@ def _or_traced(compute: Callable[..., Array]) -> Callable[..., Array]:
     """Decorate the version for NumPy of a function of `traced_linear_algebra`, to which JAX arrays go."""
 
     @functools.wraps(compute)
-    def choose(*matrices: Array | None) -> Array:
+    def choose(*matrices: Array) -> Array:
         if is_traced(*matrices):
             return getattr(_traced(), compute.__name__)(*matrices)
         try:
