@@ -5,6 +5,10 @@
 - `paper`: three iterations for random pairs in float32. The candidates are a Python loop over `refine`,
   `jax.lax.map`, `jax.vmap` with several batch sizes, and `jaxsmw.refine_pairs`. The time of `refine_pairs`
   includes the transfer of initial maps and results.
+- `methods`: `jax.vmap` over pairs of random shapes, compared with the same pairs one after the other, for
+  several refiners and solutions.
+- `descriptors`: functional maps of 128 descriptors and the resolvent mask. One call for all linear systems is
+  compared with one call per row of C, as in the loop of many programs, and with NumPy.
 - `accurate`: all stages of the preset `"accurate"` in float32, without a search. The candidates are several
   batch sizes of `run_batches`, which includes the transfer of initial maps and results. The last row is
   `jaxsmw.match_pairs`, which also computes initial maps and searches for better maps, on the host.
@@ -24,6 +28,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -44,6 +49,13 @@ from jaxsmw.benchmark.datasets import open_data_set
 from jaxsmw.collection.pairs import match_pairs, prepare_task
 from jaxsmw.collection.shapes import prepare_collection
 from jaxsmw.core.refinement import Refinement, refine
+from jaxsmw.core.refiner import Refiner
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.registration import Registration
+from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
+from jaxsmw.core.solutions.closed_form import LeastSquares
+from jaxsmw.core.solutions.descriptors import DescriptorPair, ProjectedDescriptors
+from jaxsmw.core.solutions.regularized import RegularizedLeastSquares
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
@@ -53,6 +65,8 @@ from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import PRESETS, PresetName
 from jaxsmw.runtime.batches import bytes_per_pair, refine_pairs, stack
+from jaxsmw.runtime.compilation import compiler_options
+from jaxsmw.runtime.threads import one_blas_thread
 
 Pair = tuple[Spectrum, Spectrum, Int[Array, " m"]]
 
@@ -193,6 +207,143 @@ def paper(options: argparse.Namespace) -> Iterator[Part]:
     )
 
 
+def methods(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the time of a batch by `jax.vmap`, relative to its pairs one after the other."""
+    n, k, count = options.vertices, options.eigenvectors, min(options.pairs, 8)
+    generator = np.random.default_rng(0)
+
+    def random_shape() -> Spectrum:
+        points = generator.standard_normal((n, 3)).astype(np.float32)
+        normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+        return random_spectrum(generator, n, k).with_positions(jnp.asarray(points), jnp.asarray(normals))
+
+    pairs: list[Pair] = [
+        (random_shape(), random_shape(), jnp.asarray(generator.integers(0, n, n), jnp.int32))
+        for _ in range(count)
+    ]
+    x, y, maps = zip(*pairs, strict=True)
+    batch = stack(x), stack(y), jnp.stack(maps)
+    step = max(1, n // 1000)
+    samples = jnp.arange(0, n - step, step), jnp.arange(1, n - step + 1, step)
+    levels = tuple(range(min(20, k), k, 20))
+    refiners: dict[str, Refiner] = {
+        "Filtering": WaveletPreservation(),
+        "LeastSquares": WaveletPreservation(solution=LeastSquares()),
+        "RegularizedLeastSquares": WaveletPreservation(solution=RegularizedLeastSquares()),
+        "FeatureRegression": FeatureRegression(levels),
+        "Registration": Registration(levels),
+    }
+    rows, measured = [["", "CPU ms per pair, one by one", "of this time in a batch"]], {}
+    for name, refiner in refiners.items():
+        refine_one = jax.jit(
+            partial(refine, refiner=refiner, samples=samples, iterations=ITERATIONS),
+            compiler_options=compiler_options(),
+        )
+        refine_batch = jax.jit(jax.vmap(refine_one), compiler_options=compiler_options())
+        with one_blas_thread():
+            seconds = medians(
+                {
+                    "pairs": partial(lambda one: [one(*pair) for pair in pairs], refine_one),
+                    "batch": partial(refine_batch, *batch),
+                },
+                options.repeats,
+                time.process_time,
+            )
+        measured[name] = seconds
+        per_pair, share = 1e3 * seconds["pairs"] / count, seconds["batch"] / seconds["pairs"]
+        rows.append([name, f"{per_pair:.3g}", f"{share:.2f}"])
+    yield (
+        "Methods",
+        f"{count} pairs of shapes with {n} vertices each, of which about 1000 are samples, k = {k}, "
+        f"{ITERATIONS} iterations, float32.",
+        rows,
+        {"seconds": measured, "pairs": count},
+    )
+
+
+def descriptors(options: argparse.Namespace) -> Iterator[Part]:
+    """Yield the times of functional maps of descriptors, by one call per row of C and by one call in all."""
+    count, number = min(options.pairs, 4), 128
+    generator = np.random.default_rng(0)
+    names = ["a call per row", "NumPy, row by row", "a call per pair", "one call", "one call, with gradient"]
+    rows, measured = [["k", *(f"{name}, ms" for name in names)]], {}
+    for k in options.sizes:
+        arrays = [jnp.asarray(generator.standard_normal((count, k, number)), jnp.float32) for _ in range(2)]
+        gaps = generator.uniform(0.5, 1.5, (2, count, k))
+        arrays += [jnp.asarray(eigenvalues, jnp.float32) for eigenvalues in np.cumsum(gaps, axis=2)]
+
+        def functional_map(f_x: Array, f_y: Array, eigenvalues_x: Array, eigenvalues_y: Array) -> Array:
+            solution = RegularizedLeastSquares(
+                wavelet_preservation=None,
+                orthogonality=None,
+                descriptor_preservation=1.0,
+                laplacian_commutativity=10.0,
+                mask="resolvent",
+                descriptors=DescriptorPair(ProjectedDescriptors(f_x), ProjectedDescriptors(f_y)),
+            )
+            return solution.minimize(None, eigenvalues_x, eigenvalues_y)[0]
+
+        @jax.jit
+        def systems(f_x: Array, f_y: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:
+            """Return the matrix that all rows share, the diagonals that differ, and the right sides."""
+            a, b = (jnp.sqrt(values / jnp.maximum(x[-1], y[-1])) for values in (x, y))
+            a, b = a[:, None], b[None, :]
+            scale = f_x.shape[0] / jnp.sum(f_x**2)
+            penalty = 10 * (a - b) ** 2 / ((1 + a**2) * (1 + b**2))
+            return scale * f_y @ f_y.T, penalty, scale * f_x @ f_y.T
+
+        def total(*arrays: Array) -> Array:
+            return jnp.sum(jax.vmap(functional_map)(*arrays) ** 2)
+
+        each = [[array[i] for array in arrays] for i in range(count)]
+        solve_row = jax.jit(
+            lambda gram, penalty, right: jax.scipy.linalg.solve(
+                gram + jnp.diag(penalty), right, assume_a="pos"
+            ),
+            compiler_options=compiler_options(),
+        )
+        one = jax.jit(functional_map, compiler_options=compiler_options())
+        batch = jax.jit(jax.vmap(functional_map), compiler_options=compiler_options())
+        gradient = jax.jit(jax.grad(total, (0, 1)), compiler_options=compiler_options())
+
+        def row_by_row(
+            each: list[list[Array]] = each, systems: Callable = systems, solve: Callable = solve_row
+        ) -> list:
+            return [
+                solve(gram, *row)
+                for gram, *parts in (systems(*pair) for pair in each)
+                for row in zip(*parts, strict=True)
+            ]
+
+        def in_numpy(each: list[list[Array]] = each, systems: Callable = systems) -> list:
+            return [
+                np.linalg.solve(gram + np.diag(penalty), right)
+                for gram, *parts in (map(np.asarray, systems(*pair)) for pair in each)
+                for penalty, right in zip(*parts, strict=True)
+            ]
+
+        candidates = (
+            row_by_row,
+            in_numpy,
+            partial(lambda each, one: [one(*pair) for pair in each], each, one),
+            partial(batch, *arrays),
+            partial(gradient, *arrays),
+        )
+        difference = np.max(np.abs(np.reshape(in_numpy(), (count, k, k)) - batch(*arrays)))
+        assert difference < 1e-3, difference
+        with one_blas_thread():
+            seconds = medians(dict(zip(names, candidates, strict=True)), options.repeats)
+        measured[k] = seconds
+        rows.append([str(k), *(f"{1e3 * seconds[name] / count:.3g}" for name in names)])
+    yield (
+        "Maps of descriptors",
+        f"Milliseconds per pair, for {count} pairs with {number} descriptors and the resolvent mask, "
+        "float32.",
+        rows,
+        {"seconds": measured, "pairs": count},
+    )
+
+
 class Shapes(NamedTuple):
     """The meshes of several shapes, their names, and the ordered pairs to match, as positions in `meshes`."""
 
@@ -304,7 +455,13 @@ def prepared_tasks(shapes: Shapes, preset: PresetName) -> list[tuple[SpectralPai
     return [(task.prepared.spectra, task.start) for task in tasks]
 
 
-PARTS = {"paper": paper, "accurate": accurate, "agreement": agreement}
+PARTS = {
+    "paper": paper,
+    "methods": methods,
+    "descriptors": descriptors,
+    "accurate": accurate,
+    "agreement": agreement,
+}
 
 
 def main() -> None:
@@ -314,6 +471,8 @@ def main() -> None:
         "--eigenvectors", type=int, default=100, help="per random shape (default: %(default)s)"
     )
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[4, 16, 64])
+    sizes = [30, 50, 100, 200, 300]
+    parser.add_argument("--sizes", type=int, nargs="+", default=sizes, help="k of the maps of descriptors")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="refine 8 pairs once, in batches of 2 and 8")
     options = parser.parse_args()

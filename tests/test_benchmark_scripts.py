@@ -43,6 +43,12 @@ def test_every_way_to_refine_a_batch_is_measured(monkeypatch, capsys, tmp_path):
     assert rows[2:] == ["products alone", "loop", "lax.map", "vmap of 2", "vmap of 8", "refine_pairs"]
 
 
+def test_batches_of_methods_and_of_maps_of_descriptors_are_measured(monkeypatch, capsys, tmp_path):
+    arguments = ["--quick", "--pairs", "2", "--vertices", "150", "--eigenvectors", "8", "--sizes", "6", "9"]
+    rows = rows_of(monkeypatch, capsys, tmp_path, *arguments, "--only", "methods", "descriptors")
+    assert {"LeastSquares", "FeatureRegression", "6", "9"} <= set(rows)
+
+
 @pytest.mark.sampled
 def test_batches_of_the_preset_accurate_are_measured(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(benchmark_batches, "SHAPES", 2)

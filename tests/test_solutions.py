@@ -452,6 +452,7 @@ def test_float32_stays_float32_and_agrees(pair, pointwise_map):
         ({"orthogonality": jnp.ones(3)}, "one number"),
         ({"laplacian_commutativity": float("nan")}, "laplacian_commutativity"),
         ({"max_steps": 0}, "max_steps"),
+        ({"resolvent_power": 0.0}, "resolvent_power must be above 0"),
     ],
 )
 def test_invalid_settings_are_refused(options, message):
@@ -477,6 +478,86 @@ def test_descriptors_need_a_weight_and_commutativity_needs_operators(pair):
         RegularizedLeastSquares(
             descriptors=DescriptorPair(complete.x, descriptors.y), descriptor_commutativity=1.0
         )
+
+
+MASKS = {"standard": {}, "resolvent": {"mask": "resolvent"}, "resolvent of power 1": {"mask": "resolvent", "resolvent_power": 1.0}}  # fmt: skip
+
+
+def map_of_descriptors(values_x, values_y, spectrum_x, spectrum_y, commutativity=0.3, **options):
+    """The functional map of descriptors and a mask, in closed form unless `options` add other terms."""
+    solution = RegularizedLeastSquares(
+        wavelet_preservation=None,
+        descriptor_preservation=1.0,
+        laplacian_commutativity=commutativity,
+        descriptors=DescriptorPair.project(values_x, values_y, spectrum_x, spectrum_y),
+        **({"orthogonality": None} | options),
+    )
+    return solution.minimize(None, spectrum_x.eigenvalues, spectrum_y.eigenvalues)
+
+
+def values_on(spectrum, seed):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=(len(spectrum.mask), 2 * D)))
+
+
+@pytest.mark.parametrize("mask", MASKS)
+def test_descriptors_and_a_mask_give_one_linear_system_per_row(pair, mask):
+    """Row i solves `C_i (w F F^T + diag(mask_i²)) = (w F_out F^T)_i` (Donati et al. 2020)."""
+    values = [values_on(spectrum, seed) for seed, spectrum in enumerate(pair)]
+    c, result = map_of_descriptors(*values, *pair, **MASKS[mask])
+    assert result == RESULTS.successful
+    f_out, f_in = (
+        np.asarray(s.eigenvectors).T @ (np.asarray(s.vertex_areas)[:, None] * f)
+        for s, f in zip(pair, values, strict=True)
+    )
+    eigenvalues = [np.asarray(s.eigenvalues) for s in pair]
+    a, b = (e / max(map(np.max, eigenvalues)) for e in eigenvalues)
+    if mask != "standard":
+        power = MASKS[mask].get("resolvent_power", 0.5)
+        a, b = 1 / (a**power - 1j), 1 / (b**power - 1j)
+    penalty = 0.3 * np.abs(a[:, None] - b[None]) ** 2
+    weight = K_X / np.sum(f_out**2)
+    rows = [
+        np.linalg.solve(weight * f_in @ f_in.T + np.diag(penalty[i]), weight * f_in @ f_out[i])
+        for i in range(K_X)
+    ]
+    np.testing.assert_allclose(c, rows, atol=1e-12)
+    iterated, _ = map_of_descriptors(*values, *pair, orthogonality=1e-12, **PRECISE, **MASKS[mask])
+    np.testing.assert_allclose(iterated, c, atol=1e-7)
+
+
+@pytest.mark.parametrize("options", first_always([MASKS["resolvent"], {}, {"orthogonality": 0.02, **PRECISE}], always=2), ids=str)  # fmt: skip
+def test_maps_of_a_batch_of_descriptors_and_their_derivatives(options):
+    """One call solves all pairs. Derivatives agree with finite differences and with those of each pair."""
+    x, y = (
+        stacked(*(random_spectrum(n, k, seed=seed + n) for seed in range(2))) for n, k in ((M, K_X), (N, K_Y))
+    )
+    values_x, values_y = (jnp.asarray(np.random.default_rng(n).normal(size=(2, n, 2 * D))) for n in (M, N))
+
+    def of_pair(values_x, values_y, x, y, weight):
+        return map_of_descriptors(values_x, values_y, x, y, weight, **options)[0]
+
+    @jax.jit
+    def of_batch(values_x, values_y, eigenvalues, weight):
+        moved = eqx.tree_at(lambda s: s.eigenvalues, x, eigenvalues)
+        return jax.vmap(of_pair, (0, 0, 0, 0, None))(values_x, values_y, moved, y, weight)
+
+    # The root of an eigenvalue has no derivative at 0.
+    arguments = values_x, values_y, x.eigenvalues + 1, 0.3
+    for i in range(2):
+        x_i, y_i = (jax.tree.map(lambda leaf, i=i: leaf[i], s) for s in (x, y))
+        x_i = eqx.tree_at(lambda s: s.eigenvalues, x_i, x_i.eigenvalues + 1)
+        alone = of_pair(values_x[i], values_y[i], x_i, y_i, 0.3)
+        np.testing.assert_allclose(of_batch(*arguments)[i], alone, atol=1e-9)
+    check_grads(of_batch, arguments, order=1, modes=["fwd", "rev"], atol=1e-5, rtol=1e-4)
+
+
+def test_too_few_descriptors_for_a_map_are_reported(pair):
+    """One descriptor and no mask do not determine the map."""
+    values = [values_on(spectrum, seed)[:, :1] for seed, spectrum in enumerate(pair)]
+    _, result = map_of_descriptors(*values, *pair, commutativity=None)
+    assert result == RESULTS.singular_system
+    _, result = map_of_descriptors(*values, *pair)
+    assert result == RESULTS.successful
 
 
 def test_minimize_accepts_another_energy(pair):

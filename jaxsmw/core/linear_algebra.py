@@ -33,7 +33,7 @@ def _or_traced(compute: Callable[..., Array]) -> Callable[..., Array]:
         try:
             return compute(*matrices)
         except np.linalg.LinAlgError:
-            return np.full_like(matrices[-1], np.nan)
+            return np.full_like(matrices[min(1, len(matrices) - 1)], np.nan)
 
     return choose
 
@@ -57,10 +57,12 @@ def cholesky(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:
 
 
 @_or_traced
-def solve_positive_definite(matrix: Float[Array, "k k"], right: Float[Array, "k c"]) -> Float[Array, "k c"]:
-    """Return `matrix^-1 right` for a positive definite matrix."""
-    factor = scipy.linalg.cho_factor(matrix, check_finite=False)
-    return scipy.linalg.cho_solve(factor, right, check_finite=False)
+def solve_positive_definite(
+    matrix: Float[Array, "k k"], right: Float[Array, "k c"], factor: Float[Array, "k k"] | None = None
+) -> Float[Array, "k c"]:
+    """Return `matrix^-1 right` for a positive definite matrix, by its Cholesky factor if it is known."""
+    factors = scipy.linalg.cho_factor(matrix, check_finite=False) if factor is None else (factor, True)
+    return scipy.linalg.cho_solve(factors, right, check_finite=False)
 
 
 @_or_traced
@@ -83,13 +85,15 @@ def rounding(matrix: Float[Array, "k k"]) -> Float[Array, ""]:
     return xp.max(xp.diagonal(matrix)) * xp.asarray(relative, matrix.dtype)
 
 
-def is_regular(matrix: Float[Array, "k k"]) -> Bool[Array, ""]:
-    """Return whether a Gram matrix is non-singular to working precision."""
+def is_regular(matrix: Float[Array, "k k"], factor: Float[Array, "k k"] | None = None) -> Bool[Array, ""]:
+    """Return whether a Gram matrix, of which the `cholesky` factor may be known, is non-singular.
+
+    The matrix counts as singular if a pivot of the factor is as small as the rounding error.
+    """
     xp = namespace(matrix)
-    # If the matrix is singular, one of its Cholesky pivots is negative or as small as the rounding error. If
-    # a pivot is negative, the factor contains NaN, and the comparison below is False.
-    pivots = xp.diagonal(cholesky(stop_gradient(matrix))) ** 2
-    return xp.min(pivots) > rounding(matrix)
+    factor = cholesky(stop_gradient(matrix)) if factor is None else factor
+    # If a pivot is negative, the factor contains NaN, and the comparison below is False.
+    return xp.min(xp.diagonal(factor) ** 2) > rounding(matrix)
 
 
 def regularized(matrix: Float[Array, "k k"]) -> Float[Array, "k k"]:

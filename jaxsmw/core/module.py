@@ -124,13 +124,18 @@ def _shown(value: Any) -> str:
 
 
 def jitted(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
-    """Decorate a function, which JAX compiles at its first call by `equinox.filter_jit`."""
+    """Decorate a function, which JAX compiles at its first call by `equinox.filter_jit`.
+
+    `jax.vmap` calls the function in a loop on CPUs; see `jaxsmw.core.traced_batches.one_by_one`.
+    """
 
     @functools.cache
     def compiled() -> Any:
         import equinox as eqx
 
-        return eqx.filter_jit(function)
+        from jaxsmw.core.traced_batches import one_by_one
+
+        return eqx.filter_jit(one_by_one(function))
 
     @functools.wraps(function)
     def call(*arguments: Parameters.args, **options: Parameters.kwargs) -> Returned:

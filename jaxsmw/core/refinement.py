@@ -119,8 +119,7 @@ def refine(
     """Refine a pointwise map T: X -> Y by alternating between functional maps and pointwise maps.
 
     The loop is Algorithm 1 of the MWP paper, generalised to any refiner. The function is pure and
-    jit-compiled. For many pairs of equal size, use `jax.vmap`, or `jax.lax.map` if memory is scarce. For
-    pairs of different sizes, use `jaxsmw.refine_pairs`.
+    jit-compiled. For many pairs, use `jax.vmap`, which is a loop on CPUs, or `jaxsmw.refine_pairs`.
 
     If samples are given, only the first functional map and the last pointwise map are computed from all
     vertices, as in the fast variant of the MWP authors' program. `starts_on_samples` and `ends_on_samples`
@@ -143,8 +142,8 @@ def refine(
     - `ends_on_samples`: whether the last step matches only the samples. The refined map then contains -1 for
       each vertex of X that is not a sample.
     - `partial`: whether one shape is a part of the other. Both shapes then need the same unit of length.
-    - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. Under `jax.vmap`,
-      every pair takes as long as the slowest pair, with the same results.
+    - `stop_when_unchanged`: whether to skip the remaining iterations once no match changes. Under `jax.vmap`
+      on accelerators, every pair takes as long as the slowest pair, with the same results.
     - `history`: whether to record a `History`, which increases the run time by about 10 %.
 
     **Returns:** A `Refinement`. Numerical failures raise no error, so compare its `result` with

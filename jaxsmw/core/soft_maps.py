@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int32
 from jaxsmw.core.arrays import Array, in_blocks
 from jaxsmw.core.checks import as_parameter, check_between, check_integer
 from jaxsmw.core.linear_algebra import product
-from jaxsmw.core.module import Module, field
+from jaxsmw.core.module import Module, field, jitted
 from jaxsmw.core.search import nearest_neighbor
 
 # The number of queries per block. The distances from all queries of a block to all database rows are stored
@@ -304,7 +304,7 @@ def sinkhorn(
       squared distances, this error is the temperature, and derivatives with respect to the temperature are
       zero. If the temperature is not positive, the result is NaN.
     - `iterations`: the maximum number of iterations, an integer of at least 1. Iterations after convergence
-      are skipped. Under `jax.vmap`, they run but change nothing.
+      are skipped. Under `jax.vmap` on accelerators, they run but change nothing.
     - `tolerance`: a positive number. The iterations stop when `SoftMap.residual`, the share of misplaced
       area, is at most the tolerance.
 
@@ -328,6 +328,7 @@ class _SinkhornState(NamedTuple):
     iterations: Int32[Array, ""]
 
 
+@jitted
 def _sinkhorn_map(transport: _Transport, iterations: int, tolerance: float | Float[Array, ""]) -> SoftMap:
     queries, database, a, b, temperature = transport
     dtype, (m, d) = queries.dtype, queries.shape

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -14,7 +13,7 @@ from jaxtyping import Bool, Float, Int, Int32
 from jaxsmw.core.arrays import Array
 from jaxsmw.core.checks import check_array, check_kind, check_option, counts_iterations
 from jaxsmw.core.functional_map import FunctionalMap, PointwiseMap
-from jaxsmw.core.module import Module, field
+from jaxsmw.core.module import Module, field, jitted
 from jaxsmw.core.refinement import check_spectra, checked, diagnose
 from jaxsmw.core.refiner import Problem, State
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
@@ -51,7 +50,7 @@ class SoftRefinement(Module):
 
 
 @counts_iterations
-@eqx.filter_jit
+@jitted
 def refine_softly(
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,

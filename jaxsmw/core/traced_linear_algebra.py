@@ -4,45 +4,24 @@ All factorisations work under `jax.vmap`, also nested, and all of them have deri
 any order.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import jax.scipy as jsp
 from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
-Factors = TypeVar("Factors", bound=Array | tuple[Array, ...])
+from jaxsmw.core.traced_batches import in_loop
 
 # By default, GPUs multiply float32 matrices in lower precision. Distances would then lose digits, and
 # rounding errors could hide that a linear system is singular.
 product = partial(jnp.matmul, precision=lax.Precision.HIGHEST)
 
 
-def _one_by_one(factorize: Callable[..., Factors]) -> Callable[..., Factors]:
-    """Return the function, with a `jax.vmap` that is a loop on CPUs and a batch on accelerators."""
-    # On CPUs, LAPACK calls of jaxlib 0.10 divide a batch among the threads of XLA's pool and wait for them
-    # (`jax::ParallelBatchMap`). If each thread of the pool waits in such a call, none is left to do the work.
-    one = jax.custom_batching.custom_vmap(factorize)
-
-    @one.def_vmap
-    def batch(size: int, batched: list[bool], *arrays: Array) -> tuple[Factors, PyTree[bool]]:
-        stacked = [
-            array if has_axis else jnp.broadcast_to(array, (size, *array.shape))
-            for array, has_axis in zip(arrays, batched, strict=True)
-        ]
-        factors = lax.platform_dependent(
-            *stacked,
-            cpu=lambda *stacked: lax.map(lambda row: one(*row), stacked),
-            default=jax.vmap(factorize),
-        )
-        return factors, jax.tree.map(lambda _: True, factors)
-
-    return one
-
-
+# On CPUs, LAPACK calls of jaxlib 0.10 divide a batch among the threads of XLA's pool and wait for them
+# (`jax::ParallelBatchMap`). If each thread of the pool waits in such a call, none is left to do the work.
+_one_by_one = partial(in_loop, on_all_devices=False)
 # These functions have no derivatives. `_cholesky` reads only the lower triangle.
 _cholesky = _one_by_one(lambda matrix: lax.linalg.cholesky(matrix, symmetrize_input=False))
 _solve_lower = _one_by_one(lambda factor, right: jsp.linalg.solve_triangular(factor, right, lower=True))
@@ -80,8 +59,10 @@ def _cholesky_derivative(
     return factor, product(factor, lower)
 
 
-def solve_positive_definite(matrix: Float[Array, "k k"], right: Float[Array, "k c"]) -> Float[Array, "k c"]:
-    factor = _cholesky(lax.stop_gradient(matrix).T)
+def solve_positive_definite(
+    matrix: Float[Array, "k k"], right: Float[Array, "k c"], factor: Float[Array, "k k"] | None = None
+) -> Float[Array, "k c"]:
+    factor = _cholesky(lax.stop_gradient(matrix).T) if factor is None else lax.stop_gradient(factor)
     return lax.custom_linear_solve(
         partial(product, matrix),
         right,

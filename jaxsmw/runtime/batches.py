@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
-from functools import partial
 from typing import NamedTuple, TypeVar, Unpack
 
 import equinox as eqx
@@ -105,8 +104,8 @@ def refine_pairs(
     - `pointwise_maps`: for each pair, the initial map T: X -> Y (m,), 0-based vertices of Y.
     - `samples`: for each shape, the samples (s,), as 0-based vertices; s must be the same for all shapes.
     - `batch_size`: the number of pairs that each device receives at the same time. The default on CPUs is 1,
-      because larger batches save no time there. On other devices, it is the number of pairs that fit into
-      `memory`, but at most 64.
+      because CPUs compute the pairs of a batch one after the other. On other devices, it is the number of
+      pairs that fit into `memory`, but at most 64.
     - `memory`: the memory in bytes that a batch may use on each device if `batch_size` is None. The default
       is half of the device's memory.
     - `devices`: the JAX devices to use. The default is all devices of the default backend.
@@ -263,14 +262,9 @@ def _refine_batch(batch: _Batch, mesh: Mesh, settings: RefineSettings) -> Refine
         samples = None if samples_x is None or samples_y is None else (samples_x, samples_y)
         return refine(spectrum_x, spectrum_y, initial_map, samples=samples, **settings)
 
-    each = partial(lax.map, refine_pair) if _one_at_a_time(mesh.devices.flat[0]) else jax.vmap(refine_pair)
-    if mesh.size == 1:
-        return each(batch)
     # `shard_map` is not used, because the solvers of optimistix do not run within it. The compiler still
     # divides the batch among the devices, because the pairs do not depend on each other.
-    of_devices = jax.tree.map(lambda leaf: leaf.reshape(mesh.size, -1, *leaf.shape[1:]), batch)
-    refined = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), jax.vmap(each)(of_devices))
-    return lax.with_sharding_constraint(refined, NamedSharding(mesh, _DIVIDED))
+    return lax.with_sharding_constraint(jax.vmap(refine_pair)(batch), NamedSharding(mesh, _DIVIDED))
 
 
 def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.Device) -> int:
@@ -282,7 +276,7 @@ def _default_batch_size(bytes_of_a_pair: int, memory: int | None, device: jax.De
 
 
 def _one_at_a_time(device: jax.Device) -> bool:
-    # On CPUs, a batch of pairs takes about 33 % more time than the same pairs one after another.
+    # On CPUs, `jax.vmap` computes the pairs of a batch in a loop; see `jaxsmw.core.traced_batches`.
     return device.platform == "cpu"
 
 

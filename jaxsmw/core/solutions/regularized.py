@@ -1,11 +1,11 @@
-"""Iterative minimisation of a sum of the wavelet-preservation energy and other terms."""
+"""Minimisation of a sum of the wavelet-preservation energy and other terms."""
 
 from __future__ import annotations
 
 import functools
 import operator
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -17,13 +17,21 @@ from jaxsmw.core.arrays import Array
 from jaxsmw.core.banks import frame_function
 from jaxsmw.core.checks import as_parameter, check_between, check_option
 from jaxsmw.core.functional_map import FunctionalMap, Norm, PointwiseMap, QuadraticEnergy, WaveletProblem
-from jaxsmw.core.linear_algebra import cholesky, product, rounding, solve_lower
-from jaxsmw.core.module import field
+from jaxsmw.core.linear_algebra import (
+    cholesky,
+    is_regular,
+    product,
+    rounding,
+    solve_lower,
+    solve_positive_definite,
+)
+from jaxsmw.core.module import field, jitted
 from jaxsmw.core.results import RESULTS, where
 from jaxsmw.core.solutions.closed_form import Solution
 from jaxsmw.core.solutions.descriptors import DescriptorPair
 
 Weight = Float[Array, ""] | None
+Mask = Literal["standard", "resolvent"]
 
 _TERMS = (
     "wavelet_preservation",
@@ -39,15 +47,18 @@ def _as_weight(value: Array | float | None) -> Array | None:
 
 
 class RegularizedLeastSquares(Solution[None]):
-    """An iterative solution that minimises a sum of the wavelet-preservation energy and other terms.
+    """A solution that minimises a sum of the wavelet-preservation energy and other terms.
 
     The functional map C (k_out, k_in) minimises a weighted sum of five terms:
 
     - Wavelet preservation is the energy of equation (5) of the MWP paper, divided by the mean of the frame
       function.
-    - Laplacian commutativity is `||Lambda_out C - C Lambda_in||²`. The diagonal matrices Lambda_out and
-      Lambda_in contain the eigenvalues of the shapes "out" and "in", divided by the largest eigenvalue of
-      both.
+    - Laplacian commutativity is `||mask * C||²`, with an elementwise product. The mask (k_out, k_in) depends
+      on the eigenvalues of the shapes "out" and "in", divided by the largest eigenvalue of both. With the
+      standard mask `lambda_out - lambda_in`, this is `||Lambda_out C - C Lambda_in||²`, where the diagonal
+      matrices Lambda contain the eigenvalues. The entries of the resolvent mask (Ren et al. 2019) are
+      `|(a - i)^-1 - (b - i)^-1|` for `a = lambda_out^p` and `b = lambda_in^p`. The resolvent mask is bounded
+      for any number of eigenvalues.
     - Orthogonality is `||C^T C - I||²`, or `||C C^T - I||²` if C has fewer rows than columns. This is the
       only term that is not quadratic in C.
     - Descriptor preservation is `||C F_in - F_out||²`, where F_in and F_out contain the coefficients of the
@@ -56,11 +67,15 @@ class RegularizedLeastSquares(Solution[None]):
       function by descriptor d (Nogneng and Ovsjanikov 2017). They are scaled so that the squared norms of the
       operators `D_out` sum to k_out.
 
-    The scales make the weights comparable for all banks and all units of descriptors. The sums over thousands
-    of columns in the quadratic terms are replaced by sums over k_in equivalent columns. Then
-    `optimistix.least_squares` takes Gauss–Newton steps, whose linear systems conjugate gradients solve. The
-    solver starts from the previous functional map, or from an estimate. The derivatives of C are computed by
-    implicit differentiation at the minimum.
+    The scales make the weights comparable for all banks and all units of descriptors.
+
+    Without orthogonality and descriptor commutativity, the rows of C are independent, as in the layer of
+    Donati et al. 2020. Each row solves a linear system (k_in, k_in), and one batched Cholesky factorisation
+    solves the k_out systems exactly. Otherwise, `optimistix.least_squares` takes Gauss–Newton steps, whose
+    linear systems conjugate gradients solve. The sums over thousands of columns in the quadratic terms are
+    then replaced by sums over k_in equivalent columns. The solver starts from the previous functional map, or
+    from an estimate. In both cases, the derivatives of C are computed by implicit differentiation at the
+    minimum. `jax.vmap` solves a batch of pairs.
 
     **Arguments:**
 
@@ -71,6 +86,8 @@ class RegularizedLeastSquares(Solution[None]):
       the result of `DescriptorPair.project(..., operators=True)`.
     - `norm`: the weights of the vertices of X in the wavelet term, `"area"` (the default) or `"frobenius"`;
       see `WaveletProblem.energy`.
+    - `mask`: the mask of Laplacian commutativity, `"standard"` (the default) or `"resolvent"`.
+    - `resolvent_power`: the exponent p of the resolvent mask, above 0 and at most 1, by default 0.5.
     - `tolerance`: the relative and absolute tolerance of `optimistix.GaussNewton`, positive, by default 1e-3.
     - `max_steps`: the maximum number of Gauss–Newton steps, at least 1, by default 256. If these steps do not
       reach the tolerance, the status code is `RESULTS.solver_not_converged`.
@@ -87,11 +104,18 @@ class RegularizedLeastSquares(Solution[None]):
     descriptor_commutativity: Weight = field(converter=_as_weight, default=None)
     descriptors: DescriptorPair | None = None
     norm: Norm = field(static=True, default="area")
+    mask: Mask = field(static=True, default="standard")
+    resolvent_power: float = field(static=True, default=0.5)
     tolerance: float = field(static=True, default=1e-3)
     max_steps: int = field(static=True, default=256)
 
     def __check_init__(self) -> None:
         check_option("norm", self.norm, get_args(Norm))
+        check_option("mask", self.mask, get_args(Mask))
+        if not 0 < self.resolvent_power <= 1:
+            raise ValueError(
+                f"resolvent_power must be above 0 and at most 1, but it is {self.resolvent_power}"
+            )
         for term in _TERMS:
             if getattr(self, term) is not None:
                 check_between(self, term, getattr(self, term))
@@ -145,6 +169,7 @@ class RegularizedLeastSquares(Solution[None]):
         eigenvalues = (spectrum.eigenvalues for spectrum in problem.spectra)
         return oriented.minimize(energy, *eigenvalues, initial=previous)
 
+    @jitted
     def minimize(
         self,
         energy: QuadraticEnergy | None,
@@ -176,17 +201,18 @@ class RegularizedLeastSquares(Solution[None]):
         determined = curvature > rounding(quadratic.gram)
         finite = jnp.all(jnp.isfinite(curvature)) & jnp.all(jnp.isfinite(quadratic.cross))
         solvable = finite & jnp.all(determined)
-        # The quadratic terms have the same curvature in each entry of `C / unit`, so conjugate gradients need
-        # few steps.
-        unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
-        if initial is None:
-            initial = quadratic.cross * unit**2
-        functional_map, result = self._gauss_newton(terms, unit, initial, solvable)
-        if len(terms) == 1:
-            result = where(quadratic.is_regular(), result, RESULTS.singular_system)
-        # Traced weights are not checked, so a negative weight can make the residuals NaN.
-        residuals = jnp.stack([jnp.sum(term.residual(functional_map)) for term in terms])
-        finite &= jnp.all(jnp.isfinite(residuals))
+        if self.orthogonality is None and self.descriptor_commutativity is None:
+            functional_map, regular = _solve_rows(quadratic, terms[1:])
+            result = where(regular, RESULTS.successful, RESULTS.singular_system)
+        else:
+            # The quadratic terms have the same curvature in each entry of `C / unit`, so conjugate gradients
+            # need few steps.
+            unit = jax.lax.rsqrt(jnp.where(determined, curvature, 1))
+            initial = quadratic.cross * unit**2 if initial is None else initial
+            functional_map, result = self._gauss_newton(terms, unit, initial, solvable)
+            # Traced weights are not checked, so a negative weight can make the residuals NaN.
+            residuals = jnp.stack([jnp.sum(term.residual(functional_map)) for term in terms])
+            finite &= jnp.all(jnp.isfinite(residuals))
         result = where(solvable, result, RESULTS.undetermined_functional_map)
         return functional_map, where(finite, result, RESULTS.nonfinite_functional_map)
 
@@ -225,7 +251,8 @@ class RegularizedLeastSquares(Solution[None]):
         terms = [_energy_term(quadratic)]
         if self.laplacian_commutativity is not None:
             weight = self.laplacian_commutativity.astype(dtype)
-            terms.append(_laplacian_term(weight, eigenvalues_out, eigenvalues_in))
+            mask = _laplacian_mask(eigenvalues_out, eigenvalues_in, self.mask, self.resolvent_power)
+            terms.append(_mask_term(weight, mask))
         if self.orthogonality is not None:
             weight = self.orthogonality.astype(dtype)
             terms.append(_orthogonality_term(weight, eigenvalues_out.size, eigenvalues_in.size))
@@ -287,13 +314,23 @@ def _energy_term(energy: QuadraticEnergy) -> _Term:
     return _Term(lambda c: product(c, factor) - target, curvature)
 
 
-def _laplacian_term(
-    weight: Float[Array, ""], eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"]
-) -> _Term:
+def _mask_term(weight: Float[Array, ""], mask: Float[Array, "k_out k_in"]) -> _Term:
+    scaled = mask * jnp.sqrt(weight)
+    return _Term(lambda c: scaled * c, scaled**2)
+
+
+def _laplacian_mask(
+    eigenvalues_out: Float[Array, " k_out"], eigenvalues_in: Float[Array, " k_in"], mask: Mask, power: float
+) -> Float[Array, "k_out k_in"]:
+    """Return the mask of Laplacian commutativity, of which the sign does not matter, without unit."""
     largest = jnp.maximum(eigenvalues_out[-1], eigenvalues_in[-1])
-    gaps = (eigenvalues_out[:, None] - eigenvalues_in[None, :]) / largest
-    gaps = gaps * jnp.sqrt(weight)
-    return _Term(lambda c: gaps * c, gaps**2)
+    a, b = eigenvalues_out[:, None] / largest, eigenvalues_in[None, :] / largest
+    if mask == "standard":
+        return a - b
+    # At the eigenvalue 0, which rounding can make negative, the power has no derivative.
+    a, b = (jnp.where(values > 0, jnp.where(values > 0, values, 1) ** power, 0) for values in (a, b))
+    # The difference of the resolvents 1 / (a - i) and 1 / (b - i) is (b - a) / ((a - i) (b - i)).
+    return (a - b) * jax.lax.rsqrt((1 + a**2) * (1 + b**2))
 
 
 def _orthogonality_term(weight: Float[Array, ""], k_out: int, k_in: int) -> _Term:
@@ -311,3 +348,24 @@ def _operator_term(
         lambda c: scale * (product(c[None], d_in) - product(d_out, c[None])),
         scale**2 * (squares - 2 * product(diagonal_out.T, diagonal_in)),
     )
+
+
+def _solve_rows(
+    quadratic: QuadraticEnergy, masks: Sequence[_Term]
+) -> tuple[Float[Array, "k_out k_in"], Bool[Array, ""]]:
+    """Minimise a quadratic energy and at most one term of a mask, and return whether C is unique."""
+    if not masks:
+        return quadratic.minimizer(), quadratic.is_regular()
+    (mask,) = masks
+    rows, regular = jax.vmap(_solve_row, (None, 0, 0))(quadratic.gram, mask.curvature, quadratic.cross)
+    return rows, jnp.all(regular)
+
+
+@jitted
+def _solve_row(
+    gram: Float[Array, "k_in k_in"], curvature: Float[Array, " k_in"], cross: Float[Array, " k_in"]
+) -> tuple[Float[Array, " k_in"], Bool[Array, ""]]:
+    """Return the row c that solves `(gram + diag(curvature)) c = cross`, and whether the row is unique."""
+    system = gram + jnp.diag(curvature)
+    factor = cholesky(jax.lax.stop_gradient(system))
+    return solve_positive_definite(system, cross[:, None], factor)[:, 0], is_regular(system, factor)
