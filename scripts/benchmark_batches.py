@@ -276,12 +276,12 @@ def descriptors(options: argparse.Namespace) -> Iterator[Part]:
             solution = RegularizedLeastSquares(
                 wavelet_preservation=None,
                 orthogonality=None,
-                descriptor_preservation=1.0,
-                laplacian_commutativity=10.0,
+                descriptor_preservation=jnp.float32(1),
+                laplacian_commutativity=jnp.float32(10),
                 mask="resolvent",
                 descriptors=DescriptorPair(ProjectedDescriptors(f_x), ProjectedDescriptors(f_y)),
             )
-            return solution.minimize(None, eigenvalues_x, eigenvalues_y)[0]
+            return jnp.asarray(solution.minimize(None, eigenvalues_x, eigenvalues_y)[0])
 
         @jax.jit
         def systems(f_x: Array, f_y: Array, x: Array, y: Array) -> tuple[Array, Array, Array]:

@@ -357,6 +357,7 @@ def _solve_rows(
     if not masks:
         return quadratic.minimizer(), quadratic.is_regular()
     (mask,) = masks
+    assert mask.curvature is not None
     rows, regular = jax.vmap(_solve_row, (None, 0, 0))(quadratic.gram, mask.curvature, quadratic.cross)
     return rows, jnp.all(regular)
 

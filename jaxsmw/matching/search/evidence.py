@@ -67,7 +67,7 @@ class Evidence(NamedTuple):
         to_matches = y.distances[:, matches]
         reverse, areas_x, lacking = to_matches.argmin(axis=1), x.areas, 0.0
         if pair.partial and pair.areas[0] > pair.areas[1]:
-            areas_x = np.bincount(reverse, y.areas, len(x.areas))
+            areas_x = np.bincount(reverse, weights=y.areas, minlength=len(x.areas)).astype(float)
         elif pair.partial:
             lacking = 1 - pair.areas[0] / pair.areas[1]
         deformed = [areas_x @ deformation(x, y, matches)]
