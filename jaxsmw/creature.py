@@ -604,8 +604,15 @@ def creature_pair(kind: str = "quadruped", *, vertices: int = 5000, seed: int = 
     The two shapes are nearly isometric and are triangulated independently. The source is in the pose
     `"stand"`. The target is the same individual in another, randomly chosen pose, with 1 to 5 % fewer
     vertices. To compute the ground truth, the source vertices are projected onto the target's triangles in
-    the common rest pose. This projection is the only source of errors in the ground truth. The arguments and
-    the errors are those of `jaxsmw.creature.creature`; `vertices` is the number m of source vertices.
+    the common rest pose. This projection is the only source of errors in the ground truth.
+
+    **Arguments:**
+
+    - `kind`: `"quadruped"`, `"biped"`, `"dragon"` or `"mammal"`; see `jaxsmw.creature.creature`.
+    - `vertices`: the number m of source vertices, at least 500. SHOT needs about 700.
+    - `seed`: an integer of at least 0, which determines the individual and the pose of the target.
+
+    **Raises:** the errors of `jaxsmw.creature.creature`.
     """
     _check(kind, vertices, seed)
     random = _random(seed, "pair")

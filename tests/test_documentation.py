@@ -5,6 +5,7 @@ Notebooks run when the site is built (`.ci/run`). The build also checks names an
 
 import argparse
 import ast
+import contextlib
 import importlib
 import inspect
 import pkgutil
@@ -26,7 +27,12 @@ ROOT = Path(__file__).parents[1]
 # The handwritten pages. Scripts generate all other pages.
 PAGES = sorted(
     path.relative_to(ROOT).as_posix()
-    for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("docs/how_to/*.md"))
+    for path in (
+        ROOT / "README.md",
+        *ROOT.glob("docs/*.md"),
+        *ROOT.glob("docs/how_to/*.md"),
+        *ROOT.glob("docs/examples/*.md"),
+    )
 )
 # The smallest number of refinements that the code of each page must compute.
 REFINEMENTS = {
@@ -86,7 +92,7 @@ def pair():
         if page == "README.md"
         else pytest.param(page, marks=pytest.mark.sampled if page in LONGEST else pytest.mark.slow)
         for page in PAGES
-        if code_blocks(page)
+        if code_blocks(page) and not page.startswith("docs/examples/")
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*wrong as a whole:UserWarning")
@@ -128,6 +134,79 @@ def test_code_blocks_run(page, pair, tmp_path, monkeypatch, small_pictures):
         assert len(namespace["comparison"].methods) == 6
     if page == "docs/how_to/many_pairs.md":
         assert set(namespace["maps"]) == set(namespace["pairs"])
+
+
+def run_example(name: str, directory: Path, **numbers: int) -> dict[str, object]:
+    """Run the program of an example page in a directory, with other numbers, and return its names."""
+    (program,) = code_blocks(f"docs/examples/{name}.md")
+    for variable, number in numbers.items():
+        program, replaced = re.subn(
+            rf"^{variable} = \d+$", f"{variable} = {number}", program, flags=re.MULTILINE
+        )
+        assert replaced == 1
+    namespace: dict[str, object] = {}
+    with (
+        contextlib.chdir(directory),
+        jax.numpy_dtype_promotion("standard"),
+        jax.numpy_rank_promotion("allow"),
+        jax.enable_x64(False),
+    ):
+        exec(compile(program, name, "exec"), namespace)
+    return namespace
+
+
+def test_example_table_1(pair, tmp_path):
+    for name in ("faust_r", "scape_r"):
+        (tmp_path / "data" / name / "corres").mkdir(parents=True)
+        (tmp_path / "data" / name / "off").mkdir()
+        truth = {"pose1": np.arange(len(pair.true_map)), "pose2": pair.true_map}
+        for shape, mesh in {"pose1": pair.source, "pose2": pair.target}.items():
+            write_mesh(tmp_path / "data" / name / "off" / f"{shape}.off", mesh)
+            np.savetxt(tmp_path / "data" / name / "corres" / f"{shape}.vts", truth[shape] + 1, fmt="%d")
+    table = run_example("table_1", tmp_path, NUMBER_OF_PAIRS=1)["table"]
+    assert list(table) == ["FAUST", "SCAPE"]
+    for comparison in table.values():
+        assert comparison.errors("mwp").mean() < comparison.errors("initial").mean()
+
+
+@pytest.mark.slow
+def test_example_table_1_on_real_shapes(shared, tmp_path):
+    (tmp_path / "data").symlink_to(shared / "data")
+    table = run_example("table_1", tmp_path, NUMBER_OF_PAIRS=1)["table"]
+    assert list(table) == ["FAUST", "TOSCA"]
+    for comparison in table.values():
+        assert comparison.errors("mwp").mean() < 100 < comparison.errors("initial").mean()
+
+
+def test_example_tight_or_not(tmp_path):
+    namespace = run_example("tight_or_not", tmp_path, NUMBER_OF_PAIRS=1)
+    assert len(namespace["comparison"].differences()) == 3
+
+
+@pytest.mark.slow
+def test_example_learn_a_bank(tmp_path):
+    namespace = run_example("learn_a_bank", tmp_path, NUMBER_OF_STEPS=2)
+    loss, training = namespace["loss"], namespace["training"]
+    assert loss(namespace["bank"], training) < loss(namespace["before"], training)
+
+
+def test_example_refiner_of_a_paper(tmp_path):
+    comparison = run_example("refiner_of_a_paper", tmp_path, NUMBER_OF_PAIRS=1)["comparison"]
+    assert comparison.errors("MWP, then Neural ZoomOut") < 1.2 * comparison.errors("MWP")
+
+
+def test_example_thousand_pairs_continues(pair, tmp_path):
+    (tmp_path / "meshes").mkdir()
+    for name, mesh in {"a": pair.source, "b": pair.target, "c": pair.source}.items():
+        write_mesh(tmp_path / "meshes" / f"{name}.off", mesh)
+    assert len(run_example("thousand_pairs", tmp_path, NUMBER_OF_PAIRS=4)["missing"]) == 4
+    maps = {path: path.read_bytes() for path in (tmp_path / "maps").iterdir()}
+    assert len(maps) == 4
+    killed = sorted(maps)[2:]
+    for path in killed:
+        path.unlink()
+    assert len(run_example("thousand_pairs", tmp_path, NUMBER_OF_PAIRS=4)["missing"]) == len(killed)
+    assert maps == {path: path.read_bytes() for path in (tmp_path / "maps").iterdir()}
 
 
 def test_every_page_with_code_is_found():

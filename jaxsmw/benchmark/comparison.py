@@ -92,7 +92,8 @@ def compare(
           `number_of_eigenvectors`, and the initial map X -> Y (m,). If the function raises an
           `ArithmeticError`, the method has failed on this pair.
         - a `Preset` or the name of a preset, which `jaxsmw.match` runs with its search.
-        - the name of a method of the command `jaxsmw benchmark`, such as `"zoomout"`.
+        - the name of a method that `jaxsmw benchmark --help` lists: `"zoomout"`, `"icp"`, `"cpd"`,
+          `"initial"` (the initial map without refinement) and others.
 
     - `pairs`: a data set (a `DataSet` or its directory), or pairs with ground truth: each is a `DataPair`, a
       `CreaturePair`, or a tuple `(mesh_x, mesh_y, truth)`. In a tuple, `truth` is a `GroundTruth`, or the
