@@ -131,9 +131,13 @@ def search(
         candidates = race(readings, judged, hypotheses and number == 0)
         # A twin can be better if it reads the pair in another way.
         new = [one for one in different([*judged, *candidates]) if one not in judged]
-        refined = [_refined(one, preset) for one in _likely(new, settings)]
-        if not refined:
+        likely = _likely(new, settings)
+        if not likely:
             break
+        if number == 0:  # Only maps after the same stages can be compared.
+            again = _refined(first, preset)
+            judged = [again] if again.outcome.successful else judged
+        refined = [_refined(one, preset) for one in likely]
         judged = list(different([*judged, *refined]))
         certain = _certain(judged, settings)
     likely = _likely(judged, settings)
