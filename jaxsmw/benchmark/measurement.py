@@ -257,6 +257,7 @@ class _PreparedTask:
                 number_of_eigenvectors,
                 max(method.number_of_crease_eigenvectors for method in methods.values()),
                 MOST_SAMPLES,
+                tuple(dict.fromkeys(name for method in methods.values() for name in method.bases)),
             ),
             number_of_descriptors=max(method.number_of_descriptors for method in methods.values()),
         )

@@ -72,7 +72,7 @@ def shape_key(shape: PreparedShape, preset: Preset, eigensolver: Eigensolver) ->
     """Return the part of a `Store` key that identifies a shape, apart from its descriptors."""
     sizes = preset.sizes
     numbers = sizes.number_of_eigenvectors, sizes.number_of_crease_eigenvectors
-    return shape.mesh.vertices, shape.mesh.faces, eigensolver, *numbers
+    return shape.mesh.vertices, shape.mesh.faces, eigensolver, *numbers, *sizes.bases
 
 
 def preset_key(preset: Preset) -> tuple[Any, ...]:

@@ -55,7 +55,7 @@ from jaxsmw.core.linear_algebra import (
     symmetric_eigenvalues,
 )
 from jaxsmw.core.module import Module, field
-from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.core.spectrum import Spectrum, by_basis
 
 if TYPE_CHECKING:
     from jaxsmw.core.soft_maps import SoftMap, SparseSoftMap
@@ -88,17 +88,22 @@ def dual_eigenvectors(spectrum: Spectrum, pseudo_inverse: PseudoInverse) -> Floa
     Phi^T`, in which all vertices have the same weight, as in the MWP authors' program. The two forms are
     nearly equal if the vertices are spread evenly. The eigenvectors of samples (`Spectrum.sample`) are not
     orthonormal and need `"least_squares"`. The result has the unit of length, where the eigenvectors have 1 /
-    length.
+    length. The bases of a `JoinedSpectrum` are inverted one by one.
     """
     check_option("pseudo_inverse", pseudo_inverse, get_args(PseudoInverse))
     if pseudo_inverse == "area":
         return spectrum.eigenvectors * spectrum.vertex_areas[:, None]
-    gram = product(spectrum.eigenvectors.T, spectrum.eigenvectors)
-    if spectrum.mask.shape[0] >= gram.shape[0]:
+    duals = [_least_squares(part) for part in by_basis(spectrum, spectrum.eigenvectors)]
+    return duals[0] if len(duals) == 1 else namespace(*duals).concatenate(duals, axis=1)
+
+
+def _least_squares(eigenvectors: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    gram = product(eigenvectors.T, eigenvectors)
+    if eigenvectors.shape[0] >= gram.shape[0]:
         # An eigenvector of a sliver can vanish at all samples. Its coefficients are then nearly zero. Fewer
         # samples than eigenvectors remain an error.
         gram = regularized(gram)
-    return solve_positive_definite(gram, spectrum.eigenvectors.T).T
+    return solve_positive_definite(gram, eigenvectors.T).T
 
 
 def encode(

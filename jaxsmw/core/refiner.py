@@ -209,6 +209,11 @@ class Refiner(Module, Generic[PreparedT, StateT]):
         return self
 
     @property
+    def further_bases(self) -> tuple[str, ...]:
+        """The names of the bases that the spectra need besides the Laplacian's, none by default."""
+        return ()
+
+    @property
     def convention(self) -> Convention:
         """The direction of the functional map, `"pullback"` by default."""
         return "pullback"

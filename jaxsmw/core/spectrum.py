@@ -4,11 +4,42 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
+import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsmw.core.arrays import Array, namespace, rows_at
-from jaxsmw.core.module import Module
+from jaxsmw.core.module import Module, field
+from jaxsmw.errors import InputError
+
+
+class Basis(Module):
+    """Further functions on a surface, with frequencies, for `WaveletPreservation(bases=...)`.
+
+    The functions Psi are orthonormal with respect to the vertex areas A of the `Spectrum` that contains the
+    basis: `Psi^T A Psi = I`. They are zero at masked vertices. `jaxsmw.geometry.add_bases` computes
+    bases, and `Spectrum.with_bases` accepts any basis.
+
+    **Attributes:**
+
+    - `name`: the name, by which refiners choose a basis.
+    - `eigenvalues`: (k,), ascending, in any unit that both shapes share, because filters depend only on their
+      ratios.
+    - `eigenvectors`: (n, k), in units of 1 / length.
+    """
+
+    name: str = field(static=True)
+    eigenvalues: Float[Array, " k"]
+    eigenvectors: Float[Array, "n k"]
+
+    def truncate(self, number_of_eigenvectors: int) -> Basis:
+        """Return the basis with only its first `number_of_eigenvectors` functions."""
+        return dataclasses.replace(
+            self,
+            eigenvalues=self.eigenvalues[:number_of_eigenvectors],
+            eigenvectors=self.eigenvectors[:, :number_of_eigenvectors],
+        )
 
 
 class Spectrum(Module):
@@ -38,6 +69,7 @@ class Spectrum(Module):
       surface bends; see `jaxsmw.geometry.crease_eigenvectors`. Only `FeatureRegression` uses them.
     - `positions`, `normals`: (n, 3), the vertex positions in units of length, and the outward unit normals;
       or None. Only `Registration` uses them.
+    - `bases`: further bases, each a `Basis`. Only `WaveletPreservation` uses them.
     """
 
     eigenvalues: Float[Array, " k"]
@@ -48,13 +80,15 @@ class Spectrum(Module):
     positions: Float[Array, "n 3"] | None = None
     normals: Float[Array, "n 3"] | None = None
     crease_eigenvectors: Float[Array, "n c"] | None = None
+    bases: tuple[Basis, ...] = ()
 
     def truncate(self, number_of_eigenvectors: int) -> Spectrum:
-        """Return the spectrum with only the first `number_of_eigenvectors` eigenpairs."""
+        """Return the spectrum with only the first `number_of_eigenvectors` eigenpairs, also of each basis."""
         return dataclasses.replace(
             self,
             eigenvalues=self.eigenvalues[:number_of_eigenvectors],
             eigenvectors=self.eigenvectors[:, :number_of_eigenvectors],
+            bases=tuple(basis.truncate(number_of_eigenvectors) for basis in self.bases),
         )
 
     def scale(self, factor: float) -> Spectrum:
@@ -66,6 +100,14 @@ class Spectrum(Module):
             eigenvectors=self.eigenvectors / factor**0.5,
             vertex_areas=self.vertex_areas * factor,
             positions=None if self.positions is None else self.positions * factor**0.5,
+            bases=tuple(
+                dataclasses.replace(
+                    basis,
+                    eigenvalues=basis.eigenvalues / factor,
+                    eigenvectors=basis.eigenvectors / factor**0.5,
+                )
+                for basis in self.bases
+            ),
         )
 
     def reflect(self) -> Spectrum:
@@ -104,6 +146,41 @@ class Spectrum(Module):
         self._check_rows("normals", normals, 3)
         return dataclasses.replace(self, positions=positions, normals=normals)
 
+    def with_bases(self, bases: tuple[Basis, ...]) -> Spectrum:
+        """Return the spectrum with the given further bases, or with none.
+
+        **Raises:** `ValueError` if the functions of a basis do not have one row per vertex.
+        """
+        for basis in bases:
+            self._check_rows(f"functions of the basis {basis.name!r}", basis.eigenvectors)
+        return dataclasses.replace(self, bases=tuple(bases))
+
+    def joined(self, names: tuple[str, ...]) -> JoinedSpectrum:
+        """Return the spectrum whose eigenpairs are those of several bases, one basis after another.
+
+        **Arguments:**
+
+        - `names`: names of bases. `"laplacian"` means the eigenpairs of the spectrum itself.
+
+        **Raises:** `InputError` if the spectrum has no basis of a name.
+        """
+        known: dict[str, Basis | Spectrum] = {"laplacian": self}
+        known |= {basis.name: basis for basis in self.bases}
+        if missing := [name for name in names if name not in known]:
+            raise InputError(
+                f"a spectrum has no basis {missing[0]!r}: compute it (jaxsmw.geometry.add_bases), or give "
+                "your own (Spectrum.with_bases)."
+            )
+        parts = [known[name] for name in names]
+        xp = namespace(self.eigenvectors)
+        others = {one.name: getattr(self, one.name) for one in dataclasses.fields(Spectrum)}
+        others |= {
+            "eigenvalues": xp.concatenate([part.eigenvalues for part in parts]),
+            "eigenvectors": xp.concatenate([part.eigenvectors for part in parts], axis=1),
+            "bases": (),
+        }
+        return JoinedSpectrum(**others, sizes=tuple(part.eigenvalues.shape[0] for part in parts))
+
     def pad(self, number_of_vertices: int) -> Spectrum:
         """Return the spectrum with masked vertices appended, so that it has `number_of_vertices` vertices.
 
@@ -119,7 +196,7 @@ class Spectrum(Module):
         if rows == 0:
             return self
         return self._map_vertex_arrays(
-            lambda field: xp.pad(field, ((0, rows), *((0, 0),) * (field.ndim - 1)))
+            lambda array: xp.pad(array, ((0, rows), *((0, 0),) * (array.ndim - 1)))
         )
 
     def sample(self, vertices: Int[Array, " s"]) -> Spectrum:
@@ -130,7 +207,7 @@ class Spectrum(Module):
         """
         xp = namespace(self.vertex_areas)
         share = xp.sum(self.vertex_areas) / vertices.shape[0]
-        sampled = self._map_vertex_arrays(lambda field: rows_at(field, vertices))
+        sampled = self._map_vertex_arrays(lambda array: rows_at(array, vertices))
         return dataclasses.replace(sampled, vertex_areas=xp.full(vertices.shape, share))
 
     def excluding(self, vertices: Bool[Array, " n"]) -> Spectrum:
@@ -151,6 +228,28 @@ class Spectrum(Module):
 
     def _map_vertex_arrays(self, change: Callable[[Array], Array]) -> Spectrum:
         """Return the spectrum with a function applied to all arrays that have one row per vertex."""
-        names = [field.name for field in dataclasses.fields(self) if field.name != "eigenvalues"]
+        names = [one.name for one in dataclasses.fields(Spectrum) if one.name not in ("eigenvalues", "bases")]
         present = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return dataclasses.replace(self, **{name: change(field) for name, field in present.items()})
+        changed: dict[str, Any] = {name: change(array) for name, array in present.items()}
+        changed["bases"] = tuple(
+            dataclasses.replace(basis, eigenvectors=change(basis.eigenvectors)) for basis in self.bases
+        )
+        return dataclasses.replace(self, **changed)
+
+
+class JoinedSpectrum(Spectrum):
+    """The eigenpairs of several bases side by side, the result of `Spectrum.joined`.
+
+    Functions of one basis are orthonormal, but functions of different bases are not orthogonal. The
+    attribute `sizes` contains the number of functions of each basis.
+    """
+
+    sizes: tuple[int, ...] = field(static=True, default=())
+
+
+def by_basis(spectrum: Spectrum, array: Float[Array, "*rows k"]) -> list[Float[Array, "*rows k_b"]]:
+    """Return an array in parts, one for the eigenpairs of each basis, which its last axis counts."""
+    if not isinstance(spectrum, JoinedSpectrum):
+        return [array]
+    ends = np.cumsum(spectrum.sizes).tolist()
+    return [array[..., end - size : end] for end, size in zip(ends, spectrum.sizes, strict=True)]

@@ -1,4 +1,5 @@
 from .assignment import one_to_one_map
+from .bases import add_bases
 from .creases import crease_eigenvectors
 from .eigenbasis import compute_spectrum
 from .geodesics import geodesic_distances, geodesic_matrix
@@ -15,6 +16,7 @@ __all__ = [
     "Mesh",
     "ScaleEstimate",
     "SurfacePoints",
+    "add_bases",
     "compute_spectrum",
     "crease_eigenvectors",
     "cut_shortcuts",

@@ -45,13 +45,22 @@ def crease_eigenvectors(mesh: Mesh, number: int) -> Float64[np.ndarray, "n c"]:
     **Raises:** `InputError` if `number` is out of its range, or if the eigenproblem cannot be solved
     accurately.
     """
+    return crease_eigenpairs(mesh, number)[1]
+
+
+def crease_eigenpairs(
+    mesh: Mesh, number: int
+) -> tuple[Float64[np.ndarray, " c"], Float64[np.ndarray, "n c"]]:
+    """Return the eigenvalues (c,) and the `crease_eigenvectors` (n, c), without unit."""
     check_number_of_eigenvectors(mesh, number)
 
     def compute() -> dict[str, np.ndarray]:
-        return {"eigenvectors": solve_on_surface(mesh, *_assemble(mesh), number)[1]}
+        eigenvalues, eigenvectors = solve_on_surface(mesh, *_assemble(mesh), number)
+        return {"eigenvalues": eigenvalues, "eigenvectors": eigenvectors}
 
     inputs = mesh.vertices, mesh.faces, number, _NORMAL_WEIGHT
-    return cached("crease-eigenvectors", inputs, compute)["eigenvectors"]
+    pairs = cached("crease-eigenpairs", inputs, compute)
+    return pairs["eigenvalues"], pairs["eigenvectors"]
 
 
 def _assemble(mesh: Mesh) -> tuple[sp.csc_matrix, Float64[np.ndarray, " n"]]:

@@ -232,7 +232,8 @@ class Correspondence:
         from jaxsmw.io.exchange import unit_factor
 
         matrix = np.asarray(self.functional_map, np.float64)
-        if self.stage.refiner.convention != "pullback":
+        refiner = self.stage.refiner
+        if refiner.convention != "pullback" or refiner.further_bases:
             encoded = encode(self.pointwise_map, self.spectrum_x, self.spectrum_y)
             matrix = np.asarray(encoded, np.float64)
         factor_x, factor_y = (unit_factor(*side) for side in self._sides)

@@ -202,7 +202,7 @@ def prepare(
     **Arguments:**
 
     - `pair`: the source X (m vertices) and the target Y (n vertices).
-    - `sizes`: the numbers of eigenvectors, crease eigenvectors and samples of each shape.
+    - `sizes`: the numbers of eigenvectors, crease eigenvectors and samples of each shape, and its bases.
     - `given`: the pair to whose vertices the result refers, if `pair` is cut; by default `pair`.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`.
     - `backend`: see `jaxsmw.match`.

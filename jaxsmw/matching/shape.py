@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int, Int64, Shaped
 
 from jaxsmw.choices import DEFAULT_BACKEND, Backend, Eigensolver, Laplacian
 from jaxsmw.core.arrays import Array, float_type, namespace, on_host
-from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.core.spectrum import Basis, Spectrum
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.bases import add_bases
 from jaxsmw.geometry.creases import crease_eigenvectors
 from jaxsmw.geometry.eigenbasis import as_spectrum, choose_eigensolver, eigenpairs
 from jaxsmw.geometry.mesh import Mesh
@@ -106,7 +107,11 @@ class PreparedShape:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the shape as arrays, for a file."""
-        arrays = {name: np.asarray(value) for name, value in vars(self.spectrum).items() if value is not None}
+        values = vars(self.spectrum).items()
+        arrays = {name: np.asarray(value) for name, value in values if value is not None and name != "bases"}
+        for basis in self.spectrum.bases:
+            arrays[f"eigenvalues_of_basis_{basis.name}"] = np.asarray(basis.eigenvalues)
+            arrays[f"eigenvectors_of_basis_{basis.name}"] = np.asarray(basis.eigenvectors)
         arrays |= {"mesh_vertices": self.mesh.vertices, "mesh_faces": self.mesh.faces}
         if self.samples is not None:
             arrays["samples"] = np.asarray(self.samples)
@@ -116,7 +121,12 @@ class PreparedShape:
     def from_arrays(cls, arrays: Mapping[str, np.ndarray], name: str) -> PreparedShape:
         """Return the shape, given the result of the method `arrays`."""
         names = [field.name for field in fields(Spectrum) if field.name in arrays]
-        spectrum = Spectrum(**{name: arrays[name] for name in names})
+        values, vectors = "eigenvalues_of_basis_", "eigenvectors_of_basis_"
+        bases = [key.removeprefix(values) for key in arrays if key.startswith(values)]
+        spectrum = Spectrum(
+            **{name: arrays[name] for name in names},
+            bases=tuple(Basis(basis, arrays[values + basis], arrays[vectors + basis]) for basis in bases),
+        )
         samples = arrays.get("samples")
         mesh = Mesh(arrays["mesh_vertices"], arrays["mesh_faces"], name)
         return cls(mesh, spectrum, compared_samples(mesh), samples)
@@ -131,12 +141,12 @@ def prepare_shapes(
     backend: Backend = DEFAULT_BACKEND,
     step: Step = no_step,
 ) -> list[PreparedShape]:
-    """Compute the spectra, crease eigenvectors and samples of shapes; two shapes side by side.
+    """Compute the spectra, bases, crease eigenvectors and samples of shapes; two shapes side by side.
 
     **Arguments:**
 
     - `meshes`: the meshes, each a `Mesh` in any unit of length.
-    - `sizes`: the numbers of eigenvectors, crease eigenvectors and samples of each shape.
+    - `sizes`: the numbers of eigenvectors, crease eigenvectors and samples of each shape, and its bases.
     - `laplacian`, `eigensolver`: see `jaxsmw.compute_spectrum`. All meshes get the same eigensolver, because
       their spectra are compared.
     - `backend`: see `jaxsmw.match`. The arrays of the spectra are of NumPy or JAX.
@@ -150,14 +160,14 @@ def prepare_shapes(
         eigensolver = choose_eigensolver(*meshes)
     dtype = float_type()  # threads do not inherit `jax.enable_x64`
 
-    def each(compute: Callable[[Mesh], Computed]) -> Sequence[Computed]:
-        return side_by_side(compute, *meshes) if len(meshes) == 2 else [compute(mesh) for mesh in meshes]
+    def each(compute: Callable[[Any], Computed], inputs: Sequence[Any] = meshes) -> Sequence[Computed]:
+        return side_by_side(compute, *inputs) if len(inputs) == 2 else [compute(one) for one in inputs]
 
     def shape(mesh: Mesh) -> PreparedShape:
         pairs = eigenpairs(mesh, number, laplacian=laplacian, eigensolver=eigensolver)
         return _shape(mesh, as_spectrum(mesh, *pairs, dtype=dtype))
 
-    number, creases, samples = sizes
+    number, creases, samples, bases = sizes
     with step("eigenbases"):
         shapes = list(each(shape))
     if samples:
@@ -173,6 +183,10 @@ def prepare_shapes(
             replace(shape, spectrum=shape.spectrum.with_crease_eigenvectors(on_host(columns)))
             for shape, columns in zip(shapes, vectors, strict=True)
         ]
+    if bases:
+        with step("further bases"):
+            spectra = each(lambda shape: add_bases(shape.mesh, shape.spectrum, bases), shapes)
+        shapes = [replace(shape, spectrum=spectrum) for shape, spectrum in zip(shapes, spectra, strict=True)]
     if chosen_backend(backend) == "numpy":
         return shapes
     import jax

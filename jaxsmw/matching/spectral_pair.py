@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxsmw.core.arrays import Array, is_traced
 from jaxsmw.core.refiner import Samples
-from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.core.spectrum import Basis, Spectrum
 from jaxsmw.matching.stages import Stage
+
+Eigenpairs = TypeVar("Eigenpairs", Spectrum, Basis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +47,7 @@ class SpectralPair:
         return not is_traced(self.x.eigenvectors, self.y.eigenvectors)
 
     def seen_by(self, stage: Stage) -> SpectralPair:
-        """Return the pair, restricted to the eigenvectors, descriptors and samples that a stage uses.
+        """Return the pair, restricted to the eigenvectors, bases, descriptors and samples that a stage uses.
 
         If one of the spectra has no crease eigenvectors, the result has none either. This happens in a
         collection if only one of two meshes is large.
@@ -52,7 +56,8 @@ class SpectralPair:
         creased = all(spectrum.crease_eigenvectors is not None for spectrum in spectra)
         number_of_creases = stage.number_of_crease_eigenvectors if creased else 0
         x, y = (
-            spectrum.truncate(stage.number_of_eigenvectors)
+            spectrum.with_bases(_named(spectrum.bases, stage.refiner.further_bases))
+            .truncate(stage.number_of_eigenvectors)
             .with_descriptors(_first(spectrum.descriptors, stage.number_of_descriptors))
             .with_crease_eigenvectors(_first(spectrum.crease_eigenvectors, number_of_creases))
             for spectrum in spectra
@@ -81,7 +86,7 @@ def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, 
 
     The limit is the largest eigenvalue of X or the largest eigenvalue of Y, whichever is smaller. Eigenpairs
     with eigenvalues above this limit are removed. The MWP paper truncates the spectra of partial shapes in
-    the same way.
+    the same way. Each further basis has its own limit.
 
     **Arguments:**
 
@@ -90,7 +95,17 @@ def common_range(spectrum_x: Spectrum, spectrum_y: Spectrum) -> tuple[Spectrum, 
     **Returns:** The spectra of X and Y with k_X and k_Y eigenvectors, in the same unit. One of the spectra is
     unchanged.
     """
-    spectra = spectrum_x, spectrum_y
-    last = min(float(spectrum.eigenvalues[-1]) for spectrum in spectra)
-    cut = [s.truncate(int((np.asarray(s.eigenvalues) <= last).sum())) for s in spectra]
+    bases = [_common_range(*both) for both in zip(spectrum_x.bases, spectrum_y.bases, strict=True)]
+    x, y = _common_range(spectrum_x, spectrum_y)
+    return x.with_bases(tuple(of_x for of_x, _ in bases)), y.with_bases(tuple(of_y for _, of_y in bases))
+
+
+def _common_range(x: Eigenpairs, y: Eigenpairs) -> tuple[Eigenpairs, Eigenpairs]:
+    last = min(float(side.eigenvalues[-1]) for side in (x, y))
+    cut = [side.truncate(int((np.asarray(side.eigenvalues) <= last).sum())) for side in (x, y)]
     return cut[0], cut[1]
+
+
+def _named(bases: Sequence[Basis], names: Sequence[str]) -> tuple[Basis, ...]:
+    """Return the bases with some names, in the order of these names."""
+    return tuple(basis for name in names for basis in bases if basis.name == name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import NamedTuple, get_args
 
 from jaxsmw.choices import ITERATIONS, NUMBER_OF_EIGENVECTORS, PresetName
@@ -104,6 +104,16 @@ class Stage:
                 f"{name} is {number!r}, but the refiner's levels require {derived}: leave {name} out."
             )
 
+    @property
+    def sizes(self) -> Sizes:
+        """What the stage needs of each shape."""
+        return Sizes(
+            self.number_of_eigenvectors,
+            self.number_of_crease_eigenvectors,
+            self.number_of_samples or 0,
+            self.refiner.further_bases,
+        )
+
     def settings(self, *, partial: bool = False, traced: bool = True) -> RefineSettings:
         """Return the stage as keyword arguments of `jaxsmw.refine`, for two full shapes or a partial pair.
 
@@ -172,11 +182,18 @@ class Stage:
 
 
 class Sizes(NamedTuple):
-    """What stages need of each shape: numbers of eigenvectors, crease eigenvectors and samples."""
+    """What stages need of each shape: numbers of eigenvectors, crease eigenvectors and samples, and bases."""
 
     number_of_eigenvectors: int
     number_of_crease_eigenvectors: int = 0
     number_of_samples: int = 0
+    bases: tuple[str, ...] = ()
+
+    @classmethod
+    def of_all(cls, every: Iterable[Sizes]) -> Sizes:
+        """Return what several stages need together."""
+        eigenvectors, creases, samples, bases = zip(*every, strict=True)
+        return cls(max(eigenvectors), max(creases), max(samples), tuple(dict.fromkeys(chain(*bases))))
 
 
 @dataclass(frozen=True)
@@ -292,11 +309,7 @@ class Preset:
     @property
     def sizes(self) -> Sizes:
         """What the stages need of each shape."""
-        return Sizes(
-            max(stage.number_of_eigenvectors for stage in self.stages),
-            max(stage.number_of_crease_eigenvectors for stage in self.stages),
-            max(stage.number_of_samples or 0 for stage in self.stages),
-        )
+        return Sizes.of_all(stage.sizes for stage in self.stages)
 
     @property
     def number_of_descriptors(self) -> int:

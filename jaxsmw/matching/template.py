@@ -24,7 +24,7 @@ from jaxsmw.matching.search.alternatives import Alternative
 from jaxsmw.matching.search.fitting import fitted_scale
 from jaxsmw.matching.search.proxies import Proxy
 from jaxsmw.matching.shape import PreparedShape
-from jaxsmw.matching.stages import Preset, Sizes, Stage
+from jaxsmw.matching.stages import Preset, Stage
 
 # Beside positions in units of the square root of the template's area, normals have this weight. It keeps the
 # two sides of a thin part apart.
@@ -161,7 +161,7 @@ def _prepared(
 
     def prepared(surfaces: Pair) -> tuple[PreparedPair, Stage]:
         fitted = stage.fitted(surfaces.fewest_vertices())
-        sizes = Sizes(fitted.number_of_eigenvectors, number_of_samples=fitted.number_of_samples or 0)
+        sizes = fitted.sizes._replace(number_of_crease_eigenvectors=0)
         ready = prepare(
             surfaces,
             sizes,

@@ -108,6 +108,7 @@ class Method(abc.ABC):
     - `reference`: the publication and the settings of the method, as text that is printed with the results.
     - `number_of_eigenvectors`, `number_of_crease_eigenvectors`, `number_of_descriptors`: the largest numbers
       that the method uses.
+    - `bases`: the names of the bases that the method uses besides the Laplacian's.
     - `package`: the import name of the optional package that the method needs; an empty text for none.
     - `full_only`: whether the method matches only pairs of full shapes.
     - `partial_only`: whether the method matches only partial pairs.
@@ -117,6 +118,7 @@ class Method(abc.ABC):
     number_of_eigenvectors: int
     number_of_crease_eigenvectors: int = 0
     number_of_descriptors: int = 0
+    bases: tuple[str, ...] = ()
     package: str = ""
     full_only: bool = False
     partial_only: bool = False

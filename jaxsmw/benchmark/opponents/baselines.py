@@ -120,9 +120,11 @@ class Staged(Method):
     number_of_eigenvectors: int = field(init=False)
     number_of_crease_eigenvectors: int = field(init=False)
     number_of_descriptors: int = field(init=False)
+    bases: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         preset = Preset(self.stages)
+        object.__setattr__(self, "bases", preset.sizes.bases)
         object.__setattr__(self, "number_of_eigenvectors", preset.sizes.number_of_eigenvectors)
         object.__setattr__(self, "number_of_crease_eigenvectors", preset.sizes.number_of_crease_eigenvectors)
         object.__setattr__(self, "number_of_descriptors", preset.number_of_descriptors)

@@ -20,7 +20,7 @@ from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.shape import prepare_shapes
-from jaxsmw.matching.stages import Preset, Sizes, Stage
+from jaxsmw.matching.stages import Preset, Stage
 
 logger = logging.getLogger("jaxsmw")
 
@@ -138,7 +138,7 @@ def _prepared_again(prepared: PreparedPair, pair: Pair, stage: Stage) -> Prepare
 
     **Raises:** `InputError` if the kept region is too small or too coarse.
     """
-    sizes = Sizes(stage.number_of_eigenvectors, number_of_samples=stage.number_of_samples or 0)
+    sizes = stage.sizes._replace(number_of_crease_eigenvectors=0)
     laplacian, eigensolver = prepared.laplacian, prepared.eigensolver
     backend: Backend = "numpy" if prepared.spectra.on_host else "jax"
     shapes = prepare_shapes(pair.meshes, sizes, laplacian=laplacian, eigensolver=eigensolver, backend=backend)
