@@ -174,8 +174,8 @@ def test_pairs_are_drawn_by_the_seed_or_read_from_a_list(scape, tmp_path):
 def test_a_template_makes_a_method_for_partial_shapes(tmp_path):
     file = tmp_path / "whole.off"
     write_mesh(file, bumpy_mesh(1))
-    methods = find_methods(["accurate:quadruped", f"accurate:{file}"])
-    assert list(methods) == ["accurate:quadruped", "accurate:whole.off"]
+    methods = find_methods(["accurate:mammal", f"accurate:{file}"])
+    assert list(methods) == ["accurate:mammal", "accurate:whole.off"]
     assert all(
         method.partial_only and "through the template" in method.reference for method in methods.values()
     )
