@@ -580,8 +580,8 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
 
     **Arguments:**
 
-    - `kind`: `"quadruped"` (a fox), `"biped"` (a goblin), `"dragon"`, or `"mammal"` (a heavy quadruped with
-      average proportions of mammals).
+    - `kind`: `"quadruped"` (a fox), `"biped"` (a goblin), `"dragon"`, or `"mammal"` (a heavy quadruped
+      between a dog, a cow and a lion).
     - `vertices`: the number of vertices, at least 500.
     - `pose`: one of the poses that `CREATURES` lists for this kind.
     - `seed`: an integer of at least 0, which determines the proportions, the triangulation, and the small

@@ -315,3 +315,13 @@ def test_interval_is_a_confidence_interval_of_the_mean():
     mean, low, high = mean_interval(np.array([1.0, 2.0]), seed=0)
     assert mean == 1.5 and np.isnan(low) and np.isnan(high)
     assert np.isnan(mean_interval(np.array([]), seed=0)).all()
+
+
+def test_a_directory_of_maps_is_a_method_of_any_name(tmp_path, pairs):
+    """The name of the method differs from that of the directory."""
+    source, target, _ = pairs[0]
+    (tmp_path / "maps").mkdir()
+    file = tmp_path / "maps" / f"{source.name}_{target.name}.map"
+    np.savetxt(file, 1 + np.arange(len(source.vertices)), fmt="%d")
+    comparison = compare({"identity": str(tmp_path / "maps")}, pairs[:1], init="wks", quiet=True)
+    assert comparison.methods == ("identity",) and comparison.errors("identity")[0] == 0

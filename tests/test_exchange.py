@@ -23,6 +23,7 @@ from synthetic import bumpy_mesh, random_spectrum, sphere_mesh
 
 import jaxsmw
 from jaxsmw import InputError, Mesh, Spectrum, decode, encode, make_mesh
+from jaxsmw.geometry import add_bases
 from jaxsmw.io import exchange, make_spectrum
 from jaxsmw.io.maps import check_map_name, read_landmarks
 
@@ -883,3 +884,14 @@ def test_the_spectrum_of_a_cut_mesh_is_not_converted(bodies, spectra):
         InputError, match=r"y: has 162 vertices, but its spectrum has 642, because the mesh was cut: compute"
     ):
         exchange.unit_factor(bodies[1], spectra[0])
+
+
+def test_tensors_of_further_bases_have_the_names_of_the_bases(monkeypatch):
+    """Runs without PyTorch."""
+    library = SimpleNamespace(from_dlpack=np.asarray)
+    monkeypatch.setattr("jaxsmw.io.exchange._library", lambda *names: library)
+    mesh = bumpy_mesh(3)
+    spectrum = jaxsmw.compute_spectrum(mesh, K)
+    plain, joined = (exchange.to_torch(one) for one in (spectrum, add_bases(mesh, spectrum, ["crease"])))
+    assert set(joined) - set(plain) == {"eigenvalues_of_basis_crease", "eigenvectors_of_basis_crease"}
+    np.testing.assert_array_equal(plain["eigenvalues"], spectrum.eigenvalues)

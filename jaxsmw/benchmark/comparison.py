@@ -308,7 +308,8 @@ class MapMethod(Method):
         except (InputError, ArithmeticError):
             raise
         except Exception as error:
-            frame = [one for one in inspect.trace() if "site-packages" not in one.filename][-1]
+            frames = inspect.trace()
+            frame = ([one for one in frames if "site-packages" not in one.filename] or frames)[-1]
             raise InputError(
                 f"the method {self.name} raised {type(error).__name__} at {frame.filename}, line "
                 f"{frame.lineno} ({error}): correct the function."
@@ -343,7 +344,7 @@ def _as_method(name: str, method: Compared, number_of_eigenvectors: int, iterati
     if isinstance(method, str):
         if method in get_args(PresetName):
             return Matched(f"jaxsmw.match with the preset {method}", choose_preset(method))
-        return find_methods([method])[method]
+        return next(iter(find_methods([method]).values()))
     if isinstance(method, Preset):
         return Matched(f"jaxsmw.match with a preset ({value_digest(method)})", method)
     if isinstance(method, Refiner):

@@ -27,7 +27,23 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class DataPair:
+class _NamedPair:
+    source: str
+    target: str
+
+    @property
+    def name(self) -> str:
+        """The text "SOURCE to TARGET" with the names of both shapes."""
+        return f"{self.source} to {self.target}"
+
+    @property
+    def names(self) -> tuple[str, str]:
+        """The names of the source and the target."""
+        return self.source, self.target
+
+
+@dataclass(frozen=True)
+class DataPair(_NamedPair):
     """A pair of shapes in a data set: their names, their mesh files, and the files of their ground truth.
 
     **Attributes:**
@@ -43,8 +59,6 @@ class DataPair:
     - `reverse_truth`: if both are parts, the file of the ground truth from Y to X; None without one.
     """
 
-    source: str
-    target: str
     source_file: Path
     target_file: Path
     truth: tuple[Path, ...] = ()
@@ -53,16 +67,6 @@ class DataPair:
     partial: bool = False
     both_partial: bool = False
     reverse_truth: Path | None = None
-
-    @property
-    def name(self) -> str:
-        """The text "SOURCE to TARGET" with the names of both shapes."""
-        return f"{self.source} to {self.target}"
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """The names of the source and the target."""
-        return self.source, self.target
 
     @property
     def meshes(self) -> tuple[Path, Path]:
@@ -130,7 +134,7 @@ class DataPair:
 
 
 @dataclass(frozen=True, eq=False)
-class MeshPair:
+class MeshPair(_NamedPair):
     """A pair of meshes in memory with ground truth, which a benchmark measures like a `DataPair`.
 
     **Attributes:**
@@ -140,8 +144,6 @@ class MeshPair:
     - `truth`: the ground truth.
     """
 
-    source: str
-    target: str
     mesh_x: Mesh
     mesh_y: Mesh
     truth: GroundTruth
@@ -151,16 +153,6 @@ class MeshPair:
     def meshes(self) -> tuple[Mesh, Mesh]:
         """The meshes of X and Y."""
         return self.mesh_x, self.mesh_y
-
-    @property
-    def name(self) -> str:
-        """The text "SOURCE to TARGET" with the names of both shapes."""
-        return f"{self.source} to {self.target}"
-
-    @property
-    def names(self) -> tuple[str, str]:
-        """The names of the source and the target."""
-        return self.source, self.target
 
     def ground_truth(self, mesh_x: Mesh, mesh_y: Mesh, *, mirrored: bool = False) -> GroundTruth:
         """Return the ground truth. `InputError` is raised for a mirrored one, which does not exist."""

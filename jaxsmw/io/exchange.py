@@ -46,7 +46,8 @@ def to_torch(result: Any) -> Tensors:
     another object with the attributes `pointwise_map` and `functional_map`.
 
     **Returns:** A tensor for an array, and otherwise a dictionary. That of a `Spectrum` contains its arrays
-    by the names of its attributes. That of a result contains `pointwise_map` (m,) and `functional_map`, and
+    by the names of its attributes, and those of further bases as `eigenvalues_of_basis_NAME` and
+    `eigenvectors_of_basis_NAME`. That of a result contains `pointwise_map` (m,) and `functional_map`, and
     that of a `Correspondence` also the dictionaries `spectrum_x` and `spectrum_y`.
 
     **Raises:** `InputError` if PyTorch is not installed, or the object has no such arrays.
@@ -58,6 +59,9 @@ def to_torch(result: Any) -> Tensors:
             return torch.from_dlpack(value)
         if isinstance(value, Spectrum):
             fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+            for basis in fields.pop("bases"):
+                fields[f"eigenvalues_of_basis_{basis.name}"] = basis.eigenvalues
+                fields[f"eigenvectors_of_basis_{basis.name}"] = basis.eigenvectors
         elif hasattr(value, "pointwise_map") and hasattr(value, "functional_map"):
             fields = {name: getattr(value, name, None) for name in _PARTS}
         else:

@@ -66,7 +66,7 @@ def _suspicion(correspondence: Correspondence) -> str:
     if pair.partial and correspondence.shared is None and all(map(relative_boundary, pair.meshes)):
         cures.append(
             "match both meshes through a full shape of this kind with template=mesh, or with "
-            'template="mammal" for animals, if both are parts'
+            'template="mammal" for four-legged animals, if both are parts'
         )
     if not pair.partial:
         cures.append("set partial=True if one mesh is a part of the other")

@@ -189,7 +189,7 @@ def stretch(pair: Pair, pointwise_map: Int64[np.ndarray, " m"]) -> float:
     """Measure how much a map changes the lengths of edges of X.
 
     A map that exchanges two limbs stretches the surface between them. The right map between two poses of a
-    body stretches nothing much, even if it bends patches more. (Entry R49 of docs/research_log.md)
+    body stretches little, even if it bends patches more. (Entry R49 of docs/research_log.md)
 
     **Returns:** The root mean square of the changes in length, in the units of `edge_lengths`. An edge counts
     by its share of the area, and a large change counts as 0.1.

@@ -152,9 +152,9 @@ def match(
         ]
         seconds: dict[str, float] = {}
         with timed("source to template", seconds):
-            x_to_template = matched(pairs[0], init=init)
+            x_to_template = matched(pairs[0], init=init, history=False)
         with timed("target to template", seconds):
-            y_to_template = matched(pairs[1], init=init)
+            y_to_template = matched(pairs[1], init=init, history=False)
         with timed("source to target", seconds), one_blas_thread():
             method = choose_preset(preset)
             correspondence = join(

@@ -134,7 +134,7 @@ def search(
         likely = _likely(new, settings)
         if not likely:
             break
-        if number == 0:  # Only maps after the same stages can be compared.
+        if number == 0:  # The rivals have passed the race as well.
             again = _refined(first, preset)
             judged = [again] if again.outcome.successful else judged
         refined = [_refined(one, preset) for one in likely]
