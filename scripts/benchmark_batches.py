@@ -235,11 +235,10 @@ def methods(options: argparse.Namespace) -> Iterator[Part]:
     }
     rows, measured = [["", "CPU ms per pair, one by one", "of this time in a batch"]], {}
     for name, refiner in refiners.items():
-        refine_one = jax.jit(
-            partial(refine, refiner=refiner, samples=samples, iterations=ITERATIONS),
-            compiler_options=compiler_options(),
+        call = partial(refine, refiner=refiner, samples=samples, iterations=ITERATIONS)
+        refine_one, refine_batch = (
+            jax.jit(function, compiler_options=compiler_options()) for function in (call, jax.vmap(call))
         )
-        refine_batch = jax.jit(jax.vmap(refine_one), compiler_options=compiler_options())
         with one_blas_thread():
             seconds = medians(
                 {
