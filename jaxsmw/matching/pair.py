@@ -114,6 +114,12 @@ class Pair:
         unit_x, unit_y = self.units_of_length
         return self.mesh_x.area / unit_x**2, self.mesh_y.area / unit_y**2
 
+    @property
+    def source_is_whole(self) -> bool:
+        """Whether Y is the smaller shape of a partial pair, and X is therefore taken as the whole shape."""
+        area_x, area_y = self.areas
+        return self.partial and area_x > area_y
+
     def _check_areas(self) -> None:
         """Check that a closed full shape is not clearly smaller than its open part.
 

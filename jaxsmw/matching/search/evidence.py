@@ -66,7 +66,7 @@ class Evidence(NamedTuple):
         x, y, pair = reading.x, reading.y, reading.prepared.pair
         to_matches = y.distances[:, matches]
         reverse, areas_x, lacking = to_matches.argmin(axis=1), x.areas, 0.0
-        if pair.partial and pair.areas[0] > pair.areas[1]:
+        if pair.source_is_whole:
             areas_x = np.bincount(reverse, weights=y.areas, minlength=len(x.areas)).astype(float)
         elif pair.partial:
             lacking = 1 - pair.areas[0] / pair.areas[1]

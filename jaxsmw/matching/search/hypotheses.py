@@ -99,8 +99,7 @@ def by_fits(reading: Reading) -> Iterator[SampleMap]:
     x, y, pair = reading.x, reading.y, reading.prepared.pair
     if not pair.partial:
         return
-    area_x, area_y = pair.areas
-    moving, fixed = (x, y) if area_x <= area_y else (y, x)
+    moving, fixed = (y, x) if pair.source_is_whole else (x, y)
     of_fixed = features(fixed.positions, fixed.normals)
     for fit in fits(moving, fixed):
         queries, database = (fit.features, of_fixed) if moving is x else (of_fixed, fit.features)

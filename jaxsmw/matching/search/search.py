@@ -71,7 +71,7 @@ class Judged(Candidate):
         reverse = extend_to_unreferenced(pair.mesh_y, self.outcome.last.reverse_map())
         directions = [(pair, forward, reverse), (pair.reversed(), reverse, forward)]
         if pair.partial:
-            directions = [directions[pair.areas[0] > pair.areas[1]]]
+            directions = [directions[pair.source_is_whole]]
         lengths = [
             stretch(sides, there) + sides.mesh_x.average(detours(sides, there, back))
             for sides, there, back in directions
