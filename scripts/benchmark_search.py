@@ -1,6 +1,6 @@
 """Measures the search for the right map: how often its map is right, and how reliable its probabilities are.
 
-    python scripts/benchmark_search.py DATA_DIRECTORY [--pairs N] [--seed SEED] [--output DIR]
+    python scripts/benchmark_search.py DATA_DIRECTORY [--pairs N] [--seed SEED] [--output DIR] [--hypotheses]
 
 `DATA_DIRECTORY` contains the data sets of `docs/datasets.md`. The script draws N pairs of each kind of
 `scripts/judged_pairs.py`, and matches them by `jaxsmw.match` with its defaults. It writes `pairs.csv`, which
@@ -11,6 +11,10 @@ a later run continues, the tables `search.md`, and the reliability curve `search
 - *right among four*: the map or one of the first three alternatives is right.
 - The reliability curve groups the maps by probability. The bars are 95 % intervals of the share of right maps
   (Wilson 1927).
+
+With `--hypotheses`, the script compares the kinds of hypothesis instead. Each kind runs in a race of its own.
+The script writes `hypotheses.csv`, and the table `hypotheses.md`: for each kind of hypothesis, the number of
+pairs for which the race finds a right map, and the number of those for which no other kind does.
 """
 
 from __future__ import annotations
@@ -33,10 +37,19 @@ from judged_pairs import (
     reliability_table,
 )
 
-from jaxsmw import match
+from jaxsmw import Pair, match
 from jaxsmw.benchmark.tables import markdown
+from jaxsmw.matching.executor import run
+from jaxsmw.matching.preparation import prepare
+from jaxsmw.matching.search.hypotheses import HYPOTHESES
+from jaxsmw.matching.search.race import race
+from jaxsmw.matching.search.reading import Reading
+from jaxsmw.matching.search.search import readings_of
+from jaxsmw.matching.stages import PRESETS
+from jaxsmw.matching.starts import make_start
 from jaxsmw.report.figures import new_figure, save_figure, style_axes
 from jaxsmw.runtime.provenance import made_with
+from jaxsmw.runtime.threads import one_blas_thread
 
 # The number of alternatives among which the right map should be.
 ALTERNATIVES = 3
@@ -69,6 +82,49 @@ def judged(known: KnownPair) -> dict[str, Any]:
     }
 
 
+def found_by_kinds(known: KnownPair) -> dict[str, Any]:
+    """Return whether the first map, and the race of each kind of hypothesis, are right."""
+    preset = PRESETS["accurate"].fitted(min(len(mesh.referenced_indices) for mesh in (known.x, known.y)))
+    pair = Pair.make(known.x, known.y, partial=known.partial)
+    with one_blas_thread(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        prepared = prepare(pair.without_shortcuts(), preset.sizes, given=pair)
+        start = make_start(prepared, "shot")
+        prepared = prepared.describe(preset.number_of_descriptors)
+        outcome = run(prepared.usable(preset).before_final, prepared.spectra, start)
+        first = Reading.of(prepared).with_first(outcome.pointwise_map)
+        readings = readings_of(first, first.is_asymmetric())
+        row: dict[str, Any] = {FIRST: int(is_right(*known.errors(outcome.pointwise_map)))}
+        for kind in HYPOTHESES:
+            maps = [one.reading.extended(one.matches) for one in race(readings, [], [kind])]
+            row[kind.__name__] = int(any(is_right(*known.errors(one)) for one in maps))
+    return row
+
+
+# The column of the map of the first start.
+FIRST = "first map"
+
+
+def hypothesis_table(rows: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return, for each kind of shape and of hypothesis, how many pairs have a right map, and only by this."""
+    kinds = [row["source"].split(": ", 1)[0] for row in rows]
+    found = {name: np.array([bool(int(row[name])) for row in rows]) for name in rows[0] if name in NAMES}
+    table = [["", "pairs", *found, "any"]]
+    for kind in (*dict.fromkeys(kinds), "all"):
+        own = np.array([kind in (of_row, "all") for of_row in kinds])
+        by_name = [own & right for right in found.values()]
+        table.append(
+            [kind, str(own.sum()), *(str(right.sum()) for right in (*by_name, np.any(by_name, axis=0)))]
+        )
+    number = np.sum(list(found.values()), axis=0)
+    table.append(["only this", "", *(str(np.sum(right & (number == 1))) for right in found.values()), ""])
+    return table
+
+
+# The columns of `hypotheses.csv` that tell which maps are right.
+NAMES = (FIRST, *(kind.__name__ for kind in HYPOTHESES))
+
+
 def tables(results: Sequence[Judged]) -> str:
     """Return the results of each kind, and the reliability of the probabilities."""
     rows = count_table(results, "right among four")
@@ -97,8 +153,16 @@ def draw(results: Sequence[Judged], file: Path) -> None:
 
 def main() -> None:
     parser = make_parser(__doc__, data="DATA_DIRECTORY", pairs=8, output="search", seed=True)
+    parser.add_argument("--hypotheses", action="store_true", help="compare the kinds of hypothesis")
     options = parser.parse_args()
     pairs = known_pairs(options.data, options.pairs, options.seed)
+    if options.hypotheses:
+        file = options.output / "hypotheses.csv"
+        rows = measure_pairs(file, pairs, lambda known: known.names, found_by_kinds).rows
+        text = f"{markdown(hypothesis_table(rows))}\n\n{made_with()}\n"
+        print(text)
+        write_text(options.output / "hypotheses.md", text)
+        return
     journal = measure_pairs(options.output / "pairs.csv", pairs, lambda known: known.names, judged)
     results = [read(row) for row in journal.rows]
     text = tables(results)

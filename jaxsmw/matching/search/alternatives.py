@@ -25,7 +25,8 @@ class Alternative(NamedTuple):
 
     - `pointwise_map`: T: X -> Y (m,), int64, as 0-based vertices of Y.
     - `probability`: the probability that this map is right, from 0 to 1.
-    - `difference`: in what it differs from the chosen map, such as `"mirrored"` or `"turned by 180°"`.
+    - `difference`: in what it differs from the chosen map, such as `"mirrored"` or `"turned by 180° about the
+      axis (0.0, 0.0, 1.0) of the target"`.
     """
 
     pointwise_map: Int64[np.ndarray, " m"]
@@ -62,6 +63,9 @@ def difference(best: Judged, other: Judged) -> str:
     turn = rigid_fit(placed, elsewhere, areas)
     left, apart = (areas @ ((points - elsewhere) ** 2).sum(axis=1) for points in (turn.apply(placed), placed))
     if left < _TURNED * apart:
-        angle = np.rad2deg(Rotation.from_matrix(turn.rotation).magnitude())
-        return f"turned by {angle:.0f}°"
+        vector = Rotation.from_matrix(turn.rotation).as_rotvec(degrees=True)
+        angle = np.linalg.norm(vector)
+        # Zero is added because -0.0 + 0.0 is 0.0.
+        axis = ", ".join(f"{part:.1f}" for part in np.round(vector / max(angle, 1e-9), 1) + 0.0)
+        return f"turned by {angle:.0f}° about the axis ({axis}) of the target"
     return f"different on {first.difference(*matches):.0%} of the source"

@@ -19,6 +19,9 @@ from jaxsmw.matching.search.fitting import features, fits
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
+Hypothesis = Callable[[Reading], Iterator[SampleMap]]
+"""A kind of hypothesis: a function from a reading to maps of samples."""
+
 # The sets of radii of SHOT, in units of 0.06, that give one hypothesis each.
 _SHOT_RADII = ((1,), (1, 2, 4), (2, 4), (4, 8))
 # The weights of positions after an alignment, of positions along principal axes, and of the relative
@@ -106,7 +109,7 @@ def by_fits(reading: Reading) -> Iterator[SampleMap]:
         yield KDTree(database).query(queries)[1]
 
 
-HYPOTHESES: tuple[Callable[[Reading], Iterator[SampleMap]], ...] = (
+HYPOTHESES: tuple[Hypothesis, ...] = (
     by_descriptors,
     by_alignment,
     by_given_positions,

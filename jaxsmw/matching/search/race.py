@@ -18,7 +18,7 @@ from jaxsmw.matching.executor import run_all
 from jaxsmw.matching.judge import discontinuous_parts, orientation_reversal
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.search.evidence import Evidence
-from jaxsmw.matching.search.hypotheses import HYPOTHESES
+from jaxsmw.matching.search.hypotheses import HYPOTHESES, Hypothesis
 from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
@@ -56,16 +56,18 @@ class Candidate:
 Kind = TypeVar("Kind", bound=Candidate)
 
 
-def race(readings: Sequence[Reading], known: Iterable[Candidate], hypotheses: bool = True) -> list[Candidate]:
+def race(
+    readings: Sequence[Reading], known: Iterable[Candidate], hypotheses: Sequence[Hypothesis] = HYPOTHESES
+) -> list[Candidate]:
     """Refine maps of samples together, and return different maps, the best first.
 
     **Arguments:**
 
     - `readings`: the readings of the pair.
     - `known`: known maps of samples.
-    - `hypotheses`: whether all hypotheses of all readings are refined as well.
+    - `hypotheses`: the kinds of hypothesis that are refined as well, for each reading.
     """
-    starts = [task for reading in readings if hypotheses for task in _hypotheses(reading)]
+    starts = [task for reading in readings for task in _hypotheses(reading, hypotheses)]
     found = _refined([*starts, *(_Task(one.reading, one.matches) for one in known)])
     moved: list[Candidate] = []
     for _ in range(_ROUNDS):
@@ -110,8 +112,8 @@ class _Task(NamedTuple):
     excluded: Bool[np.ndarray, " s"] | None = None
 
 
-def _hypotheses(reading: Reading) -> Iterator[_Task]:
-    for hypothesis in HYPOTHESES:
+def _hypotheses(reading: Reading, hypotheses: Sequence[Hypothesis] = HYPOTHESES) -> Iterator[_Task]:
+    for hypothesis in hypotheses:
         with suppress(InputError):  # the samples can be too sparse for SHOT of this radius
             for matches in hypothesis(reading):
                 yield _Task(reading, matches)

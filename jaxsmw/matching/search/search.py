@@ -23,6 +23,7 @@ from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probabilities
+from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import Candidate, Kind, different, race
 from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.settings import SearchSettings
@@ -119,16 +120,12 @@ def search(
     # nearly its own mirror image, such as a person, needs no second hand: its left stays its left.
     both_hands = hypotheses and mirror == "auto" and reading.is_asymmetric()
     certain = _ends_the_search(first, settings) and not both_hands
-    readings = [reading]
-    if hypotheses and not certain:
-        readings += [part.with_first(first.pointwise_map) for part in _as_parts(reading)]
-    if both_hands:
-        readings = [hand for one in readings for hand in (one, one.mirror())]
+    readings = readings_of(reading, both_hands) if hypotheses and not certain else [reading]
     for number in range(_ROUNDS):
         if certain:
             break
         logger.info("the map is uncertain, so other maps are tried ...")
-        candidates = race(readings, judged, hypotheses and number == 0)
+        candidates = race(readings, judged, HYPOTHESES if hypotheses and number == 0 else ())
         # A twin can be better if it reads the pair in another way.
         new = [one for one in different([*judged, *candidates]) if one not in judged]
         likely = _likely(new, settings)
@@ -178,6 +175,12 @@ def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
     return [maps[number] for number in order if shares[number] >= settings.likely * shares[order[0]]]
 
 
+def readings_of(reading: Reading, both_hands: bool) -> list[Reading]:
+    """Return a reading, and those with a shape as a part of the other. Both hands double them."""
+    readings = [reading, *_as_parts(reading)]
+    return [hand for one in readings for hand in (one, one.mirror())] if both_hands else readings
+
+
 def _as_parts(reading: Reading) -> Iterator[Reading]:
     """Yield the readings in which one of two shapes that were called full is a part of the other.
 
@@ -195,7 +198,7 @@ def _as_parts(reading: Reading) -> Iterator[Reading]:
                 part = Pair.make(*pair.meshes, partial=True, scale=scale)
             if all(abs(np.log(part.scale / other)) > _SAME_SCALE for other in known):
                 known.append(part.scale)
-                yield Reading.of(prepared.as_part(part))
+                yield replace(Reading.of(prepared.as_part(part)), first=reading.first)
         except InputError:  # no scale can be estimated, or the closed mesh is the smaller one
             continue
 
