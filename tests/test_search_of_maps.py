@@ -14,6 +14,7 @@ from synthetic import body_with_arms, bumpy_mesh, mean_error
 import jaxsmw
 from jaxsmw import Mesh, creature_pair, make_mesh, match
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.creature import creature
 from jaxsmw.geometry.sampling import SurfaceSamples
 from jaxsmw.geometry.shot import mirrored_descriptors, shot_descriptors
 from jaxsmw.matching.advice import advice
@@ -452,6 +453,14 @@ def test_a_mirrored_result_is_in_terms_of_the_source():
 @pytest.mark.sampled
 def test_evidence_of_hands_has_opposite_signs_for_opposite_hands(lump):
     assert hand_evidence(read(lump, turned(lump.mirrored()))) > 0 > hand_evidence(read(lump, turned(lump)))
+
+
+def test_the_mirror_image_of_a_symmetric_body_exchanges_left_and_right():
+    # The identity preserves all lengths as well, but reverses the orientation.
+    body = creature("mammal", vertices=800)
+    found = match(body, body, mirror="yes")
+    offsets = body.vertices[found.pointwise_map] - body.vertices * [-1, 1, 1]
+    assert np.linalg.norm(offsets, axis=1).mean() < 0.05 * body.area**0.5 and not found.suspicious
 
 
 def test_asymmetric_shapes_are_compared_in_both_hands(pair, lump):
