@@ -15,6 +15,7 @@ import re
 import tempfile
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,9 +31,10 @@ from scipy.spatial.transform import Rotation
 
 import jaxsmw
 from jaxsmw.choices import Axis
+from jaxsmw.collection import asymmetry, mirror_points
 from jaxsmw.creature import creature
 from jaxsmw.report.colors import position_colors
-from jaxsmw.report.figures import draw_correspondence, draw_mesh
+from jaxsmw.report.figures import draw_correspondence, draw_mesh, draw_values
 from jaxsmw.runtime.files import atomic_write
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -246,6 +248,25 @@ def draw_another_kind() -> None:
     draw_side_by_side("failure_another_kind", panels)
 
 
+def draw_asymmetry() -> None:
+    """Draw the directional and the fluctuating asymmetry of five synthetic animals."""
+    meshes = [creature("mammal", vertices=1500 + 20 * seed, seed=seed) for seed in range(5)]
+    collection = jaxsmw.match_collection(meshes, mirror="no")
+    template = meshes[collection.template]
+    points = mirror_points(template)
+    shapes = [one.vertices for one in collection.registered]
+    counterparts = [points.interpolate(shape, template) for shape in shapes]
+    found = asymmetry(shapes, counterparts, weights=template.vertex_areas)
+    mean = replace(template, vertices=found.symmetric.mean(axis=0), name="mean of both sides")
+    panels = {
+        "Directional asymmetry": np.linalg.norm(found.directional, axis=1),
+        "Fluctuating asymmetry": np.sqrt((found.fluctuating**2).sum(axis=2).mean(axis=0)),
+    }
+    save_small(
+        PICTURES / "asymmetry.png", picture_of(draw_values(mean, panels, "unit of the meshes", up="y"))
+    )
+
+
 def draw_without_search() -> None:
     """Match a collection by `paper` and by `accurate`, and draw its template and one other quadruped."""
     meshes = [creature("quadruped", vertices=800 + 20 * seed, seed=seed) for seed in range(5)]
@@ -301,7 +322,8 @@ def main() -> None:
         "--only",
         nargs="+",
         metavar="NAME",
-        help="draw only these: `tutorial`, `transfers`, `another_kind`, `collection`, or names of cases",
+        help="draw only these: `tutorial`, `transfers`, `another_kind`, `collection`, `asymmetry`, or names of "
+        "cases",
     )
     options = parser.parse_args()
     PICTURES.mkdir(exist_ok=True)
@@ -310,6 +332,7 @@ def main() -> None:
         ("transfers", draw_transfers),
         ("another_kind", draw_another_kind),
         ("collection", draw_without_search),
+        ("asymmetry", draw_asymmetry),
     ):
         if not options.only or name in options.only:
             draw()

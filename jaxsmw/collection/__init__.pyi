@@ -1,3 +1,4 @@
+from .bilateral import Asymmetry, asymmetry, mirror_points
 from .consistency import edge_errors
 from .graph import choose_edges, shape_distances
 from .hands import choose_hands
@@ -9,6 +10,7 @@ from .shapes import PreparedShape, prepare_collection
 from .synchronization import Network, synchronize
 
 __all__ = [
+    "Asymmetry",
     "Collection",
     "MatchedEdge",
     "Network",
@@ -16,11 +18,13 @@ __all__ = [
     "ProcrustesAlignment",
     "ShapeModel",
     "align",
+    "asymmetry",
     "choose_edges",
     "choose_hands",
     "edge_errors",
     "match_collection",
     "match_pairs",
+    "mirror_points",
     "prepare_collection",
     "shape_distances",
     "shape_model",

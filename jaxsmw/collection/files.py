@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 import os
@@ -25,7 +24,7 @@ from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.maps import write_pointwise_map
 from jaxsmw.io.mesh_data import MeshData
 from jaxsmw.io.meshes import write_mesh_data
-from jaxsmw.runtime.files import atomic_write, check_writable, make_directory
+from jaxsmw.runtime.files import atomic_write, check_writable, make_directory, write_csv
 from jaxsmw.transfer.attributes import registered_data, transfer_attributes
 from jaxsmw.transfer.landmarks import transfer_landmarks
 
@@ -130,14 +129,9 @@ def write_model(collection: Collection, model: ShapeModel, directory: Path, suff
             matrices=motion.scales[:, None, None] * motion.rotations * collection.signs[:, None, :],
             translations=motion.translations,
         )
-    with (
-        atomic_write(directory / "scores.csv") as temporary,
-        temporary.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file,
-    ):
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["mesh", *(f"mode_{number + 1}" for number in range(len(model.modes)))])
-        for name, scores in zip(collection.names, model.scores, strict=True):
-            writer.writerow([name, *map(repr, scores.tolist())])
+    rows = [["mesh", *(f"mode_{number + 1}" for number in range(len(model.modes)))]]
+    rows += [[name, *scores] for name, scores in zip(collection.names, model.scores.tolist(), strict=True)]
+    write_csv(directory / "scores.csv", rows)
     return [directory / f"mean{suffix}", directory / "modes.npz", directory / "scores.csv"]
 
 

@@ -103,7 +103,26 @@ def draw_correspondence(
     for name, values in checked.items():
         panels.append(_Panel(f"{name} on the source", shown_x, error_colors(values, error_limit)))
     figure = _draw_panels(panels, azimuth, right_margin=_SCALE_WIDTH)
-    _draw_error_scale(figure, error_limit, any(np.isnan(values).any() for values in checked.values()))
+    _draw_scale(figure, error_limit, "error (fraction of √area)")
+    if any(np.isnan(values).any() for values in checked.values()):
+        _draw_unknown(figure)
+    return figure
+
+
+def draw_values(
+    mesh: Mesh, values: Mapping[str, Float64[np.ndarray, " n"]], unit: str, *, up: Axis | None = None
+) -> Figure:
+    """Draw non-negative values at the n vertices of a mesh as colours, in one panel for each name.
+
+    The scale ends at the largest of the 98th percentiles. The label of the scale is `unit`. `up` is the axis
+    that points up, as in `draw_correspondence`.
+    """
+    limit = max(float(np.quantile(of_panel, 0.98)) for of_panel in values.values())
+    limit = float(f"{limit:.1g}") or 1.0
+    shown = stand(mesh, up)
+    panels = [_Panel(name, shown, error_colors(of_panel, limit)) for name, of_panel in values.items()]
+    figure = _draw_panels(panels, None, right_margin=_SCALE_WIDTH)
+    _draw_scale(figure, limit, unit)
     return figure
 
 
@@ -493,11 +512,10 @@ def _fitting_names(paths: Sequence[str]) -> list[str]:
     return fitting
 
 
-def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
-    """Draw the colour bar of errors at the right edge, and the colour of unknown errors if there are some."""
+def _draw_scale(figure: Figure, limit: float, label: str) -> None:
+    """Draw the colour bar of `error_colors` at the right edge."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
-    from matplotlib.patches import Patch
 
     colors = ListedColormap(error_colors(np.linspace(0, 1, 256), 1.0))
     width = _DPI * figure.get_figwidth()
@@ -505,13 +523,18 @@ def _draw_error_scale(figure: Figure, limit: float, has_unknown: bool) -> None:
     ticks = np.linspace(0, limit, 6)
     scale = figure.colorbar(ScalarMappable(Normalize(0, limit), colors), cax=axes, extend="max", ticks=ticks)
     scale.ax.set_yticklabels([*(f"{tick:g}" for tick in ticks[:-1]), f"{limit:g} and\nabove"])
-    scale.set_label("error (fraction of √area)", fontsize=7.5, color=FAINT)
+    scale.set_label(label, fontsize=7.5, color=FAINT)
     scale.outline.set_visible(False)
     style_axes(axes)
-    if has_unknown:
-        unknown = Patch(facecolor=PLAIN.tolist(), label="unknown")
-        place = (1 - (_SCALE_WIDTH + 10) / width, 0.16)
-        figure.legend(handles=[unknown], loc="upper left", bbox_to_anchor=place, frameon=False, fontsize=8)
+
+
+def _draw_unknown(figure: Figure) -> None:
+    """Draw the colour of unknown values below the colour bar."""
+    from matplotlib.patches import Patch
+
+    unknown = Patch(facecolor=PLAIN.tolist(), label="unknown")
+    place = (1 - (_SCALE_WIDTH + 10) / (_DPI * figure.get_figwidth()), 0.16)
+    figure.legend(handles=[unknown], loc="upper left", bbox_to_anchor=place, frameon=False, fontsize=8)
 
 
 def new_figure(width: float, height: float, *, plot: bool = False) -> Figure:

@@ -6,12 +6,13 @@ from those of living ones, and python-atomicwrites is no longer maintained.
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import stat
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -113,6 +114,15 @@ def atomic_write(path: FilePath) -> Iterator[Path]:
 _unfinished: set[Path] = set()
 # The directories from which this process has removed leftovers.
 _without_leftovers: set[Path] = set()
+
+
+def write_csv(path: FilePath, rows: Iterable[Iterable[object]]) -> None:
+    """Write rows as a CSV file, all of it or nothing. Floats keep all digits."""
+    with (
+        atomic_write(path) as temporary,
+        temporary.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file,
+    ):
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 def _create_locked(temporary: Path) -> int | None:
