@@ -322,8 +322,8 @@ def main() -> None:
         "--only",
         nargs="+",
         metavar="NAME",
-        help="draw only these: `tutorial`, `transfers`, `another_kind`, `collection`, `asymmetry`, or names of "
-        "cases",
+        help="draw only these: `tutorial`, `transfers`, `another_kind`, `collection`, `asymmetry`, or names "
+        "of cases",
     )
     options = parser.parse_args()
     PICTURES.mkdir(exist_ok=True)
