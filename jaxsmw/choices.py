@@ -11,7 +11,7 @@ PresetName = Literal["fast", "paper", "accurate"]
 """The names of the presets; see `jaxsmw.PRESETS`."""
 DEFAULT_PRESET: PresetName = "accurate"
 
-InitialMap = Literal["shot", "wks", "hks", "wavelet", "functional", "aligned"]
+InitialMap = Literal["shot", "wks", "hks", "wavelet", "functional", "aligned", "positions"]
 """The names of the initial maps; see `jaxsmw.initial_map`."""
 DEFAULT_INITIAL_MAP: InitialMap = "shot"
 MatchInit = Literal["auto", InitialMap]

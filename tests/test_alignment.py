@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import bumpy_mesh
+from synthetic import bumpy_mesh, sphere_mesh
 
 from jaxsmw import Pair, initial_map, make_mesh, match, paired_spectra
 from jaxsmw.geometry.alignment import align_rigidly
@@ -46,6 +46,32 @@ def test_the_initial_map_of_a_moved_copy_is_right(partial):
     pair = Pair.make(LUMP, target, partial=partial)
     spectra = paired_spectra(pair, 20)
     np.testing.assert_array_equal(initial_map(pair, *spectra, init="aligned"), order)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e5])
+def test_aligned_meshes_are_matched_by_their_positions(offset):
+    """A sphere looks the same from all sides, so only the positions tell which point is which."""
+    ball = make_mesh(*sphere_mesh(3))
+    order = np.random.default_rng(0).permutation(len(ball.vertices))
+    vertices = np.empty_like(ball.vertices)
+    vertices[order] = 1.05 * ball.vertices + offset
+    source = make_mesh(ball.vertices + offset, ball.faces)
+    found = match(source, make_mesh(vertices, order[ball.faces]), init="positions")
+    np.testing.assert_array_equal(found.initial_map, order)
+    far = np.linalg.norm(ball.vertices - ball.vertices[np.argsort(order)[found.pointwise_map]], axis=1)
+    assert far.mean() < 0.1 and not found.mirrored
+
+
+def test_positions_keep_the_sides_of_a_thin_sheet_apart():
+    """The positions of the sides are nearer to each other than to their counterparts on the moved sheet."""
+    ball = make_mesh(*sphere_mesh(3))
+    thin = make_mesh(ball.vertices * [1, 1, 0.01], ball.faces)
+    moved = make_mesh(thin.vertices + np.array([0, 0, 0.03]), thin.faces)
+    pair = Pair.make(thin, moved)
+    found = initial_map(pair, *paired_spectra(pair, 20), init="positions")
+    inside = np.abs(thin.vertices[:, 2]) > 0.005
+    same_side = thin.vertices[found, 2] * thin.vertices[:, 2] > 0
+    assert same_side[inside].all()
 
 
 def test_mirrored_shapes_are_aligned_as_their_mirror_images():

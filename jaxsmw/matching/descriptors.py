@@ -20,6 +20,8 @@ from jaxsmw.runtime.threads import one_blas_thread, side_by_side
 # On meshes with at least `FINE_FROM` vertices, a neighbourhood of the smaller radius contains at least about
 # ten vertices.
 FINE_FROM, FINE_RADIUS = 2000, 2 / 3 * SHOT_RADIUS
+# Rows do not vary along axes whose variance is a smaller share of the largest variance, except for rounding.
+_LEAST_VARIANCE = 1e-12
 # So many centred rows stay in the processor's cache.
 _ROWS_PER_PRODUCT = 1000
 
@@ -34,7 +36,8 @@ class PrincipalAxes(NamedTuple):
 
     - `mean`: the weighted mean of the rows (c,), in the unit of the rows.
     - `axes`: the axes (c, d), in order of decreasing variance. Each axis is divided by the standard deviation
-      of the rows along the axis, so its unit is the inverse unit of the rows.
+      of the rows along the axis, so its unit is the inverse unit of the rows. An axis is zero if the rows do
+      not vary along it.
     """
 
     mean: Float[np.ndarray, " c"]
@@ -68,8 +71,11 @@ class PrincipalAxes(NamedTuple):
             variances, directions = scipy.linalg.eigh(
                 covariance, subset_by_index=[last - number + 1, last], overwrite_a=True, check_finite=False
             )
-        scale = np.sqrt(np.maximum(variances[::-1], np.finfo(np.float64).tiny))
-        return cls(origin + mean, directions[:, ::-1] / scale)
+        # All points of a sphere have nearly equal rows. Axes along which rows do not vary become zero.
+        least = max(_LEAST_VARIANCE * variances[-1], np.finfo(np.float32).tiny)
+        deviations = np.sqrt(np.maximum(variances, least))
+        axes = np.where(variances > least, directions / deviations, 0)
+        return cls(origin + mean, axes[:, ::-1])
 
     def components(self, values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d"]:
         """Return the principal components of rows (n, c), in the type of the rows."""

@@ -85,9 +85,10 @@ def match(
 
         - `"auto"` (the default): `"shot"`. If its map is uncertain and the preset has a search, many other
           initial maps are tried; see docs/how_it_works.md.
-        - `"shot"`, `"wks"`, `"hks"`, `"wavelet"`, `"functional"`, `"aligned"`, a given map (m,) or landmarks
-          (l, 2): see `initial_map`. No other initial maps are tried. `"functional"` is smoother than `"shot"`
-          and has smaller errors, but after refinement, the map often has larger errors (docs/results.md).
+        - `"shot"`, `"wks"`, `"hks"`, `"wavelet"`, `"functional"`, `"aligned"`, `"positions"`, a given map
+          (m,) or landmarks (l, 2): see `initial_map`. No other initial maps are tried. `"functional"` is
+          smoother than `"shot"` and has smaller errors, but after refinement, the map often has larger errors
+          (docs/results.md).
 
     - `laplacian`, `eigensolver`: see `compute_spectrum`. `"auto"` chooses `"approximate"` for both meshes if
       one mesh has at least 50 000 referenced vertices, else `"exact"`.

@@ -26,6 +26,8 @@ from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, c
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
+from jaxsmw.matching.search.fitting import features
+from jaxsmw.matching.shape import PreparedShape
 
 INITIAL_MAPS: tuple[InitialMap, ...] = get_args(InitialMap)
 """The names of the initial maps."""
@@ -57,6 +59,8 @@ def initial_map(
           the Laplacian.
         - `"aligned"`: nearest neighbours in SHOT descriptors and in space, after X was scaled to the area of
           Y and aligned rigidly. Use this map for rigid shapes such as teeth and bones.
+        - `"positions"`: nearest neighbours in the given positions and in normals, for meshes that are already
+          aligned in one frame, in the same unit of length.
         - an integer array (m,): a given pointwise map, as 0-based vertices of Y.
         - a `SurfacePoints` with m points on Y: a map to points on faces. Each point is replaced by the
           nearest corner of its face.
@@ -125,9 +129,9 @@ _Features = tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]
 """Features of X (a, d) and of Y (b, d), with one row per compared vertex."""
 
 
-def _finite(prepared: PreparedPair, name: str, features: _Features) -> _Features:
-    if all(np.isfinite(of_shape).all() for of_shape in features):
-        return features
+def _finite(prepared: PreparedPair, name: str, compared: _Features) -> _Features:
+    if all(np.isfinite(of_shape).all() for of_shape in compared):
+        return compared
     raise InputError(
         f"{prepared.pair.name}: {name} descriptors are not defined on these meshes with "
         f"{len(prepared.x.spectrum.eigenvalues)} eigenvectors: compute more eigenvectors, or choose another "
@@ -218,6 +222,19 @@ def _aligned_features(prepared: PreparedPair) -> _Features:
     return of_x, of_y
 
 
+def _given_positions(prepared: PreparedPair) -> _Features:
+    """Return the given positions and normals, for meshes that lie in one frame."""
+    _, unit = prepared.pair.units_of_length
+
+    def placed(shape: PreparedShape) -> Float[np.ndarray, "a 6"]:
+        outward = -1 if shape.mesh.is_inside_out else 1
+        # Positions far from the origin would have rounding errors in float32.
+        positions = (shape.mesh.vertices - prepared.y.mesh.middle) / unit
+        return shape.at_compared(features(positions, outward * shape.mesh.vertex_normals))
+
+    return placed(prepared.x), placed(prepared.y)
+
+
 METHODS: dict[InitialMap, Callable[[PreparedPair], _Features]] = {
     "shot": _shot_features,
     "wks": partial(_signature_features, wave_kernel_signature),
@@ -225,6 +242,7 @@ METHODS: dict[InitialMap, Callable[[PreparedPair], _Features]] = {
     "wavelet": partial(_signature_features, wavelet_signature),
     "functional": _functional_features,
     "aligned": _aligned_features,
+    "positions": _given_positions,
 }
 """A dictionary from the name of each initial map to the function that computes its features.
 
@@ -242,13 +260,13 @@ _ELSEWHERE = 100.0
 
 def _landmark_features(prepared: PreparedPair, landmarks: Int[np.ndarray, "l 2"]) -> _Features:
     """Append the weighted geodesic distances to all landmarks to SHOT."""
-    features = []
+    both = []
     units = prepared.pair.units_of_length
     for shape, vertices, unit, shot in zip(prepared.shapes, landmarks.T, units, prepared.shot, strict=True):
         distances = geodesic_distances(shape.mesh, vertices.astype(np.int64)).T / unit
         distances = _LANDMARK_WEIGHT * np.where(np.isfinite(distances), distances, _ELSEWHERE)
-        features.append(np.hstack([shot, shape.at_compared(distances)]))
-    return features[0], features[1]
+        both.append(np.hstack([shot, shape.at_compared(distances)]))
+    return both[0], both[1]
 
 
 def _check_landmarks(pair: Pair, landmarks: np.ndarray) -> None:
@@ -306,14 +324,14 @@ def check_nearest(
         )
 
 
-def nearest_map(prepared: PreparedPair, features: _Features) -> Int64[np.ndarray, " m"]:
+def nearest_map(prepared: PreparedPair, compared: _Features) -> Int64[np.ndarray, " m"]:
     """Compute a pointwise map of all vertices of X (m,) by nearest-neighbour search in feature space.
 
     **Raises:** `ArithmeticError` if the search is wrong; see `check_nearest`.
     """
     x, y = prepared.shapes
     dtype, mask = y.spectrum.eigenvectors.dtype, np.asarray(y.compared_spectrum.mask)
-    of_x, of_y = (of_shape.astype(dtype) for of_shape in features)
+    of_x, of_y = (of_shape.astype(dtype) for of_shape in compared)
     xp = namespace(y.spectrum.eigenvectors)
     nearest = np.asarray(nearest_neighbor(xp.asarray(of_x), xp.asarray(of_y), database_mask=mask), np.int64)
     check_nearest(of_x, of_y, np.flatnonzero(mask), nearest)
