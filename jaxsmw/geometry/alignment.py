@@ -26,9 +26,18 @@ _MOVED_FIRST = 500
 _DIFFERENT = 0.25
 # The distance of the points on normals from the surface, in units of length.
 _THICKNESS = 0.1
+# The weight of unit normals beside positions in oriented points, in units of length.
+NORMAL_WEIGHT = 0.1
 # A rotation is nearly ambiguous if `divisor` is at most `_AMBIGUOUS`. Otherwise, Newton's method for the
 # trace converges in 4 to 14 steps, and the error of the rotation is below 1e-10.
 _NEWTON_STEPS, _AMBIGUOUS = 16, 1e-3
+
+
+def oriented_points(
+    positions: Float64[np.ndarray, "p 3"], normals: Float64[np.ndarray, "p 3"]
+) -> Float64[np.ndarray, "p 6"]:
+    """Return coordinates in which points are near if their positions and their normals are near."""
+    return np.hstack([positions, NORMAL_WEIGHT * normals])
 
 
 class Alignment(NamedTuple):

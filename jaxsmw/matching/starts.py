@@ -18,7 +18,7 @@ from jaxsmw.core.search import nearest_neighbor
 from jaxsmw.core.signatures import heat_kernel_signature, wave_kernel_signature, wavelet_signature
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.alignment import align_rigidly
+from jaxsmw.geometry.alignment import align_rigidly, oriented_points
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.sampling import poisson_disk_samples
@@ -26,7 +26,6 @@ from jaxsmw.geometry.surface_points import SurfacePoints, check_pointwise_map, c
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.search.fitting import features
 from jaxsmw.matching.shape import PreparedShape
 
 INITIAL_MAPS: tuple[InitialMap, ...] = get_args(InitialMap)
@@ -230,7 +229,7 @@ def _given_positions(prepared: PreparedPair) -> _Features:
         outward = -1 if shape.mesh.is_inside_out else 1
         # Positions far from the origin would have rounding errors in float32.
         positions = (shape.mesh.vertices - prepared.y.mesh.middle) / unit
-        return shape.at_compared(features(positions, outward * shape.mesh.vertex_normals))
+        return shape.at_compared(oriented_points(positions, outward * shape.mesh.vertex_normals))
 
     return placed(prepared.x), placed(prepared.y)
 

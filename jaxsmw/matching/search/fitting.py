@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from jaxsmw.geometry.alignment import PatchMotions, patch_motions
+from jaxsmw.geometry.alignment import NORMAL_WEIGHT, PatchMotions, oriented_points, patch_motions
 from jaxsmw.geometry.currents import Oriented, overlapping_alignments
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.matching.search.proxies import Proxy
@@ -28,8 +28,6 @@ _JUDGED = 0.2
 # Matches have a weight that falls with their distance. The tolerance falls from the first number by this
 # factor in each iteration, down to the last number.
 _TOLERANCES = np.maximum(0.15 * 0.88 ** np.arange(len(_ROUGH) + len(_FINE)), 0.05)
-# The weight of normals beside positions.
-_NORMALS = 0.1
 # The weight of a match at a boundary, where parts without a counterpart gather, and of the present position.
 _AT_BOUNDARY, _PRESENT = 0.1, 0.03
 # This number is added to the two terms of the cost of a fit.
@@ -49,7 +47,7 @@ class Fit(NamedTuple):
     @property
     def features(self) -> Float[np.ndarray, "s 6"]:
         """The coordinates in which nearest points are matched."""
-        return features(self.positions, self.normals)
+        return oriented_points(self.positions, self.normals)
 
 
 def fits(moving: Proxy, fixed: Proxy, *, thorough: bool = True) -> Iterator[Fit]:
@@ -133,7 +131,7 @@ class _Fitting:
         areas, self.fixed_areas = (side.areas * side.mesh.area / side.unit**2 for side in (moving, fixed))
         self.areas = np.bincount(nearest, areas, len(self.rows))
         self.on_boundary = np.bincount(nearest, moving.on_boundary, len(self.rows)) > 0
-        self.features = features(fixed.positions, fixed.normals)
+        self.features = oriented_points(fixed.positions, fixed.normals)
         self.fixed_features = self.features.astype(np.float32)
         among_moved = moving.distances[np.ix_(self.rows, self.rows)]
         self.patches = {radius: _patches(among_moved, self.areas, radius) for radius in {*_ROUGH, *_FINE}}
@@ -181,7 +179,7 @@ class _Fitting:
         goals = (pulled / total).T
         shares = self.patches[radius] * (total / self.areas)
         shares /= shares.sum(axis=1, keepdims=True)
-        return patch_motions(shares, self.positions, self.normals, goals[:, :3], goals[:, 3:] / _NORMALS)
+        return patch_motions(shares, self.positions, self.normals, goals[:, :3], goals[:, 3:] / NORMAL_WEIGHT)
 
     def _cost(self, fit: Fit) -> float:
         """Return the logarithms of the mean deformation of patches and of the mean distance, added."""
@@ -192,13 +190,6 @@ class _Fitting:
         motions = patch_motions(self.patches[_JUDGED], self.positions, self.normals, *goals)
         distance = shares @ np.minimum(far, _FAR)
         return float(np.log(shares @ motions.deformations + _LEAST) + np.log(distance + _LEAST))
-
-
-def features(
-    positions: Float[np.ndarray, "s 3"], normals: Float[np.ndarray, "s 3"]
-) -> Float[np.ndarray, "s 6"]:
-    """Return coordinates in which near points with similar normals are near."""
-    return np.hstack([positions, _NORMALS * normals])
 
 
 def _moved(

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int64
 from scipy.spatial import KDTree
 
-from jaxsmw.geometry.alignment import alignments
-from jaxsmw.matching.search.fitting import features, fits
+from jaxsmw.geometry.alignment import alignments, oriented_points
+from jaxsmw.matching.search.fitting import fits
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
@@ -103,7 +103,7 @@ def by_fits(reading: Reading) -> Iterator[SampleMap]:
     if not pair.partial:
         return
     moving, fixed = (y, x) if pair.source_is_whole else (x, y)
-    of_fixed = features(fixed.positions, fixed.normals)
+    of_fixed = oriented_points(fixed.positions, fixed.normals)
     for fit in fits(moving, fixed):
         queries, database = (fit.features, of_fixed) if moving is x else (of_fixed, fit.features)
         yield KDTree(database).query(queries)[1]
