@@ -23,7 +23,7 @@ from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.alternatives import alternatives
-from jaxsmw.matching.search.evidence import Evidence, deformation, discontinuity, probabilities
+from jaxsmw.matching.search.evidence import Evidence, deformation, discontinuity, probabilities, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, race
 from jaxsmw.matching.search.reading import Reading
@@ -205,11 +205,11 @@ def test_different_maps_share_the_probability_of_the_best_one():
 
 
 def test_of_equal_maps_the_more_consistent_one_is_preferred():
-    first, second = probabilities([1.0, 1.0], [0.01, 0.02])
-    assert second < 1e-3 * first and first + second == pytest.approx(probabilities([1.0])[0])
-    np.testing.assert_allclose(probabilities([0.0, 0.0], [0.02, 0.02]), 1 / 4)
-    np.testing.assert_allclose(probabilities([0.0, -np.inf], [0.02, np.inf]), [1 / 2, 0])
-    assert probabilities([3.0, 2.0], [0.0, 0.0])[0] > probabilities([2.0])[0]  # both maps are exact
+    first, second = shares([1.0, 1.0], [0.02, 0.04])
+    assert second < 1e-3 * first and first + second == pytest.approx(1)
+    np.testing.assert_allclose(shares([0.0, 0.0], [0.02, 0.02]), 1 / 2)
+    np.testing.assert_allclose(shares([0.0, -np.inf], [0.02, np.inf]), [1, 0])
+    assert shares([3.0, 2.0], [0.0, 1e-3])[0] == shares([3.0, 2.0])[0]  # both maps are exact
 
 
 def test_maps_that_tear_a_surface_stretch_it(pair):
@@ -355,6 +355,25 @@ def test_a_certain_map_ends_the_search(pair, monkeypatch):
     assert found.log_odds < 0 and not raced and found.outcome.successful
 
 
+def test_only_the_chosen_map_is_refined_by_further_passes(pair, monkeypatch):
+    """Further passes make wrong maps nearly as good as the right one, so the shares are those before them."""
+    mesh_x, mesh_y, truth = pair
+    prepared = prepare(Pair.make(mesh_x, mesh_y), Sizes(60)).describe(30)
+    wrong = upside_down(mesh_x, truth)
+    monkeypatch.setattr(
+        "jaxsmw.matching.search.search.race", lambda readings, *_: [known_map(readings[0], wrong)]
+    )
+    settings = replace(SEARCH.search, certain=1.0, likely=0.0, coarse_from=9.0)
+    (best, *others), (same, *unchanged) = (
+        search(prepared, Start(truth), replace(SEARCH, search=one), outcome=Outcome(truth))
+        for one in (replace(settings, non_isometric=0.0), replace(settings, passes=0))
+    )
+    assert others and [one.share for one in others] == [one.share for one in unchanged]
+    assert best.share == same.share > 0.9 and not np.array_equal(best.pointwise_map, same.pointwise_map)
+    for one, other in zip(others, unchanged, strict=True):
+        np.testing.assert_array_equal(one.pointwise_map, other.pointwise_map)
+
+
 @pytest.mark.filterwarnings("ignore:.*neighbours within the SHOT radius:UserWarning")
 def test_readings_are_tried_only_where_they_are_possible(pair, lump, monkeypatch):
     mesh_x, mesh_y, _ = pair
@@ -479,8 +498,10 @@ def test_alternatives_tell_in_what_they_differ(lump):
     around = right[KDTree(lump.vertices).query(half)[1]]
     swapped = np.where(lump.vertices[:, 2] > 0.7, around, right)
     others = [judged(reading.mirror(), around), judged(reading, around), judged(reading, swapped)]
-    probability, described = alternatives(judged(reading, right), others)
+    others = [replace(one, share=0.01) for one in others]
+    probability, described = alternatives(replace(judged(reading, right), share=0.97), others)
     assert probability > 0.9
+    assert [other.probability for other in described] == pytest.approx([probability / 97] * 3)
     mirrored, rotated, partly = described
     assert mirrored.difference == "mirrored"
     told = re.fullmatch(r"turned by 180° about the axis \((.*)\) of the target", rotated.difference)

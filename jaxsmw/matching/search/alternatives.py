@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxsmw.geometry.alignment import rigid_fit
 from jaxsmw.geometry.mesh import extend_to_unreferenced
-from jaxsmw.matching.search.search import Judged, shares_of
+from jaxsmw.matching.search.evidence import probability
+from jaxsmw.matching.search.search import Judged
 
 # One map is another one, turned, if a rotation explains all but this share of the squared distances between
 # their matches.
@@ -36,14 +37,14 @@ class Alternative(NamedTuple):
 
 def alternatives(best: Judged, others: Sequence[Judged]) -> tuple[float, tuple[Alternative, ...]]:
     """Return the probability that the best map is right, and the other maps, the most probable first."""
-    first, *shares = shares_of([best, *others]).tolist()
-    return first, tuple(
+    any_right = probability(best.log_odds)
+    return best.share * any_right, tuple(
         Alternative(
             extend_to_unreferenced(other.reading.prepared.given.mesh_x, other.pointwise_map),
-            share,
+            other.share * any_right,
             difference(best, other),
         )
-        for other, share in zip(others, shares, strict=True)
+        for other in others
     )
 
 

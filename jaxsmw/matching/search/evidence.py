@@ -103,27 +103,38 @@ NO_EVIDENCE = Evidence(np.inf, in_place=False, discontinuity=1.0, uncovered=1.0,
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 
-def probabilities(
+def shares(
     log_odds: Sequence[float], inconsistencies: Sequence[float] | None = None
 ) -> Float[np.ndarray, " c"]:
-    """Return the probability of each of several different maps to be right, given the log-odds of each (c,).
+    """Return the probability of each of several different maps (c,) to be right, if one of them is.
 
-    The log-odds of the best map say how probable it is that one of the maps is right. This probability is
-    divided among the maps by a multinomial logistic model, in which differences of the log-odds count
+    The maps are compared by a multinomial logistic model, in which differences of the log-odds (c,) count
     `_CONTRAST` times, because maps of the same pair are easier to compare than maps of different pairs.
 
     If the inconsistencies of the maps are given (c,), more consistent maps are preferred. A map that
     exchanges two legs in opposite poses can deform patches less than the right map, but it stretches the
     surface between the legs.
     """
-    odds = np.asarray(log_odds, float)
-    if not np.isfinite(odds).any():
-        return np.zeros(len(odds))
-    preferences = odds
+    preferences = np.asarray(log_odds, float)
+    if not np.isfinite(preferences).any():
+        return np.zeros(len(preferences))
     if inconsistencies is not None:
-        preferences = odds + _INCONSISTENCY * np.log(np.maximum(inconsistencies, _CONSISTENT))
-    shares = np.exp(_CONTRAST * (preferences - preferences.max()))
-    return shares / shares.sum() / (1 + np.exp(-odds[preferences.argmax()]))
+        preferences = preferences + _INCONSISTENCY * np.log(np.maximum(inconsistencies, _CONSISTENT))
+    exponentials = np.exp(_CONTRAST * (preferences - preferences.max()))
+    return exponentials / exponentials.sum()
+
+
+def probability(log_odds: float) -> float:
+    """Return the probability with the given log-odds."""
+    return float(1 / (1 + np.exp(-log_odds)))
+
+
+def probabilities(log_odds: Sequence[float]) -> Float[np.ndarray, " c"]:
+    """Return the probability of each of several different maps to be right, given the log-odds of each (c,).
+
+    The log-odds of the best map say how probable it is that one of the maps is right.
+    """
+    return shares(log_odds) * probability(max(log_odds, default=0.0))
 
 
 def discontinuity(source: Proxy, target: Proxy, matches: SampleMap, areas: Float[np.ndarray, " s"]) -> float:

@@ -52,6 +52,10 @@ class Candidate:
         """The log-odds that the map is right."""
         return self.evidence.log_odds
 
+    def is_twin(self, other: Candidate) -> bool:
+        """Return whether the map differs from another one on less than 2 % of the area."""
+        return self.reading.difference(self.matches, other.matches) < DIFFERENT_AREA
+
 
 Kind = TypeVar("Kind", bound=Candidate)
 
@@ -95,11 +99,7 @@ def different(candidates: Sequence[Kind]) -> Iterator[Kind]:
     """Yield candidates that differ from all better ones, the best first."""
     yielded: list[Kind] = []
     for candidate in sorted(candidates, key=lambda candidate: -candidate.log_odds):
-        twins = (
-            candidate.reading.difference(candidate.matches, other.matches) < DIFFERENT_AREA
-            for other in yielded
-        )
-        if not any(twins):
+        if not any(candidate.is_twin(other) for other in yielded):
             yielded.append(candidate)
             yield candidate
 

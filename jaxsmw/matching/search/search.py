@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 
 from jaxsmw.choices import Mirror
 from jaxsmw.core.arrays import namespace
@@ -22,7 +22,7 @@ from jaxsmw.matching.judge import area_shape_difference, detours, distortion, st
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probabilities
+from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probabilities, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import Candidate, Kind, different, race
 from jaxsmw.matching.search.reading import Reading
@@ -43,10 +43,14 @@ _ROUNDS = 2
 class Judged(Candidate):
     """A map that was refined at all vertices, and the evidence for it.
 
-    **Attributes:** those of `Candidate`, and `outcome`, the `Outcome` of the stages.
+    **Attributes:** those of `Candidate`, and
+
+    - `outcome`: the `Outcome` of the stages.
+    - `share`: the probability that this map is right if one of the maps of the search is right.
     """
 
     outcome: Outcome
+    share: float = 1.0
 
     @classmethod
     def of(cls, reading: Reading, outcome: Outcome) -> Judged:
@@ -137,16 +141,15 @@ def search(
         refined = [_refined(one, preset) for one in likely]
         judged = list(different([*judged, *refined]))
         certain = _certain(judged, settings)
-    likely = _likely(judged, settings)
-    judged = list(different([_finished(one, preset) if one in likely else one for one in judged]))
-    shares = shares_of(judged)
-    return [judged[number] for number in np.argsort(-shares, kind="stable")]
-
-
-def shares_of(judged: Sequence[Judged]) -> Float[np.ndarray, " c"]:
-    """Return the probability of each of several different maps (c,) to be right."""
-    log_odds = [one.log_odds for one in judged]
-    return probabilities(log_odds, [one.inconsistency for one in judged] if len(judged) > 1 else None)
+    # Further passes make a wrong map nearly as good as the right one, so the decision comes first.
+    inconsistencies = [one.inconsistency for one in judged] if len(judged) > 1 else None
+    parts = shares([one.log_odds for one in judged], inconsistencies)
+    judged = [
+        replace(judged[number], share=float(parts[number])) for number in np.argsort(-parts, kind="stable")
+    ]
+    best = _finished(judged[0], preset)
+    others = [one for one in judged[1:] if not one.is_twin(best)]
+    return [replace(best, share=1.0 - sum(one.share for one in others)), *others]
 
 
 def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
@@ -170,9 +173,9 @@ def _certain(judged: Sequence[Judged], settings: SearchSettings) -> bool:
 
 def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
     """Return the most probable maps, the best first, if they are not much less probable than the best."""
-    shares = probabilities([one.log_odds for one in maps])
-    order = np.argsort(-shares, kind="stable")[: settings.finalists]
-    return [maps[number] for number in order if shares[number] >= settings.likely * shares[order[0]]]
+    parts = shares([one.log_odds for one in maps])
+    order = np.argsort(-parts, kind="stable")[: settings.finalists]
+    return [maps[number] for number in order if parts[number] >= settings.likely * parts[order[0]]]
 
 
 def readings_of(reading: Reading, both_hands: bool) -> list[Reading]:
