@@ -251,7 +251,7 @@ class Comparison:
         other method.
         """
         reference = self._checked(reference)
-        label = f"difference from {reference} (x 10⁻³ √area)"
+        label = f"difference from {reference} (×10⁻³ √area)"
         figure = draw_intervals(self.differences(reference), label)
         if path is not None:
             save_figure(path, figure)
