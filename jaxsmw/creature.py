@@ -588,7 +588,8 @@ def creature(kind: str = "quadruped", *, vertices: int = 5000, pose: str = "rest
       random changes of the pose.
 
     **Raises:** `InputError` for an unknown kind or pose, fewer than 500 vertices, a negative seed, or a seed
-    whose body intersects itself. No seed below 250 makes a body that intersects itself.
+    whose body intersects itself. No seed below 250 makes a quadruped, a biped or a dragon that intersects
+    itself.
     """
     _check(kind, vertices, seed)
     if pose not in CREATURES[kind]:

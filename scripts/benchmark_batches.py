@@ -1,12 +1,12 @@
 """Measures how many pairs per second a device refines, one by one and in batches.
 
-    python scripts/benchmark_batches.py [--quick] [--data FAUST_R] [--output DIR]
+    python scripts/benchmark_batches.py [--quick | --device] [--data FAUST_R] [--output DIR]
 
 - `paper`: three iterations for random pairs in float32. The candidates are a Python loop over `refine`,
   `jax.lax.map`, `jax.vmap` with several batch sizes, and `jaxsmw.refine_pairs`. The time of `refine_pairs`
   includes the transfer of initial maps and results.
 - `methods`: `jax.vmap` over pairs of random shapes, compared with the same pairs one after the other, for
-  several refiners and solutions.
+  several refiners and solutions, and for `encode` by least squares.
 - `descriptors`: functional maps of 128 descriptors and the resolvent mask. One call for all linear systems is
   compared with one call per row of C, as in the loop of many programs, and with NumPy.
 - `accurate`: all stages of the preset `"accurate"` in float32, without a search. The candidates are several
@@ -22,12 +22,17 @@ On an accelerator, the script also refines pairs of shapes on the CPU, and state
 which both devices give equal matches. The shapes are creatures or, with `--data`, people of the remeshed
 FAUST set. With `--data`, the script also states the errors of both devices' maps. The script writes the
 tables to `batches.md` and all numbers to `batches.json` in DIR.
+
+With `--device`, the script measures an accelerator that is available only for a short time: `paper` with 100
+and 128 eigenvectors, the agreement with the CPU, and `accurate`. The script prints each table when it is
+measured, and ends after less than four minutes, even if tables are missing.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -48,6 +53,7 @@ from jaxtyping import Array, Int
 from jaxsmw.benchmark.datasets import open_data_set
 from jaxsmw.collection.pairs import match_pairs, prepare_task
 from jaxsmw.collection.shapes import prepare_collection
+from jaxsmw.core.functional_map import encode
 from jaxsmw.core.refinement import Refinement, refine
 from jaxsmw.core.refiner import Refiner
 from jaxsmw.core.refiners.feature_regression import FeatureRegression
@@ -74,8 +80,16 @@ Pair = tuple[Spectrum, Spectrum, Int[Array, " m"]]
 PRODUCTS = 16
 # Products with less than this share of all operations are left out of the floor.
 NEGLIGIBLE = 1e-3
-# The number of shapes, and the number of pairs that the CPU refines for comparison.
-SHAPES, COMPARED = 10, 20
+# The settings of `--device`.
+DEVICE = {
+    "only": ["paper", "agreement", "accurate"],
+    "eigenvectors": [100, 128],
+    "batch_sizes": [16, 64],
+    "repeats": 3,
+    "shapes": 9,
+    "compared": 4,
+    "seconds": 225.0,
+}
 
 
 class MatrixProduct(NamedTuple):
@@ -166,7 +180,13 @@ def random_spectrum(generator: np.random.Generator, n: int, k: int) -> Spectrum:
 
 def paper(options: argparse.Namespace) -> Iterator[Part]:
     """Yield the pairs per second of several ways to refine random pairs with the preset `"paper"`."""
-    n, k, count = options.vertices, options.eigenvectors, options.pairs
+    for k in options.eigenvectors:
+        yield paper_with(k, options)
+
+
+def paper_with(k: int, options: argparse.Namespace) -> Part:
+    """Return the pairs per second of several ways to refine random pairs with k eigenvectors."""
+    n, count = options.vertices, options.pairs
     generator = np.random.default_rng(0)
     shapes = [random_spectrum(generator, n, k) for _ in range(8)]
     pairs = [(i % 8, (i // 8 + i + 1) % 8) for i in range(count)]
@@ -193,14 +213,17 @@ def paper(options: argparse.Namespace) -> Iterator[Part]:
         },
         options.repeats,
     )
-    floor = time_of_products(matrix_products(refine_one, separate[0]), count, options.repeats)
+    products = matrix_products(refine_one, separate[0])
+    floor = time_of_products(products, count, options.repeats)
+    operations = 2 * sum(product.operations * times for product, times in products.items())
     header, *rows = rates(seconds, count, floor)
     table = [[*header, "program's memory, MiB"]]
     for name, *row in rows:
         table.append([name, *row, f"{memory[name] / 2**20:.0f}" if name in memory else "—"])
-    yield (
-        "Preset paper",
-        f"{count} pairs of shapes with {n} vertices each, k = {k}, {ITERATIONS} iterations, float32. The "
+    return (
+        f"Preset paper, k = {k}",
+        f"{count} pairs of shapes with {n} vertices each, {ITERATIONS} iterations, float32, on "
+        f"{jax.devices()[0].device_kind}. The products of one pair take {operations / 1e9:.3g} GFLOP. The "
         f"estimated memory of one pair with its arguments is {bytes_per_pair(n, n, k) / 2**20:.0f} MiB.",
         table,
         {"seconds": seconds, "products": floor, "memory": memory, "pairs": count},
@@ -209,7 +232,7 @@ def paper(options: argparse.Namespace) -> Iterator[Part]:
 
 def methods(options: argparse.Namespace) -> Iterator[Part]:
     """Yield the time of a batch by `jax.vmap`, relative to its pairs one after the other."""
-    n, k, count = options.vertices, options.eigenvectors, min(options.pairs, 8)
+    n, k, count = options.vertices, options.eigenvectors[0], min(options.pairs, 8)
     generator = np.random.default_rng(0)
 
     def random_shape() -> Spectrum:
@@ -233,9 +256,17 @@ def methods(options: argparse.Namespace) -> Iterator[Part]:
         "FeatureRegression": FeatureRegression(levels),
         "Registration": Registration(levels),
     }
+
+    def encoded(x: Spectrum, y: Spectrum, pointwise_map: Array) -> Array:
+        return jnp.asarray(encode(pointwise_map, x, y, pseudo_inverse="least_squares"))
+
+    calls: dict[str, Callable] = {
+        name: partial(refine, refiner=refiner, samples=samples, iterations=ITERATIONS)
+        for name, refiner in refiners.items()
+    }
+    calls["encode, least squares"] = encoded
     rows, measured = [["", "CPU ms per pair, one by one", "of this time in a batch"]], {}
-    for name, refiner in refiners.items():
-        call = partial(refine, refiner=refiner, samples=samples, iterations=ITERATIONS)
+    for name, call in calls.items():
         refine_one, refine_batch = (
             jax.jit(function, compiler_options=compiler_options()) for function in (call, jax.vmap(call))
         )
@@ -265,7 +296,7 @@ def descriptors(options: argparse.Namespace) -> Iterator[Part]:
     count, number = min(options.pairs, 4), 128
     generator = np.random.default_rng(0)
     names = ["a call per row", "NumPy, row by row", "a call per pair", "one call", "one call, with gradient"]
-    rows, measured = [["k", *(f"{name}, ms" for name in names)]], {}
+    rows, measured = [["k", *names]], {}
     for k in options.sizes:
         arrays = [jnp.asarray(generator.standard_normal((count, k, number)), jnp.float32) for _ in range(2)]
         gaps = generator.uniform(0.5, 1.5, (2, count, k))
@@ -331,12 +362,12 @@ def descriptors(options: argparse.Namespace) -> Iterator[Part]:
         difference = np.max(np.abs(np.reshape(in_numpy(), (count, k, k)) - batch(*arrays)))
         assert difference < 1e-3, difference
         with one_blas_thread():
-            seconds = medians(dict(zip(names, candidates, strict=True)), options.repeats)
+            seconds = medians(dict(zip(names, candidates, strict=True)), options.repeats, time.process_time)
         measured[k] = seconds
         rows.append([str(k), *(f"{1e3 * seconds[name] / count:.3g}" for name in names)])
     yield (
         "Maps of descriptors",
-        f"Milliseconds per pair, for {count} pairs with {number} descriptors and the resolvent mask, "
+        f"CPU milliseconds per pair, for {count} pairs with {number} descriptors and the resolvent mask, "
         "float32.",
         rows,
         {"seconds": measured, "pairs": count},
@@ -353,21 +384,21 @@ class Shapes(NamedTuple):
 
 def chosen_shapes(options: argparse.Namespace) -> Shapes:
     """Return people of the remeshed FAUST set if `--data` is given, else creatures in several poses."""
-    pairs = list(permutations(range(SHAPES), 2))[: options.pairs]
+    pairs = list(permutations(range(options.shapes), 2))[: options.pairs]
     if options.data is not None:
-        names = [f"tr_reg_{number:03}" for number in range(0, 7 * SHAPES, 7)]
+        names = [f"tr_reg_{number:03}" for number in range(0, 7 * options.shapes, 7)]
         return Shapes([read_mesh(options.data / "off" / f"{name}.off") for name in names], names, pairs)
     # Each creature has another seed, because the meshes of one creature have equal triangles in all poses.
     kinds = [(kind, pose) for kind, poses in CREATURES.items() for pose in poses]
     meshes = [
         creature(kind, vertices=options.vertices, pose=pose, seed=seed)
-        for seed, (kind, pose) in enumerate(kinds[:SHAPES])
+        for seed, (kind, pose) in enumerate(kinds[: options.shapes])
     ]
     return Shapes(meshes, [mesh.name for mesh in meshes], pairs)
 
 
 def accurate(options: argparse.Namespace) -> Iterator[Part]:
-    """Yield the pairs per second of the preset `"accurate"`, and the agreement with maps of the CPU."""
+    """Yield the pairs per second of the preset `"accurate"`, without and with a search."""
     shapes = chosen_shapes(options)
     preset, count = PRESETS["accurate"], len(shapes.pairs)
     tasks = prepared_tasks(shapes, "accurate")
@@ -380,16 +411,6 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
 
     candidates = {f"batches of {size}": in_batches_of(size) for size in (1, *options.batch_sizes)}
     seconds = medians(candidates, options.repeats)
-    largest = max(options.batch_sizes)
-    whole = medians(
-        {
-            "match_pairs": lambda: [
-                matched.pointwise_map
-                for _, matched in match_pairs(shapes.meshes, shapes.pairs, batch_size=largest)
-            ]
-        },
-        1,
-    )
     products: Counter[MatrixProduct] = Counter()
     for stage in preset.stages:
         spectra, first = tasks[0]
@@ -397,47 +418,56 @@ def accurate(options: argparse.Namespace) -> Iterator[Part]:
         traced = partial(refine, samples=seen.samples, **stage.settings())
         products += matrix_products(traced, *seen.both, jnp.asarray(first.pointwise_map))
     floor = time_of_products(products, count, options.repeats)
-    yield (
-        "Preset accurate",
+    note = (
         f"{count} ordered pairs of {len(shapes.meshes)} shapes with about {len(shapes.meshes[0].vertices)} "
-        f"vertices each, float32. match_pairs runs in batches of {largest}.",
-        rates(seconds | whole, count, floor),
-        {"seconds": seconds | whole, "products": floor, "pairs": count},
+        "vertices each, float32."
     )
+    numbers = {"seconds": seconds, "products": floor, "pairs": count}
+    yield "Preset accurate", note, rates(seconds, count, floor), numbers
+    largest = max(options.batch_sizes)
+
+    def matched() -> list[object]:
+        found = match_pairs(shapes.meshes, shapes.pairs, batch_size=largest)
+        return [outcome.pointwise_map for _, outcome in found]
+
+    whole = medians({"match_pairs": matched}, 1)
+    note += f" match_pairs runs in batches of {largest}."
+    numbers = {"seconds": whole, "products": floor, "pairs": count}
+    yield "Preset accurate, with initial maps and search", note, rates(whole, count, floor), numbers
 
 
 def agreement(options: argparse.Namespace) -> Iterator[Part]:
     """Yield the share of vertices at which the maps of the accelerator equal the maps of the CPU."""
-    if jax.default_backend() == "cpu":
+    device, cpu = jax.devices()[0], jax.devices("cpu")[-1]
+    if device == cpu:
         print("\nagreement: left out, because it needs an accelerator.")
         return
     shapes = chosen_shapes(options)
-    shapes = shapes._replace(pairs=shapes.pairs[:: max(1, len(shapes.pairs) // COMPARED)])
-    rows = [["preset", "equal matches", "smallest share of a pair"]]
-    measured: dict[str, dict[str, object]] = {}
+    shapes = shapes._replace(pairs=shapes.pairs[:: max(1, len(shapes.pairs) // options.compared)])
+    header = ["equal matches", "smallest share of a pair"]
     if options.data is not None:
-        rows[0] += ["error x10^-3", "error of the CPU"]
+        header += ["error x10^-3", "error of the CPU"]
     names: tuple[PresetName, ...] = ("paper", "accurate")
     for name in names:
         tasks = prepared_tasks(shapes, name)
         maps = [
-            [outcome.pointwise_map for outcome in run_batches(PRESETS[name].stages, tasks, devices=[device])]
-            for device in (jax.devices()[0], jax.devices("cpu")[0])
+            [outcome.pointwise_map for outcome in run_batches(PRESETS[name].stages, tasks, devices=[one])]
+            for one in (device, cpu)
         ]
         equal = [float(np.mean(ours == its)) for ours, its in zip(*maps, strict=True)]
-        rows.append([name, f"{np.mean(equal):.2%}", f"{min(equal):.2%}"])
-        measured[name] = {"equal": equal}
+        row = [f"{np.mean(equal):.2%}", f"{min(equal):.2%}"]
+        measured: dict[str, object] = {"equal": equal}
         if options.data is not None:
             errors = [errors_of(options.data, shapes, of_device) for of_device in maps]
-            rows[-1] += [f"{np.mean(of_device):.2f}" for of_device in errors]
-            measured[name]["errors"] = errors
-    yield (
-        "Agreement with the CPU",
-        f"{len(shapes.pairs)} ordered pairs of {len(shapes.meshes)} shapes, all stages, without a search, "
-        "float32 on both devices.",
-        rows,
-        measured,
-    )
+            row += [f"{np.mean(of_device):.2f}" for of_device in errors]
+            measured["errors"] = errors
+        yield (
+            f"Agreement with the CPU, {name}",
+            f"{len(shapes.pairs)} ordered pairs of {len(shapes.meshes)} shapes, all stages, without a "
+            "search, float32 on both devices.",
+            [header, row],
+            measured,
+        )
 
 
 def errors_of(data: Path, shapes: Shapes, maps: Sequence[np.ndarray]) -> list[float]:
@@ -466,20 +496,36 @@ PARTS = {
 def main() -> None:
     parser = make_parser(__doc__, parts=PARTS, faust=True, output="batches", pairs=64)
     parser.add_argument("--vertices", type=int, default=5000, help="per shape (default: %(default)s)")
-    parser.add_argument(
-        "--eigenvectors", type=int, default=100, help="per random shape (default: %(default)s)"
-    )
+    parser.add_argument("--eigenvectors", type=int, nargs="+", default=[100], help="per random shape")
+    parser.add_argument("--shapes", type=int, default=10, help="number of real shapes (default: %(default)s)")
+    parser.add_argument("--compared", type=int, default=20, help="number of pairs that the CPU also refines")
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[4, 16, 64])
     sizes = [30, 50, 100, 200, 300]
     parser.add_argument("--sizes", type=int, nargs="+", default=sizes, help="k of the maps of descriptors")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--quick", action="store_true", help="refine 8 pairs once, in batches of 2 and 8")
+    parser.add_argument("--device", action="store_true", help="measure an accelerator within four minutes")
+    parser.add_argument("--seconds", type=float, help="end after so many seconds, with the tables until then")
+    if parser.parse_args().device:
+        parser.set_defaults(**DEVICE)
     options = parser.parse_args()
     if options.quick:
         options.pairs, options.batch_sizes, options.repeats = 8, [2, 8], 1
     options.batch_sizes = [size for size in options.batch_sizes if size <= options.pairs]
     os.environ["JAXSMW_CACHE"] = "off"
-    measure_parts("Batches", PARTS, options)
+    timer = threading.Timer(options.seconds or 0, end, [options.seconds])
+    if options.seconds is not None:
+        timer.start()
+    try:
+        measure_parts("Batches", PARTS, options)
+    finally:
+        timer.cancel()
+
+
+def end(seconds: float) -> None:
+    """End the process, even during a compilation."""
+    print(f"\nended after {seconds:g} s: later tables are missing.", flush=True)
+    os._exit(0)
 
 
 if __name__ == "__main__":

@@ -181,6 +181,11 @@ def test_a_template_makes_a_method_for_partial_shapes(tmp_path):
     )
     with pytest.raises(InputError, match=r"missing\.off"):
         find_methods([f"accurate:{tmp_path / 'missing.off'}"])
+    (tmp_path / "other").mkdir()
+    namesake = tmp_path / "other" / file.name
+    write_mesh(namesake, bumpy_mesh(2))
+    with pytest.raises(InputError, match=r"another template already has the name whole\.off: rename it"):
+        find_methods([f"accurate:{file}", f"accurate:{namesake}"])
 
 
 def test_unknown_methods_and_initial_maps_are_refused(tmp_path):

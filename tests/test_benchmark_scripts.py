@@ -1,8 +1,11 @@
 """The scripts that measure speed and errors print complete tables for small shapes."""
 
 import json
+import os
+import subprocess
 import sys
 from argparse import Namespace
+from pathlib import Path
 
 import benchmark_batches
 import benchmark_collection
@@ -51,12 +54,65 @@ def test_batches_of_methods_and_of_maps_of_descriptors_are_measured(monkeypatch,
 
 @pytest.mark.sampled
 def test_batches_of_the_preset_accurate_are_measured(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr(benchmark_batches, "SHAPES", 2)
-    arguments = ["--only", "accurate", "--vertices", "900", "--pairs", "2", "--batch-sizes", "2", "8"]
-    rows = rows_of(monkeypatch, capsys, tmp_path, *arguments)
-    assert rows[2:] == ["products alone", "batches of 1", "batches of 2", "match_pairs"]
-    (numbers,) = json.loads((tmp_path / "batches.json").read_text())["accurate"]
+    arguments = ["--only", "accurate", "--shapes", "2", "--vertices", "900", "--pairs", "2"]
+    rows = rows_of(monkeypatch, capsys, tmp_path, *arguments, "--batch-sizes", "2", "8")
+    assert rows[2:5] == ["products alone", "batches of 1", "batches of 2"] and rows[-1] == "match_pairs"
+    _, numbers = json.loads((tmp_path / "batches.json").read_text())["accurate"]
     assert numbers["pairs"] == 2 and 0 < numbers["products"] < numbers["seconds"]["match_pairs"]
+
+
+def run_on_two_devices(directory, *arguments):
+    """Run benchmark_batches.py in a process with two CPU devices, and return what it prints."""
+    command = [sys.executable, benchmark_batches.__file__, "--device", "--output", str(directory), *arguments]
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    return subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
+
+
+@pytest.mark.slow
+def test_the_measurement_of_a_device_runs_on_the_cpu(tmp_path):
+    sizes = ["--vertices", "700", "--pairs", "2", "--shapes", "2", "--batch-sizes", "2", "--repeats", "1"]
+    printed = run_on_two_devices(tmp_path, "--eigenvectors", "8", "9", *sizes, "--only", "paper", "agreement")
+    titles = [line.removeprefix("## ") for line in printed.splitlines() if line.startswith("## ")]
+    assert titles == [
+        "Preset paper, k = 8",
+        "Preset paper, k = 9",
+        "Agreement with the CPU, paper",
+        "Agreement with the CPU, accurate",
+    ]
+    assert printed.count("100.00% | 100.00%") == 2
+
+
+# The timer of the script waits until the first table is printed, so that the test passes on a busy machine.
+ENDLESS = """
+import threading, time
+import benchmark_batches
+
+printed = threading.Event()
+
+class Timer(threading.Timer):
+    def run(self):
+        printed.wait()
+        super().run()
+
+def paper(options):
+    yield "First", "A note.", [["header"], ["row"]], {"number": 1}
+    printed.set()
+    time.sleep(3600)
+
+threading.Timer = Timer
+benchmark_batches.PARTS["paper"] = paper
+benchmark_batches.main()
+"""
+
+
+def test_a_measurement_ends_in_time_and_keeps_its_tables(tmp_path):
+    command = [sys.executable, "-c", ENDLESS, "--device", "--seconds", "1", "--output", str(tmp_path)]
+    paths = os.pathsep.join([str(Path(benchmark_batches.__file__).parent), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    printed = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
+    assert "| row |" in printed and printed.endswith("ended after 1 s: later tables are missing.\n")
+    assert json.loads((tmp_path / "batches.json").read_text())["paper"] == [{"number": 1}]
 
 
 def test_matrix_products_are_counted_in_loops():
@@ -98,6 +154,15 @@ def test_the_steps_of_a_match_from_files_add_up(tmp_path):
     assert list(seconds) == ["reading", "eigenbases", "initial map", "refinement", "other"]
     assert min(seconds.values()) > 0 and cpu > 0 and peak > 0.1
     assert [len(one) for one in maps] == [900, 900]
+
+
+def test_lines_of_code_leave_out_docstring_and_stopwatch():
+    counted = {
+        name: benchmark_speed.lines_of_code(function)
+        for name, (_, function, *_) in benchmark_speed.LIBRARIES.items()
+    }
+    assert counted["jaxsmw, paper, NumPy"] == 3
+    assert counted["pyFM, its defaults"] == 7
 
 
 def test_maps_of_a_collection_are_compared_with_direct_maps(tmp_path, monkeypatch, capsys):

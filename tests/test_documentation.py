@@ -12,6 +12,7 @@ import pkgutil
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_type_hints
 
 import jax
@@ -163,8 +164,13 @@ def test_example_table_1(pair, tmp_path):
         for shape, mesh in {"pose1": pair.source, "pose2": pair.target}.items():
             write_mesh(tmp_path / "data" / name / "off" / f"{shape}.off", mesh)
             np.savetxt(tmp_path / "data" / name / "corres" / f"{shape}.vts", truth[shape] + 1, fmt="%d")
-    table = run_example("table_1", tmp_path, NUMBER_OF_PAIRS=1)["table"]
+    namespace = run_example("table_1", tmp_path, NUMBER_OF_PAIRS=1)
+    table, cell = namespace["table"], namespace["cell"]
     assert list(table) == ["FAUST", "SCAPE"]
+    (row,) = table["FAUST"].select(["mwp"]).rows
+    failed = {**row, "target": "another", "result": "It failed.", "mean": np.nan, "seconds": np.nan}
+    assert cell(SimpleNamespace(rows=[row, failed]), "mwp") == cell(table["FAUST"], "mwp") + ", 1 failed"
+    assert cell(SimpleNamespace(rows=[failed]), "mwp").strip() == "failed"
     for comparison in table.values():
         assert comparison.errors("mwp").mean() < comparison.errors("initial").mean()
 
@@ -184,10 +190,10 @@ def test_example_tight_or_not(tmp_path):
 
 
 @pytest.mark.slow
-def test_example_learn_a_bank(tmp_path):
-    namespace = run_example("learn_a_bank", tmp_path, NUMBER_OF_STEPS=2)
-    loss, training = namespace["loss"], namespace["training"]
-    assert loss(namespace["bank"], training) < loss(namespace["before"], training)
+def test_example_learn_a_bank(tmp_path, capsys):
+    run_example("learn_a_bank", tmp_path, NUMBER_OF_STEPS=3)
+    losses = [float(loss) for loss in re.findall(r"training (\S+),", capsys.readouterr().out)]
+    assert len(losses) == 3 and losses[2] < losses[1] < losses[0]
 
 
 def test_example_refiner_of_a_paper(tmp_path):

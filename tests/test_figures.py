@@ -333,6 +333,9 @@ def test_interval_figure_shows_every_estimate() -> None:
     np.testing.assert_array_equal(drawn, [1, np.nan, -20])
     low, high = axes.get_xlim()
     assert low < -30 and high > 2
+    (axes,) = draw_intervals({"p": (0.12, -0.03, 0.31), "q": (np.nan,) * 3}, "difference").axes
+    assert axes.get_xscale() == "linear"
+    assert {"0", "+0.1", "+0.2", "+0.3"} <= {text.get_text() for text in axes.get_xticklabels()}
     with pytest.raises(InputError, match="nothing to draw"):
         draw_intervals({}, "difference")
 

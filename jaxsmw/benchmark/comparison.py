@@ -55,7 +55,7 @@ Maps contain 0-based vertices of Y. The arrays of the spectra are JAX arrays, as
 """
 
 Compared = Method | Refiner | Stage | Sequence[Stage] | Preset | MapFunction | str
-"""What `compare` accepts as a method."""
+"""The kinds of method that `compare` accepts."""
 
 TruePair = tuple[Mesh, Mesh, GroundTruth | SurfacePoints | Int[np.ndarray, " m"]]
 """The source X, the target Y and the true points on Y of some or all vertices of X."""
@@ -98,9 +98,9 @@ def compare(
     - `pairs`: a data set (a `DataSet` or its directory), or pairs with ground truth: each is a `DataPair`, a
       `CreaturePair`, or a tuple `(mesh_x, mesh_y, truth)`. In a tuple, `truth` is a `GroundTruth`, or the
       true points of all vertices of X: a map (m,) or `SurfacePoints`.
-    - `number_of_eigenvectors`: the number for refiners without levels, and for functions. Each shape gets at
-      least as many eigenvectors.
-    - `iterations`: the number for refiners without levels.
+    - `number_of_eigenvectors`: the number for refiners without levels, and for functions; 100 by default.
+      Each shape gets at least as many eigenvectors.
+    - `iterations`: the number for refiners without levels; 3 by default.
     - `init`: the initial map of all methods, a name that `jaxsmw.match` accepts, or a directory with maps in
       files `X_Y.map`. With `"auto"` (the default), it is `"shot"`; presets may also try others.
     - `evaluated_points`: the number of ground-truth points at which all maps are evaluated; None for all.
@@ -251,7 +251,7 @@ class Comparison:
         other method.
         """
         reference = self._checked(reference)
-        label = f"difference from {reference} (x 10⁻³ √area)"
+        label = f"difference from {reference} (×10⁻³ √area)"
         figure = draw_intervals(self.differences(reference), label)
         if path is not None:
             save_figure(path, figure)

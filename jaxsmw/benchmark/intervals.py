@@ -13,14 +13,20 @@ RESAMPLES = 9999
 
 
 class Interval(NamedTuple):
-    """A mean and the two ends of its bootstrap confidence interval; NaN for fewer than three values."""
+    """A mean and its 95 % bootstrap confidence interval; `str` gives both as text, as in `+1.8 [+0.7, +4.8]`.
+
+    **Attributes:**
+
+    - `mean`: the mean.
+    - `low`, `high`: the two ends of the interval; NaN for fewer than three values.
+    """
 
     mean: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        """The mean and the interval as text, with signs and one decimal, for example `+1.8 [+0.7, +4.8]`."""
+        """The mean and the interval as text, with signs and one decimal."""
         if np.isnan(self.mean):
             return "—"
         if np.isnan(self.low):

@@ -132,8 +132,8 @@ def refine(
       `partial` is True, each shape should have area 1, as from `compute_spectrum`.
     - `pointwise_map`: the initial map T, an integer array (m,) of 0-based vertices of Y.
     - `refiner`: the method, a `Refiner`. The default is `WaveletPreservation()`, the method of the MWP paper.
-    - `iterations`: the number of iterations, an integer of at least 1. Each iteration computes a functional
-      map and then a pointwise map.
+    - `iterations`: the number of iterations, an integer of at least 1; 3 by default. Each iteration computes
+      a functional map and then a pointwise map.
     - `samples`: a tuple of two integer arrays: the 0-based vertices of X (s_x,) and of Y (s_y,) on which the
       refinement iterates. The samples should be evenly spread and outnumber the eigenvectors. With None, all
       iterations use all vertices.

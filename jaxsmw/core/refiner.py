@@ -39,7 +39,10 @@ class Problem(Module):
     partial: bool = field(static=True, default=False)
 
     def query_spectra(self) -> tuple[Spectrum, Spectrum]:
-        """Return the spectra of X and of Y at the vertices on which the refiner iterates."""
+        """Return the spectra of X and of Y at the vertices on which the refiner iterates.
+
+        Eigenvectors are not orthonormal on samples, so `encode` needs `pseudo_inverse="least_squares"` there.
+        """
         if self.samples is None:
             return self.spectrum_x, self.spectrum_y
         return self.spectrum_x.sample(self.samples[0]), self.spectrum_y.sample(self.samples[1])

@@ -305,7 +305,8 @@ def draw_quality_curves(
 def draw_intervals(intervals: Mapping[str, tuple[float, float, float]], label: str) -> Figure:
     """Draw estimates with their intervals, one per row, and a vertical line at zero.
 
-    The scale is linear up to 1 and logarithmic elsewhere, so that small and large estimates are both visible.
+    The scale is linear if nothing is above 10. Otherwise, it is linear up to 1 and logarithmic elsewhere, so
+    that small and large estimates are both visible.
 
     **Arguments:**
 
@@ -317,19 +318,21 @@ def draw_intervals(intervals: Mapping[str, tuple[float, float, float]], label: s
     if not intervals:
         raise InputError("there is nothing to draw: give at least one interval.")
     figure = new_figure(6.5, 1.0 + 0.2 * len(intervals), plot=True)
-    from matplotlib.ticker import NullLocator, SymmetricalLogLocator
+    from matplotlib.ticker import MaxNLocator, NullLocator, SymmetricalLogLocator
 
     axes = figure.subplots()
     heights = np.arange(len(intervals), dtype=float)
     estimates, lows, highs = np.array(list(intervals.values()), dtype=float).T
-    axes.set_xscale("symlog", linthresh=1.0, linscale=1.0)
+    wide = np.any(np.abs([estimates, lows, highs]) > 10)
+    if wide:
+        axes.set_xscale("symlog", linthresh=1.0, linscale=1.0)
     axes.axvline(0, color=FAINT, linewidth=0.8)
     axes.hlines(heights, lows, highs, color=LINE_COLORS[0], linewidth=1.4)
     axes.plot(estimates, heights, linestyle="none", marker="o", markersize=3.6, color=LINE_COLORS[0])
     axes.set_yticks(heights, list(intervals))
     axes.set_ylim(len(intervals) - 0.5, -0.5)
     axes.set_xlabel(label)
-    axes.xaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=1.0))
+    axes.xaxis.set_major_locator(SymmetricalLogLocator(base=10, linthresh=1.0) if wide else MaxNLocator(8))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:+g}".replace("-", "−") if value else "0")
     style_axes(axes)

@@ -78,8 +78,8 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
     is then the name of the directory. `accurate:TEMPLATE` is `accurate` through a template, which is a mesh
     file or a built-in shape; see `jaxsmw.match`. Duplicate names are ignored.
 
-    **Raises:** `InputError` if a name is neither a known method nor a directory, if two methods would have
-    the same name, or if a template cannot be read.
+    **Raises:** `InputError` if a name is neither a known method nor a directory, if two directories or two
+    templates have the same name, or if a template cannot be read.
     """
     from jaxsmw.benchmark.opponents.baselines import PublishedMaps, through_template
 
@@ -90,7 +90,10 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
             continue
         if name.startswith(_THROUGH):
             template = name.removeprefix(_THROUGH)
-            methods[_THROUGH + Path(template).name] = through_template(template)
+            short = Path(template).name
+            if _THROUGH + short in methods:
+                raise InputError(f"{template}: another template already has the name {short}: rename it.")
+            methods[_THROUGH + short] = through_template(template)
             continue
         # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
         if not os.path.isdir(name):

@@ -24,9 +24,13 @@ def _whole_numbers(levels: Iterable[int]) -> tuple[int, ...]:
 
 
 class CoarseToFineState(State):
-    """The state of a coarse-to-fine refiner in the iteration of a number, counted from 0.
+    """The state of a coarse-to-fine refiner.
 
-    `recover_both` adds the `reverse_map` Y -> X, for each vertex of Y to be matched.
+    **Attributes:**
+
+    - `iteration`: the number of the iteration, an array of type int32. `update` computes it as `jnp.int32(0)`
+      in the first iteration, and as `previous.iteration + 1` in later iterations.
+    - `reverse_map`: the map Y -> X (n,) for refiners that use it, which `recover_both` adds; otherwise None.
     """
 
     iteration: Int32[Array, ""]

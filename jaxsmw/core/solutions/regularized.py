@@ -69,13 +69,13 @@ class RegularizedLeastSquares(Solution[None]):
 
     The scales make the weights comparable for all banks and all units of descriptors.
 
-    Without orthogonality and descriptor commutativity, the rows of C are independent, as in the layer of
-    Donati et al. 2020. Each row solves a linear system (k_in, k_in), and one batched Cholesky factorisation
-    solves the k_out systems exactly. Otherwise, `optimistix.least_squares` takes Gauss–Newton steps, whose
-    linear systems conjugate gradients solve. The sums over thousands of columns in the quadratic terms are
-    then replaced by sums over k_in equivalent columns. The solver starts from the previous functional map, or
-    from an estimate. In both cases, the derivatives of C are computed by implicit differentiation at the
-    minimum. `jax.vmap` solves a batch of pairs.
+    Without orthogonality and descriptor commutativity, one batched solve of k_out linear systems gives the
+    exact minimiser, as in the layer of Donati et al. 2020 (docs/mathematics.md). Otherwise,
+    `optimistix.least_squares` takes Gauss–Newton steps, whose linear systems conjugate gradients solve. The
+    sums over thousands of columns in the quadratic terms are then replaced by sums over k_in equivalent
+    columns. The solver starts from the previous functional map, or from an estimate. In both cases, the
+    derivatives of C are computed by implicit differentiation at the minimum. `jax.vmap` solves a batch of
+    pairs.
 
     **Arguments:**
 
