@@ -150,6 +150,24 @@ def test_landmarks_with_large_expected_errors_are_marked(run, pair, tmp_path, mo
     ]
 
 
+def test_landmarks_off_the_surface(run, pair, tmp_path):
+    write_landmark_file(
+        tmp_path / "x.csv", Landmarks(("center", "b c"), np.array([[0.0, 0, 0], [0.2, 0, 0]]))
+    )
+    files = "transfer", pair / "x.off", pair / "y.ply", "--map", pair / "truth.txt"
+    call = *files, "--landmarks", tmp_path / "x.csv", "--landmarks-output", tmp_path / "y.pts"
+    assert_refused(run(*call, "--quiet"), naming="the median distance of the landmarks")
+    outcome = run(*call, "--off-surface")
+    assert outcome.code == 0, outcome.errors
+    assert "y.pts: .pts files hold neither blanks" in outcome.errors
+    carried = read_landmark_file(tmp_path / "y.pts")
+    # The target is three times as large.
+    assert carried.names == ("center", "b_c")
+    assert np.allclose(carried.positions, [[0, 0, 0], [0.6, 0, 0]], atol=0.05)
+    refused = run(*files, "--off-surface", "--registered", tmp_path / "r.off", "--quiet")
+    assert_refused(refused, naming="--off-surface: has no effect without --landmarks")
+
+
 def test_the_unit_of_the_landmarks_is_kept(run, pair, tmp_path):
     outcome = run(
         "transfer", pair / "x.off", pair / "y.ply", "--map", pair / "truth.txt",

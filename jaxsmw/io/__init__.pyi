@@ -2,16 +2,19 @@ from .exchange import ImportedMap, make_functional_map, to_geomfum, to_pyfm, to_
 from .landmark_files import read_landmark_file, write_landmark_file
 from .landmarks import FrameDistances, LandmarkMatch, Landmarks, check_frame, find_frame, match_landmarks
 from .maps import read_landmarks, read_pointwise_map, write_pointwise_map
-from .mesh_data import MeshData, Skin, Texture
+from .mesh_data import LabelTable, MeshData, Overlay, Skin, Texture
 from .meshes import read_mesh, read_mesh_data, write_mesh, write_mesh_data
+from .overlays import read_overlay, write_overlay
 from .spectra import make_spectrum, read_functional_map, read_spectrum, write_functional_map, write_spectrum
 
 __all__ = [
     "FrameDistances",
     "ImportedMap",
+    "LabelTable",
     "LandmarkMatch",
     "Landmarks",
     "MeshData",
+    "Overlay",
     "Skin",
     "Texture",
     "check_frame",
@@ -24,6 +27,7 @@ __all__ = [
     "read_landmarks",
     "read_mesh",
     "read_mesh_data",
+    "read_overlay",
     "read_pointwise_map",
     "read_spectrum",
     "to_geomfum",
@@ -33,6 +37,7 @@ __all__ = [
     "write_landmark_file",
     "write_mesh",
     "write_mesh_data",
+    "write_overlay",
     "write_pointwise_map",
     "write_spectrum",
 ]

@@ -37,6 +37,8 @@ from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, checked_texture
 from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
 
+# The usual suffixes of FreeSurfer's surfaces. Surfaces with other suffixes are known by their first bytes.
+_FREESURFER = (".pial", ".white", ".inflated", ".sphere", ".smoothwm", ".midthickness")
 # The functions that read and write files with a suffix, as "module:function". A module of `jaxsmw.io.formats`
 # is loaded when such a file is opened.
 _PARSERS = {
@@ -44,13 +46,33 @@ _PARSERS = {
     **{".mat": "mat:parse_mat", ".vtk": "vtk:parse_vtk", ".vtp": "vtp:parse_vtp", ".npz": "npz:parse_npz"},
     **{".gltf": "gltf:parse_gltf", ".glb": "gltf:parse_glb"},
     **{".xyz": "points:parse_xyz", ".pcd": "pcd:parse_pcd", ".npy": "points:parse_npy"},
+    **{".gii": "brain:parse_gifti"} | dict.fromkeys(_FREESURFER, "brain:parse_surface"),
 }
 _FORMATTERS = {
     **{".off": "off:format_off", ".obj": "obj:format_obj", ".ply": "ply:format_ply"},
     **{".stl": "stl:format_stl", ".mat": "mat:format_mat", ".vtk": "vtk:format_vtk"},
     **{".vtp": "vtp:format_vtp", ".npz": "npz:format_npz"},
     **{".gltf": "gltf_writing:format_gltf", ".glb": "gltf_writing:format_glb"},
+    **{".gii": "brain:format_gifti"} | dict.fromkeys(_FREESURFER, "brain:format_surface"),
 }
+# The first bytes of FreeSurfer's surfaces, and what messages list as the formats that can be read.
+_SURFACE = b"\xff\xff\xfe"
+_KNOWN = (*(suffix for suffix in _PARSERS if suffix not in _FREESURFER), "FreeSurfer's lh.pial")
+# What converts files that this library does not read, by their suffixes.
+_CONVERTERS = {
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".brep", ".fcstd"), "FreeCAD"),
+    **dict.fromkeys((".nii", ".mgz", ".nrrd", ".mha", ".dcm", ".tif"), "3D Slicer, which segments volumes,"),
+    **dict.fromkeys((".gz", ".bz2", ".zip"), "a program that unpacks it"),
+    **dict.fromkeys((".las", ".laz", ".e57", ".pts"), "CloudCompare"),
+    **dict.fromkeys((".vtu", ".vtm", ".vts", ".vti", ".msh", ".inp", ".mesh", ".med"), "ParaView or meshio"),
+    **dict.fromkeys((".ctm", ".wrl", ".x3d", ".asc", ".qobj", ".smf"), "MeshLab"),
+}
+
+
+def _converter(suffix: str) -> str:
+    return _CONVERTERS.get(suffix, "Blender or MeshLab")
+
+
 # The formats whose files begin with text, even if numbers are binary.
 _TEXT = (".off", ".obj", ".ply", ".vtk", ".pcd")
 MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
@@ -64,7 +86,7 @@ def _loaded(function: str) -> Callable[..., Any]:
     return getattr(import_module(f"jaxsmw.io.formats.{module}"), name)
 
 
-def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
+def read_mesh(path: str | os.PathLike[str], *, weld: bool | float = False) -> Mesh:
     """Read a triangle mesh, or a point cloud, from a file in any format of `read_mesh_data`.
 
     Vertices keep the order of the file. Corners of an STL file at the same position become one vertex, and
@@ -76,9 +98,9 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
 
     - `path`: the file. The suffix, in upper or lower case, determines the format: `.off`, `.obj`, `.ply`,
         `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.xyz`, `.pcd` or `.npy`.
-    - `weld`: if True, vertices at the same position are merged, as in `make_mesh`. Faces then use only the
-        lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so no vertex is
-        renumbered. The vertices of STL and glTF files are always welded.
+    - `weld`: if True or a tolerance, vertices at the same position are merged, as in `make_mesh`. Faces then
+        use only the lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so
+        no vertex is renumbered. The vertices of STL and glTF files are always welded.
 
     **Returns:** A `Mesh` whose `name` is the path, with positions (n, 3) in the unit of the file and 0-based
     faces (f, 3). The `notes` of the mesh report changes such as dropped faces, and peculiarities such as
@@ -92,7 +114,7 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     return read_mesh_data(path, weld=weld).mesh
 
 
-def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshData:
+def read_mesh_data(path: str | os.PathLike[str], *, weld: bool | float = False) -> MeshData:
     """Read a mesh together with all data on its vertices and faces.
 
     The data of each format:
@@ -148,10 +170,12 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     data = read_bytes(path)
     suffix = path.suffix.lower()
     if suffix not in _PARSERS:
-        raise InputError(
-            f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
-            f"mesh to one of {', '.join(_PARSERS)}."
-        )
+        if not data.startswith(_SURFACE):
+            raise InputError(
+                f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
+                f"mesh with {_converter(suffix)} to one of {', '.join(_KNOWN)}."
+            )
+        suffix = _FREESURFER[0]
     with naming(path):
         polygons = _parse(data, suffix, path.parent)
         is_strip = np.zeros(len(polygons.sizes), bool) if polygons.strips is None else polygons.strips
@@ -167,8 +191,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
         name: values[polygon] if values.ndim and len(values) > polygon.max(initial=-1) else values
         for name, values in polygons.face_data.items()
     }
+    if polygons.weld and weld is False:
+        weld = 0.0
     if len(faces) or not len(polygons.vertices):
-        mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
+        mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld, notes=notes)
     else:
         normals = polygons.vertex_data.get(NORMALS)
         mesh = triangulate_points(polygons.vertices, normals, name=str(path), notes=notes)
