@@ -170,7 +170,8 @@ def add_weld(parser: argparse.ArgumentParser) -> None:
         default=False,
         type=_tolerance,
         help="merge vertices at the same position, and vertices at boundaries up to this distance, in the "
-        "unit of the mesh (default: decided from the gap between the widths of cracks and the lengths of edges)",
+        "unit of the mesh (default: decided from the gap between the widths of cracks and the lengths of "
+        "edges)",
     )
 
 

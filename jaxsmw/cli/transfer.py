@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import reduce
 from statistics import median
 from typing import TYPE_CHECKING, get_args
@@ -54,6 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "name and a position per line",
             "--landmarks-output FILE": "write the landmarks on the target to this file, in one of these "
             "formats except .mps",
+            "--blend-shapes DIR": "blend shapes of the source: a folder of OBJ files with its vertices in "
+            "the same order. They are part of the attributes",
+            "--blend-shapes-output DIR": "write the target in each blend shape of the source to this folder, "
+            "as OBJ files",
             "--map-output FILE": "write the map that was computed to this file, like match --output",
         },
     )
@@ -119,6 +124,7 @@ def run(options: argparse.Namespace) -> None:
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         _check(options)
+    from jaxsmw.io.blend_shapes import read_blend_shapes
     from jaxsmw.io.meshes import read_mesh_data
 
     with stopwatch.step("reading"):
@@ -129,6 +135,12 @@ def run(options: argparse.Namespace) -> None:
             report_mesh(file, data.mesh)
         overlays = _read_overlays(options, source)
         bare, source = source, reduce(lambda data, overlay: overlay.added_to(data), overlays, source)
+        if options.blend_shapes:
+            source = read_blend_shapes(options.blend_shapes, source)
+        if options.blend_shapes_output and not source.blend_shapes:
+            raise InputError(
+                f"{options.source}: has no blend shapes for --blend-shapes-output: add --blend-shapes DIR."
+            )
         if options.attributes and not source.has_attributes:
             raise InputError(
                 f"{options.source}: has no attributes (colours, labels, texture coordinates, blend shapes, a "
@@ -150,7 +162,7 @@ def run(options: argparse.Namespace) -> None:
             f"warning: {registered.flipped_faces.mean():.1%} of the triangles are flipped, so the map is "
             f"probably wrong: {cure}."
         )
-    if options.registered or options.attributes:
+    if options.registered or options.attributes or options.blend_shapes_output:
         _write_meshes(options, source, target, registered, stopwatch)
     _write_overlays(options, bare, overlays, registered, stopwatch)
     transferred = None
@@ -179,7 +191,7 @@ def run(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
     outputs = options.registered, options.landmarks_output, options.attributes, options.overlay_output
-    if not (any(outputs) or options.map_output or options.report):
+    if not (any(outputs) or options.map_output or options.blend_shapes_output or options.report):
         raise InputError(
             "nothing to write: give --registered FILE, --attributes FILE, --map-output FILE, --report DIR, "
             "--landmarks FILE with --landmarks-output FILE, or --overlay FILE with --overlay-output FILE."
@@ -191,6 +203,8 @@ def _check(options: argparse.Namespace) -> None:
         )
     carried = bool(options.overlay_output or options.attributes or options.registered)
     refuse_without(options, "--overlay-output or --attributes", carried, "overlay")
+    carried = bool(options.blend_shapes_output or options.attributes or options.registered)
+    refuse_without(options, "--blend-shapes-output or --attributes", carried, "blend_shapes")
     refuse_without(
         options, "--landmarks", bool(options.landmarks), "landmarks_output", "coordinates", "off_surface"
     )
@@ -228,7 +242,8 @@ def _check(options: argparse.Namespace) -> None:
     inputs += options.overlay
     check_inputs(*inputs)
     check_outputs(
-        inputs,
+        [*inputs, options.blend_shapes],
+        directories=[(options.blend_shapes_output, [])] if options.blend_shapes_output else [],
         files=[
             *(options.registered, options.attributes, options.landmarks_output, options.map_output),
             *options.overlay_output,
@@ -385,16 +400,24 @@ def _write_meshes(
     stopwatch: Stopwatch,
 ) -> None:
     """Write the registered mesh, and the target with the attributes of the source."""
+    from jaxsmw.io.blend_shapes import write_blend_shapes
     from jaxsmw.transfer.attributes import registered_data, transfer_attributes
 
     if options.registered:
         _write(options.registered, registered_data(source, registered), stopwatch)
+    if not (options.attributes or options.blend_shapes_output):
+        return
+    with stopwatch.step("attributes", announced=True):
+        carried = transfer_attributes(source, registered, target)
+    for note in carried.mesh.notes[len(target.mesh.notes) :]:
+        say(f"note: {note}")
     if options.attributes:
-        with stopwatch.step("attributes", announced=True):
-            carried = transfer_attributes(source, registered, target)
-        for note in carried.mesh.notes[len(target.mesh.notes) :]:
-            say(f"note: {note}")
         _write(options.attributes, carried, stopwatch)
+    if options.blend_shapes_output:
+        own = replace(
+            carried, blend_shapes={name: carried.blend_shapes[name] for name in source.blend_shapes}
+        )
+        report_written(*write_blend_shapes(options.blend_shapes_output, own))
 
 
 def _write(file: str, data: MeshData, stopwatch: Stopwatch) -> None:

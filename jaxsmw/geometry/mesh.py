@@ -498,13 +498,11 @@ def _distinct_faces(triangles: Int64[np.ndarray, "f 3"]) -> tuple[Int64[np.ndarr
 def _unusual_vertices(mesh: Mesh) -> list[str]:
     """Return notes about vertices that appear to be duplicated along a seam, and unreferenced vertices."""
     notes = []
-    seam = int(_split_vertices(mesh).sum())
-    if len(mesh.faces) > 1 and len(mesh.referenced_indices) == mesh.faces.size:
+    if len(mesh.faces) > 2 and len(mesh.referenced_indices) == mesh.faces.size:
         notes.append(
-            f"This is a soup of triangles: no two of its {len(mesh.faces)} triangles share a vertex"
-            + (", but many have equal corners: weld it (`weld=True`)." if seam else ".")
+            f"This is a soup of triangles: no two of its {len(mesh.faces)} triangles share a vertex."
         )
-    elif seam:
+    if seam := int(_split_vertices(mesh).sum()):
         notes.append(
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
             "surface should be closed there, weld it (`weld=True`)."

@@ -1,3 +1,4 @@
+from .blend_shapes import read_blend_shapes, write_blend_shapes
 from .exchange import ImportedMap, make_functional_map, to_geomfum, to_pyfm, to_torch
 from .landmark_files import read_landmark_file, write_landmark_file
 from .landmarks import FrameDistances, LandmarkMatch, Landmarks, check_frame, find_frame, match_landmarks
@@ -22,6 +23,7 @@ __all__ = [
     "make_functional_map",
     "make_spectrum",
     "match_landmarks",
+    "read_blend_shapes",
     "read_functional_map",
     "read_landmark_file",
     "read_landmarks",
@@ -33,6 +35,7 @@ __all__ = [
     "to_geomfum",
     "to_pyfm",
     "to_torch",
+    "write_blend_shapes",
     "write_functional_map",
     "write_landmark_file",
     "write_mesh",

@@ -97,7 +97,8 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool | float = False) -> Me
     **Arguments:**
 
     - `path`: the file. The suffix, in upper or lower case, determines the format: `.off`, `.obj`, `.ply`,
-        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.xyz`, `.pcd` or `.npy`.
+        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.gii`, `.xyz`, `.pcd` or `.npy`. Surfaces of
+        FreeSurfer, such as `lh.pial`, may have any other suffix.
     - `weld`: if True or a tolerance, vertices at the same position are merged, as in `make_mesh`. Faces then
         use only the lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so
         no vertex is renumbered. The vertices of STL and glTF files are always welded.
@@ -141,6 +142,11 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool | float = False) 
       Further attributes, morph targets and skins are read as well. If the file has several parts, the face
       data `group` contains 0-based integers, and `label_names` contains the names of the parts.
     - `.npz`: the arrays that `write_mesh_data` writes, such as `vertices`, `faces` and `vertex_data/NAME`.
+    - `.gii`: a GIFTI file with one surface, and all arrays with one row per vertex. Labels are numbered from
+      0 in the order of the file's table. Positions are those of the file, without its transform. GIFTI and
+      FreeSurfer's files need the extra `brain`.
+    - `.pial`, `.white`, `.inflated` and others: a surface of FreeSurfer, which contains no data. The geometry
+      of the volume is not read. `jaxsmw.io.read_overlay` reads data on the vertices from their own files.
     - `.xyz`: a text file with one point per line. Columns 4 to 6 become `normals` if they are unit vectors.
       Further columns are ignored.
     - `.pcd`: all fields of a file of the Point Cloud Library, which may be text, binary or compressed. The
@@ -296,15 +302,16 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
     """Write a mesh together with all data on its vertices and faces.
 
     `read_mesh_data` lists the formats, and reads the same data from the file, in the precision of the format:
-    float32 in STL and glTF files, and float64 in the other formats. Colours in OBJ files become floats.
-    Vertices keep their order in all formats except STL. glTF files need one texture vertex per vertex, so
-    vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
-    them again. The write is atomic: an incomplete file never appears at `path`.
+    float32 in STL, glTF, GIFTI and FreeSurfer's files, and float64 in the other formats. Colours in OBJ
+    files become floats. Vertices keep their order in all formats except STL. glTF files need one texture
+    vertex per vertex, so vertices are duplicated along texture seams. The file records the duplicates, and
+    `read_mesh_data` joins them again. The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 
     - `path`: the file to create or to replace. The suffix determines the format: `.off`, `.obj`, `.ply`,
-        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb` or `.npz`.
+        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.gii`, or one of FreeSurfer's suffixes
+        `.pial`, `.white`, `.inflated`, `.sphere`, `.smoothwm` and `.midthickness`.
     - `data`: a `MeshData`. The file contains all triangles of `data.faces`, including triangles that cleaning
         dropped from `data.mesh`.
 
