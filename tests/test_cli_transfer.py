@@ -4,10 +4,20 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 from command_line import SMALL, assert_refused, write_pair
 
 import jaxsmw
-from jaxsmw.io import Landmarks, read_landmark_file, read_mesh_data, write_landmark_file, write_mesh_data
+from jaxsmw.io import (
+    Landmarks,
+    read_blend_shapes,
+    read_landmark_file,
+    read_mesh_data,
+    write_blend_shapes,
+    write_landmark_file,
+    write_mesh,
+    write_mesh_data,
+)
 from jaxsmw.io.mesh_data import MeshData
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
@@ -148,6 +158,59 @@ def test_landmarks_with_large_expected_errors_are_marked(run, pair, tmp_path, mo
         f"  b: {0.021 * unit:.3g} (more than twice the median: check this landmark)",
         *(f"  {name}: {0.01 * unit:.3g}" for name in names[2:]),
     ]
+
+
+def test_landmarks_off_the_surface(run, pair, tmp_path):
+    write_landmark_file(
+        tmp_path / "x.csv", Landmarks(("center", "b c"), np.array([[0.0, 0, 0], [0.2, 0, 0]]))
+    )
+    files = "transfer", pair / "x.off", pair / "y.ply", "--map", pair / "truth.txt"
+    call = *files, "--landmarks", tmp_path / "x.csv", "--landmarks-output", tmp_path / "y.pts"
+    assert_refused(run(*call, "--quiet"), naming="the median distance of the landmarks")
+    outcome = run(*call, "--off-surface")
+    assert outcome.code == 0, outcome.errors
+    assert "y.pts: .pts files hold neither blanks" in outcome.errors
+    carried = read_landmark_file(tmp_path / "y.pts")
+    # The target is three times as large.
+    assert carried.names == ("center", "b_c")
+    assert np.allclose(carried.positions, [[0, 0, 0], [0.6, 0, 0]], atol=0.05)
+    refused = run(*files, "--off-surface", "--registered", tmp_path / "r.off", "--quiet")
+    assert_refused(refused, naming="--off-surface: has no effect without --landmarks")
+
+
+def test_blend_shapes_of_a_folder(run, pair, tmp_path):
+    mesh = jaxsmw.read_mesh(pair / "x.off")
+    moves = {"smile": 0.1 * mesh.vertex_normals, "left/up": np.tile([0.0, 0, 0.2], (len(mesh.vertices), 1))}
+    data = MeshData(mesh, mesh.faces, blend_shapes=moves)
+    assert [path.name for path in write_blend_shapes(tmp_path / "in", data)] == ["smile.obj", "left_up.obj"]
+    write_mesh(tmp_path / "in" / "neutral.obj", mesh)
+    again = read_blend_shapes(tmp_path / "in", MeshData(mesh, mesh.faces)).blend_shapes
+    assert list(again) == ["left_up", "smile"] and np.allclose(again["smile"], moves["smile"], atol=1e-15)
+    files = "transfer", pair / "x.off", pair / "y.ply", "--map", pair / "truth.txt", "--quiet"
+    call = *files, "--blend-shapes", tmp_path / "in"
+    outcome = run(*call, "--blend-shapes-output", tmp_path / "out")
+    assert outcome.code == 0, outcome.errors
+    target = jaxsmw.read_mesh(pair / "y.ply")
+    for name, expected in (("smile", 0.3 * target.vertex_normals), ("left_up", np.array([0, 0, 0.6]))):
+        shape = trimesh.load(tmp_path / "out" / f"{name}.obj", process=False)
+        assert np.array_equal(shape.faces, target.faces)
+        assert np.abs(shape.vertices - target.vertices - expected).mean() < 0.02
+    (tmp_path / "empty").mkdir()
+    write_mesh(tmp_path / "empty" / "neutral.obj", mesh)
+    (tmp_path / "other").mkdir()
+    write_mesh(tmp_path / "other" / "a.obj", target)
+    output = "--blend-shapes-output", tmp_path / "new"
+    for arguments, fault in (
+        ((*call, "--blend-shapes-output", tmp_path / "in"), "is an input"),
+        ((*call, "--report", tmp_path / "r"), "--blend-shapes: has no effect without"),
+        (call, "nothing to write"),
+        ((*files, *output), "has no blend shapes for --blend-shapes-output"),
+        ((*files, *output, "--blend-shapes", tmp_path / "missing"), "cannot be read as a folder"),
+        ((*files, *output, "--blend-shapes", tmp_path / "empty"), "contains no OBJ file with another shape"),
+        ((*files, *output, "--blend-shapes", tmp_path / "other"), "that are not those of"),
+    ):
+        assert_refused(run(*arguments), naming=fault)
+    assert not (tmp_path / "new").exists()
 
 
 def test_the_unit_of_the_landmarks_is_kept(run, pair, tmp_path):

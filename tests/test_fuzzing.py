@@ -30,11 +30,13 @@ from hypothesis import strategies as st
 from jaxsmw.cli.run import run_command
 from jaxsmw.errors import InputError
 from jaxsmw.io.landmark_files import read_landmark_file
+from jaxsmw.io.overlays import read_overlay
 
 CORPUS = Path(__file__).parent / "corpus"
 MESHES = sorted(
     p.name for p in CORPUS.iterdir() if re.match(r"jaxsmw|trimesh|vtk|scipy|points\.(xyz|npy)|.*pcd", p.name)
 )
+OVERLAYS = sorted(p.name for p in CORPUS.iterdir() if p.name.startswith("overlay"))
 LANDMARKS = sorted(p.name for p in CORPUS.iterdir() if p.name.startswith("landmarks"))
 MAPS = ["map.txt", "map.npy", "map.mat", "map.npz", "map.safetensors"]
 TRUTHS = ["map.txt", "pairs.txt", "points.baryc_gt"]
@@ -278,6 +280,15 @@ def message_of(function: Callable[[], object]) -> str | None:
     except InputError as error:
         return str(error)
     return None
+
+
+@fuzzed(250, files(OVERLAYS))
+def test_damaged_overlays(case):
+    with directories() as (inputs, _):
+        file = write_damaged(inputs, *case)
+        with limited():
+            message = message_of(lambda: read_overlay(file))
+        assert message is None or ("\n" not in message and str(file) in message)
 
 
 @fuzzed(250, files(LANDMARKS))

@@ -26,7 +26,8 @@ from jaxsmw.io import (
 
 NAMES = ("1", "nasal, left", 'the "tip"', "Größe µ", "a;b\\c", "#5", "x <&> 'y'", "=1+1", "F-1", "-2.5")
 POSITIONS = np.random.default_rng(0).normal(size=(len(NAMES), 3)) * 10.0 ** np.arange(-12, 18, 3)[:, None]
-WRITTEN = (".mrk.json", ".fcsv", ".pp", ".csv", ".txt")
+WRITTEN = (".mrk.json", ".fcsv", ".pp", ".json", ".csv", ".txt")
+PLAIN = (".tps", ".nts", ".pts")  # formats that cannot hold all names
 
 
 def same(read: Landmarks, written: Landmarks) -> bool:
@@ -51,9 +52,28 @@ def test_round_trips_are_exact(tmp_path, suffix, coordinates):
     assert (again.name, again.notes) == (str(path), ())
 
 
+@pytest.mark.parametrize("suffix", PLAIN)
+def test_morphometric_files_keep_positions_and_plain_names(tmp_path, suffix):
+    path = tmp_path / f"points{suffix.upper()}"
+    (note,) = write_landmark_file(path, Landmarks(NAMES, POSITIONS))
+    again = read_landmark_file(path)
+    assert np.array_equal(again.positions, POSITIONS) and again.coordinates is None
+    numbers = tuple(map(str, range(1, len(NAMES) + 1)))
+    if suffix == ".tps":
+        assert again.names == numbers and "only numbered" in note
+        plain = Landmarks(numbers, POSITIONS)
+    else:
+        assert again.names[:3] == ("1", "nasal,_left", "the__tip_") and "underscores" in note
+        plain = Landmarks(("a-1", "Größe"), POSITIONS[:2])
+    assert write_landmark_file(path, plain) == () and same(read_landmark_file(path), plain)
+    # Two names that become equal stay distinct.
+    write_landmark_file(path, Landmarks(("a b", "a_b"), POSITIONS[:2]))
+    assert len(set(read_landmark_file(path).names)) == 2
+
+
 def test_extreme_numbers_keep_all_digits(tmp_path):
     numbers = [[1 / 3, 5e-324, -0.0], [1e60, -1e60, 0.1 + 0.2], [1e22, 123456789.123456789, 2.0]]
-    for suffix in WRITTEN:
+    for suffix in (*WRITTEN, *PLAIN):
         landmarks = Landmarks(("a", "b", "c"), np.array(numbers), "RAS")
         write_landmark_file(tmp_path / f"p{suffix}", landmarks)
         assert (
@@ -138,6 +158,15 @@ MPS = "<point_set_file><point_set><time_series><time_series_id>0</time_series_id
         ("p.pp", '<PickedPoints><point x="1" y="2" z="3" name="a"/><point active="1" name="b" z="600" y=".5" x="-4.5"/></PickedPoints>', EXPECTED, None),
         ("p.pp", '<?xml version="1.0" encoding="UTF-8"?><!DOCTYPE PickedPoints><PickedPoints><point x="1" y="2" z="3"/><point name=" " z="600" y=".5" x="-4.5"/></PickedPoints>', UNNAMED, None),
         ("p.mps", MPS.format(PLACES), UNNAMED, "LPS"),
+        ("p.tps", "LM3=2\n1 2 3\n-4.5 .5 6e2\nIMAGE=a.png\nID=skull 3\n", UNNAMED, None),
+        ("p.tps", "lm=2\r\n1 2 3\r\n-4.5 0.5 600\r\n", UNNAMED, None),
+        ("p.nts", '"a skull\n1 2 3 0 dim=3\n1 2 3\n-4.5 0.5 600\n', UNNAMED, None),
+        ("p.nts", "1 2L 3 0 DIM=3\na b\n1 2 3\n-4.5 0.5 600\n", EXPECTED, None),
+        ("p.nts", "1 1L 6 1 9999 Dim=3\nskull3\n1 2 3\n-4.5 0.5 600\n", UNNAMED, None),
+        ("p.pts", "Version 1.0\n2\na  1.0 2.0 3.0\nb -4.5 .5 6e2\n", EXPECTED, None),
+        ("p.pts", "version: 1\nn_points: 2\n{\n1 2 3\n-4.5 0.5 600\n}\n", UNNAMED, None),
+        ("p.pts", "1 2 3\n-4.5 0.5 600\n", UNNAMED, None),
+        ("p.json", '[{"id":"a","coordinates":[1,2,3]},{"id":"b","description":"x","coordinates":[-4.5,0.5,6e2]}]', EXPECTED, None),
         ("p.mps", f"<point_set_file><point_set>{PLACES}</point_set></point_set_file>", UNNAMED, "LPS"),
     ],
 )  # fmt: skip
@@ -156,6 +185,30 @@ def markups(*points: object, **properties: object) -> str:
 
 def point(label: str, *position: object, **properties: object) -> dict[str, object]:
     return {"label": label, "position": position, **properties}
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("p.tps", "LM3=2\nnan NaN nan\n1 2 3\nSCALE=0.5\n"),
+        ("p.nts", "1 2 3 1 -999 dim=3\n-999 -999 -999\n1 2 3\n"),
+        ("p.pts", "Version 1.0\n2\nS000 9999 9999 9999\nS001 1 2 3\n"),
+    ],
+)
+def test_missing_landmarks_of_morphometric_files_are_left_out(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    landmarks = read_landmark_file(tmp_path / name)
+    assert landmarks.positions.tolist() == [[1, 2, 3]] and landmarks.names == (
+        "S001" if name == "p.pts" else "2",
+    )
+    assert "1 of 2 points left out" in landmarks.notes[-1]
+    assert (name == "p.tps") == (landmarks.notes[0] == "The lines SCALE were ignored.")
+
+
+def test_slicers_files_may_be_called_json(tmp_path):
+    write_landmark_file(tmp_path / "a.mrk.json", EXPECTED.stated("RAS"))
+    (tmp_path / "a.mrk.json").rename(tmp_path / "a.json")
+    assert same(read_landmark_file(tmp_path / "a.json"), EXPECTED)
 
 
 def test_undefined_points_are_left_out_with_a_note(tmp_path):
@@ -287,7 +340,35 @@ HOSTILE = [
     ("p.txt", "1 2 3\n" * (2**20 + 1), "more than 1048576 landmarks"),
     ("p.pp", "<PickedPoints>" + "<point />" * (2**20 + 1), "more than 1048576 landmarks"),
     ("p.vtk", "a,1,2,3\n", "suffix '.vtk'"),
-    ("p.json", markups(A), "suffix '.json'"),
+    ("p.tps", "1 2 3\n", "has no line LM3=NUMBER"),
+    ("p.tps", "LM=2\n1 2\n3 4\n", "2 coordinates instead of three"),
+    ("p.tps", "LM3=x\n1 2 3\n", "line 1 does not state the number"),
+    ("p.tps", "LM3=3\n1 2 3\n", "declares 3 landmarks, but contains 1"),
+    ("p.tps", "LM3=1\n1 2 3\n4 5 6\n", "has more than the declared 1 landmark"),
+    ("p.tps", "LM3=1\n1 2 3\nID=a\nLM3=1\n1 2 3\nID=b\n", "contains 2 specimens"),
+    ("p.tps", "LM3=1\n1 2 3,5\n", "write decimals with a point"),
+    ("p.tps", "LM3=0\nID=a\n", "contains no landmarks"),
+    ("p.nts", "1 2 3\n4 5 6\n", "header of an NTSYS matrix"),
+    ("p.nts", "2 2 3 0\n1 2 3\n4 5 6\n", "header of an NTSYS matrix"),
+    ("p.nts", '"only a comment\n', "header of an NTSYS matrix"),
+    ("p.nts", "1 2 2 0 dim=2\n1 2\n3 4\n", "landmarks with 2 coordinates"),
+    ("p.nts", "1 5 30 0 dim=3\n1 2 3\n", "contains 5 rows of 30 numbers"),
+    ("p.nts", "1 3 3 0 dim=3\n1 2 3\n4 5 6\n", "declares 3 landmarks, but contains 2"),
+    ("p.nts", "1 2L 3 0 dim=3\na a\n1 2 3\n4 5 6\n", "the same name 'a'"),
+    ("p.nts", "1 1L 3 0 dim=3\n1 2 3\n", "but contains 0"),
+    ("p.pts", "Version 1.0\n3\nS0 1 2 3\n", "declares 3 landmarks, but contains 1"),
+    ("p.pts", "Version 1.0\nS0 1 2 3\n", "line 2 does not state the number"),
+    ("p.pts", "Version 1.0\n", "line 2 does not state the number"),
+    ("p.pts", "Version 1.0\n1\nS0 1 2\n", "2 coordinates instead of three"),
+    ("p.pts", "version: 1\nn_points: 1\n{\n1 2\n}\n", "landmarks of a mesh, not of a picture"),
+    ("p.pts", "version: 1\nn_points: 2\n{\n1 2 3\n}\n", "declares 2 landmarks, but contains 1"),
+    ("p.pts", "version: 1\nn_points: 1\n{\n1 2 3\n", "between braces"),
+    ("p.json", "[{}]", "coordinates that are not a list"),
+    ("p.json", "[1]", "neither a list of landmarks of Scalismo nor"),
+    ("p.json", '{"id": "a"}', "neither a list of landmarks of Scalismo nor"),
+    ("p.json", '[{"id": 3, "coordinates": [1, 2, 3]}]', "an id that is not text"),
+    ("p.json", '[{"id": "a", "coordinates": [1, 2]}]', "three numbers"),
+    ("p.json", "[]", "contains no landmarks"),
     ("p", "a,1,2,3\n", "suffix ''"),
 ]  # fmt: skip
 
@@ -328,7 +409,7 @@ def test_no_truncated_file_is_read_with_a_wrong_position(tmp_path, suffix):
 
 def test_files_that_cannot_be_written_leave_nothing_behind(tmp_path):
     landmarks = Landmarks(("a",), np.zeros((1, 3)), "LPS")
-    for name in ("p.mps", "p.vtk", "p.json", "missing/p.csv"):
+    for name in ("p.mps", "p.vtk", "p.xml", "missing/p.csv"):
         with pytest.raises(InputError):
             write_landmark_file(tmp_path / name, landmarks)
     assert not list(tmp_path.iterdir())

@@ -3,7 +3,9 @@
 import dataclasses
 import errno
 import itertools
+import math
 import os
+import re
 import struct
 from collections import Counter
 from pathlib import Path
@@ -190,7 +192,7 @@ def test_welding_joins_positions_that_differ_by_rounding_and_both_zeros_are_equa
     """Rounding splits a vertex if the gap is at most a hundredth of the shortest edge."""
     vertices = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-0.0, 0, 0], [1 + gap, 0, 0], [0, -1, 0]]
     faces = [[0, 1, 2], [3, 5, 4]]
-    welded = make_mesh(vertices, faces, weld=True)
+    welded = make_mesh(vertices, faces, weld=0.0)
     assert welded.faces.tolist() == [[0, 1, 2], [0, 5, 1 if joined else 4]]
     assert welded.vertices.tolist() == vertices
     reported = sum("4 boundary vertices" in note for note in make_mesh(vertices, faces).notes)
@@ -200,7 +202,68 @@ def test_welding_joins_positions_that_differ_by_rounding_and_both_zeros_are_equa
 def test_rounding_never_closes_a_short_edge():
     """A small triangle lies at the corner of a large one, whose edges are 500 times longer."""
     vertices = [[0, 0, 0], [100, 0, 0], [0, 100, 0], [0.2, 0, 0], [0.4, 0, 0], [0.2, -0.2, 0]]
-    assert coincident_vertices(np.array(vertices), np.array([[0, 1, 2], [3, 5, 4]])).tolist() == [*range(6)]
+    lowest, widest = coincident_vertices(np.array(vertices), np.array([[0, 1, 2], [3, 5, 4]]))
+    assert lowest.tolist() == [*range(6)] and widest == 0
+
+
+def cracked(width: float) -> tuple[np.ndarray, np.ndarray]:
+    """A grid of 1 x 1 squares, cut along the middle into halves that are apart by a width with 30 % of noise."""
+    x, y = np.meshgrid(np.arange(11.0), np.arange(6.0))
+    left = np.stack([x.ravel(), y.ravel(), np.zeros(66)], axis=1)
+    noise = np.random.default_rng(0).uniform(0.7, 1, size=66)
+    right = left + np.stack([10 + width * noise, np.zeros(66), np.zeros(66)], axis=1)
+    corner = (np.arange(10) + 11 * np.arange(5)[:, None]).ravel()[:, None]
+    faces = np.concatenate([corner + np.array([0, 1, 12]), corner + np.array([0, 12, 11])])
+    return np.concatenate([left, right]), np.concatenate([faces, faces + 66])
+
+
+@pytest.mark.parametrize(
+    ("width", "weld", "joined"),
+    [
+        (0.0, True, True),
+        (0.005, 0.0, True),
+        (0.05, 0.0, False),
+        (0.05, True, True),
+        (0.15, True, True),
+        (0.24, True, True),
+        (0.5, True, False),
+        (0.5, 0.3, False),
+        (0.5, 0.6, True),
+        (0.05, 0.02, False),
+        (0.5, 100.0, True),
+    ],
+)
+def test_cracks_are_welded_up_to_the_tolerance_or_the_gap(width, weld, joined):
+    vertices, faces = cracked(width)
+    mesh = make_mesh(vertices, faces, weld=weld)
+    assert diagnose(mesh).components == (1 if joined else 2)
+    assert len(mesh.faces) == len(faces) and mesh.vertices.tobytes() == vertices.tobytes()
+    said = re.search(r"vertices up to (0\.\d+) apart became one", " ".join(mesh.notes))
+    assert bool(said) == (joined and width > 0.01)
+    assert said is None or 0.9 * width < float(said[1]) <= width
+
+
+def test_lips_at_all_distances_stay_apart():
+    """Without a gap between the widths of a slit and the lengths of edges, only rounding is closed."""
+    vertices, faces = cracked(0.0)
+    vertices[66::11, 0] += np.array([0.0, 0.02, 0.06, 0.15, 0.3, 0.9])
+    mesh = make_mesh(vertices, faces, weld=True)
+    assert diagnose(mesh).components == 1
+    assert "at the same position became one" in " ".join(mesh.notes)
+
+
+@pytest.mark.parametrize("weld", [-1.0, math.nan, math.inf])
+def test_impossible_tolerances_are_refused(weld):
+    with pytest.raises(InputError, match=r"weld is .*give a finite number of at least 0"):
+        make_mesh(*cracked(0.1), weld=weld)
+
+
+def test_a_soup_of_triangles_is_named():
+    soup = unwelded(OCTAHEDRON)
+    assert "This is a soup of triangles: no two of its 8 triangles share a vertex." in " ".join(soup.notes)
+    apart = make_mesh(soup.vertices + 3 * np.repeat(np.arange(8.0), 3)[:, None], soup.faces)
+    assert "no two of its 8 triangles share a vertex." in " ".join(apart.notes)
+    assert "soup" not in " ".join(make_mesh(soup.vertices, soup.faces, weld=True).notes)
 
 
 @pytest.mark.parametrize("stray", [np.nan, np.inf, -np.inf])

@@ -21,7 +21,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.io import MeshData, Skin, Texture, read_mesh, read_mesh_data, write_mesh, write_mesh_data
 
-SUFFIXES = [".off", ".obj", ".ply", ".stl", ".mat", ".vtk", ".vtp", ".gltf", ".glb", ".npz"]
+SUFFIXES = [".off", ".obj", ".ply", ".stl", ".mat", ".vtk", ".vtp", ".gltf", ".glb", ".npz", ".gii", ".pial"]
 # What the formats keep of the sample: vertex data, face data, and other attributes.
 ALL_VERTEX_DATA = {"colors", "temperature", "flow", "index", "flags", "short", "long"}
 KEPT = {
@@ -39,8 +39,10 @@ KEPT = {
         {"colors", "group", "stress"},
         {"texture", "blend_shapes", "skin", "label_names"},
     ),
+    ".gii": (ALL_VERTEX_DATA, set(), set()),
+    ".pial": (set(), set(), set()),
 }
-SINGLE = (".stl", ".gltf", ".glb")  # formats with float32
+SINGLE = (".stl", ".gltf", ".glb", ".gii", ".pial")  # formats with float32
 
 
 def close(suffix: str) -> float:

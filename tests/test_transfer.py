@@ -390,6 +390,27 @@ class TestLandmarks:
         assert len(moved.notes) == 1 and "'c'" in moved.notes[0]
         assert moved.source_distances[2] > 0.3 > 1e-9 > moved.source_distances[[0, 1, 3, 4]].max()
 
+    @pytest.mark.parametrize("matrix", [TURN, MIRROR])
+    def test_landmarks_off_the_surface_follow_the_space_around(self, matrix):
+        """A similarity moves all points of space exactly. On the surface, the result is the usual one."""
+        mesh = bumpy_mesh(3)
+        registered = on_same_numbering(mesh, moved(mesh, 2 * matrix))
+        off = Landmarks(
+            ("middle", "inside", "outside"), np.array([[0.0, 0, 0], [0.2, 0.1, 0.3], [1.5, 0.2, 0.1]])
+        )
+        carried = transfer_landmarks(off, registered, off_surface=True)
+        assert np.allclose(carried.landmarks.positions, off.positions @ (2 * matrix).T + SHIFT, atol=1e-4)
+        assert carried.notes == () and (carried.source_distances > 0.2).all()
+        on = Landmarks(("a", "b"), mesh.vertices[[3, 100]])
+        usual, spline = (transfer_landmarks(on, registered, off_surface=off) for off in (False, True))
+        assert np.allclose(spline.landmarks.positions, usual.landmarks.positions, atol=1e-6)
+
+    def test_landmarks_of_another_place_are_refused(self):
+        mesh = bumpy_mesh(2)
+        registered = on_same_numbering(mesh, moved(mesh, np.eye(3)))
+        with pytest.raises(InputError, match=r"'far' is .* whose diagonal is .* in its unit"):
+            transfer_landmarks(Landmarks(("far",), np.full((1, 3), 1000.0)), registered, off_surface=True)
+
     def test_the_other_coordinate_system_is_refused(self):
         mesh_x = moved(self.mesh_x, np.eye(3))
         registered = on_same_numbering(mesh_x, self.mesh_y)

@@ -162,7 +162,30 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
 
 def add_weld(parser: argparse.ArgumentParser) -> None:
     """Add `--weld`."""
-    parser.add_argument("--weld", action="store_true", help="merge vertices at the same position")
+    parser.add_argument(
+        "--weld",
+        metavar="TOLERANCE",
+        nargs="?",
+        const=True,
+        default=False,
+        type=_tolerance,
+        help="merge vertices at the same position, and vertices at boundaries up to this distance, in the "
+        "unit of the mesh (default: decided from the gap between the widths of cracks and the lengths of "
+        "edges)",
+    )
+
+
+def _tolerance(text: str) -> float:
+    """An argument type for lengths of at least 0. Python would take a mesh behind `--weld` for its length."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if 0 <= number < math.inf:
+        return number
+    raise argparse.ArgumentTypeError(
+        f"{shortened(text)!r} is not a length: give a number, or put --weld behind the meshes"
+    )
 
 
 def add_partial(parser: argparse.ArgumentParser, *, with_scale: bool) -> None:
@@ -197,7 +220,7 @@ def refuse_without(options: argparse.Namespace, needed: str, is_given: bool, *na
     """Refuse the options `names`, which have no effect, unless the option `needed` is given."""
     for name in names:
         value = getattr(options, name)
-        if not is_given and value is not None and value is not False:
+        if not is_given and value is not None and value is not False and value != []:
             option = option_of(name)
             raise InputError(
                 f"{option}: has no effect without {needed}: add {needed}, or leave {option} out."

@@ -75,6 +75,7 @@ def check_collection(options: argparse.Namespace) -> dict[str, Path]:
 def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
     """Return the paths of the mesh files that are not excluded, by their names and in alphabetical order."""
     from jaxsmw.io.meshes import MESH_SUFFIXES
+    from jaxsmw.io.overlays import OVERLAY_SUFFIXES
 
     directory = options.directory
     try:
@@ -83,6 +84,7 @@ def _mesh_files(options: argparse.Namespace) -> dict[str, Path]:
         raise InputError(
             f"{directory}: cannot be read as a directory ({error.strerror}): give a directory with meshes."
         ) from error
+    names = [name for name in names if not name.lower().endswith(OVERLAY_SUFFIXES)]
     files = {name: Path(directory) / name for name in names if name.lower().endswith(MESH_SUFFIXES)}
     for name in {Path(_inside(options, "exclude", file, files)).name for file in options.exclude}:
         del files[name]
@@ -191,8 +193,9 @@ def _note_other_files(options: argparse.Namespace) -> None:
     """Print a note that names the files that are neither meshes nor usual companions of meshes."""
     from jaxsmw.io.landmark_files import LANDMARK_SUFFIXES
     from jaxsmw.io.meshes import MESH_SUFFIXES
+    from jaxsmw.io.overlays import OVERLAY_SUFFIXES
 
-    usual = (*MESH_SUFFIXES, *LANDMARK_SUFFIXES, *_COMPANIONS)
+    usual = (*MESH_SUFFIXES, *LANDMARK_SUFFIXES, *OVERLAY_SUFFIXES, *_COMPANIONS)
     names = []
     for path in sorted(Path(options.directory).iterdir()):
         if not path.exists():

@@ -31,7 +31,7 @@ def check_inputs(*paths: str | None) -> None:
         size_of_file(file)
 
 
-def read_meshes(*files: str, weld: bool) -> list[Mesh]:
+def read_meshes(*files: str, weld: bool | float) -> list[Mesh]:
     """Read meshes, and print a summary of each as progress messages."""
     from jaxsmw.io.meshes import read_mesh
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import reduce
 from statistics import median
 from typing import TYPE_CHECKING, get_args
 
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     from jaxsmw.io.landmarks import Landmarks
-    from jaxsmw.io.mesh_data import MeshData
+    from jaxsmw.io.mesh_data import MeshData, Overlay
     from jaxsmw.matching.correspondence import Correspondence
     from jaxsmw.transfer.landmarks import TransferredLandmarks
     from jaxsmw.transfer.registered_mesh import RegisteredMesh
@@ -49,16 +51,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--registered FILE": "write the registered mesh to this file: the source with all its faces and "
             "attributes, and with positions on the target. The suffix determines the format",
             "--landmarks FILE": "landmarks on the source: .mrk.json and .fcsv of 3D Slicer, .pp of MeshLab, "
-            ".mps of MITK, or .csv and .txt with a name and a position per line",
+            ".mps of MITK, .tps, .nts and .pts of morphometrics, .json of Scalismo, or .csv and .txt with a "
+            "name and a position per line",
             "--landmarks-output FILE": "write the landmarks on the target to this file, in one of these "
             "formats except .mps",
+            "--blend-shapes DIR": "blend shapes of the source: a folder of OBJ files with its vertices in "
+            "the same order. They are part of the attributes",
+            "--blend-shapes-output DIR": "write the target in each blend shape of the source to this folder, "
+            "as OBJ files",
+            "--map-output FILE": "write the map that was computed to this file, like match --output",
         },
+    )
+    parser.add_argument(
+        "--overlay",
+        metavar="FILE",
+        type=path,
+        action="append",
+        default=[],
+        help="data on the vertices of the source, as GIFTI (.func.gii, .shape.gii, .label.gii) or from "
+        "FreeSurfer (.annot, lh.curv): part of the attributes. Repeat the option for several files",
+    )
+    parser.add_argument(
+        "--overlay-output",
+        metavar="FILE",
+        type=path,
+        action="append",
+        default=[],
+        help="write an overlay on the target to this file, in one of these formats. Give as many files as "
+        "for --overlay, in the same order",
     )
     parser.add_argument(
         "--coordinates",
         choices=get_args(CoordinateSystem),
         help="coordinate system of both meshes, to which landmarks are converted. By default, the coordinate "
         "system of the landmark file is assumed",
+    )
+    parser.add_argument(
+        "--off-surface",
+        action="store_true",
+        help="landmarks lie off the surface on purpose, for example inside a skull: the deformation of the "
+        "space around the source moves them",
     )
     parser.add_argument(
         "--attributes",
@@ -92,6 +124,7 @@ def run(options: argparse.Namespace) -> None:
     stopwatch = Stopwatch()
     with stopwatch.step("loading"):
         _check(options)
+    from jaxsmw.io.blend_shapes import read_blend_shapes
     from jaxsmw.io.meshes import read_mesh_data
 
     with stopwatch.step("reading"):
@@ -100,6 +133,14 @@ def run(options: argparse.Namespace) -> None:
         )
         for file, data in ((options.source, source), (options.target, target)):
             report_mesh(file, data.mesh)
+        overlays = _read_overlays(options, source)
+        bare, source = source, reduce(lambda data, overlay: overlay.added_to(data), overlays, source)
+        if options.blend_shapes:
+            source = read_blend_shapes(options.blend_shapes, source)
+        if options.blend_shapes_output and not source.blend_shapes:
+            raise InputError(
+                f"{options.source}: has no blend shapes for --blend-shapes-output: add --blend-shapes DIR."
+            )
         if options.attributes and not source.has_attributes:
             raise InputError(
                 f"{options.source}: has no attributes (colours, labels, texture coordinates, blend shapes, a "
@@ -121,12 +162,18 @@ def run(options: argparse.Namespace) -> None:
             f"warning: {registered.flipped_faces.mean():.1%} of the triangles are flipped, so the map is "
             f"probably wrong: {cure}."
         )
-    if options.registered or options.attributes:
+    if options.registered or options.attributes or options.blend_shapes_output:
         _write_meshes(options, source, target, registered, stopwatch)
+    _write_overlays(options, bare, overlays, registered, stopwatch)
     transferred = None
     if landmarks:
         expected = None if correspondence is None else correspondence.expected_error()
         transferred = _transfer_landmarks(options, landmarks, expected, registered, stopwatch)
+    if correspondence is not None and options.map_output:
+        from jaxsmw.io.maps import write_pointwise_map
+
+        write_pointwise_map(options.map_output, correspondence.pointwise_map)
+        report_written(options.map_output)
     if correspondence is not None and options.report:
         write_match_report(
             options.report,
@@ -143,16 +190,30 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
-    if not (options.registered or options.landmarks_output or options.attributes or options.report):
+    outputs = options.registered, options.landmarks_output, options.attributes, options.overlay_output
+    if not (any(outputs) or options.map_output or options.blend_shapes_output or options.report):
         raise InputError(
-            "nothing to write: give --registered FILE, --attributes FILE, --report DIR, or --landmarks FILE "
-            "with --landmarks-output FILE."
+            "nothing to write: give --registered FILE, --attributes FILE, --map-output FILE, --report DIR, "
+            "--landmarks FILE with --landmarks-output FILE, or --overlay FILE with --overlay-output FILE."
         )
-    refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_output", "coordinates")
+    if options.overlay_output and len(options.overlay_output) != len(options.overlay):
+        raise InputError(
+            f"--overlay-output is given {len(options.overlay_output)} times and --overlay "
+            f"{len(options.overlay)} times: give one output for each overlay."
+        )
+    carried = bool(options.overlay_output or options.attributes or options.registered)
+    refuse_without(options, "--overlay-output or --attributes", carried, "overlay")
+    carried = bool(options.blend_shapes_output or options.attributes or options.registered)
+    refuse_without(options, "--blend-shapes-output or --attributes", carried, "blend_shapes")
+    refuse_without(
+        options, "--landmarks", bool(options.landmarks), "landmarks_output", "coordinates", "off_surface"
+    )
     written = options.landmarks_output or options.report
     refuse_without(options, "--landmarks-output or --report", bool(written), "landmarks")
     if options.map and (names := given_method(options)):
         raise InputError(f"{names[0]} has no effect with --map: give one of the two.")
+    if options.map and options.map_output:
+        raise InputError("--map-output: writes a computed map, but --map gives one: leave one of them out.")
     if options.map and options.report:
         raise InputError("--report: describes a match, but --map gives a map: leave one of the two out.")
     refuse_without(options, "--partial", options.partial, "scale")
@@ -161,7 +222,9 @@ def _check(options: argparse.Namespace) -> None:
     reads_indices = bool(options.map or options.init.files)
     refuse_without(options, "--map or a file of --init", reads_indices, "index_base")
     from jaxsmw.io.landmark_files import check_landmark_suffix, check_readable_suffix
+    from jaxsmw.io.maps import check_map_name
     from jaxsmw.io.meshes import check_attribute_suffix, check_mesh_suffix
+    from jaxsmw.io.overlays import check_overlay_name
 
     if options.registered:
         check_mesh_suffix(options.registered)
@@ -171,11 +234,20 @@ def _check(options: argparse.Namespace) -> None:
         check_readable_suffix(options.landmarks)
     if options.landmarks_output:
         check_landmark_suffix(options.landmarks_output)
+    if options.map_output:
+        check_map_name(options.map_output)
+    for file in options.overlay_output:
+        check_overlay_name(file)
     inputs = [options.source, options.target, options.map, options.landmarks, *options.init.files]
+    inputs += options.overlay
     check_inputs(*inputs)
     check_outputs(
-        inputs,
-        files=[options.registered, options.attributes, options.landmarks_output],
+        [*inputs, options.blend_shapes],
+        directories=[(options.blend_shapes_output, [])] if options.blend_shapes_output else [],
+        files=[
+            *(options.registered, options.attributes, options.landmarks_output, options.map_output),
+            *options.overlay_output,
+        ],
         report=options.report,
     )
     import jaxsmw.matching.match  # noqa: F401 (imported here because loading is timed separately)
@@ -210,8 +282,43 @@ def _read_landmarks(options: argparse.Namespace, source: MeshData) -> Landmarks:
     # Errors in the landmarks are found before the long computation.
     if options.landmarks_output:
         check_known_system(options.landmarks_output, landmarks)
-    check_frame(landmarks, source.mesh)
+    if not options.off_surface:
+        check_frame(landmarks, source.mesh)
     return landmarks
+
+
+def _read_overlays(options: argparse.Namespace, source: MeshData) -> list[Overlay]:
+    """Read the overlays of the source, and check that they fit it and have different names."""
+    from jaxsmw.io.overlays import read_overlay
+
+    overlays = [read_overlay(file) for file in options.overlay]
+    for overlay in overlays:
+        overlay.added_to(source)
+        for note in overlay.notes:
+            say(f"note: {overlay.name}: {note}")
+    return overlays
+
+
+def _write_overlays(
+    options: argparse.Namespace,
+    source: MeshData,
+    overlays: list[Overlay],
+    registered: RegisteredMesh,
+    stopwatch: Stopwatch,
+) -> None:
+    """Write each overlay on the target."""
+    from jaxsmw.io.mesh_data import MeshData
+    from jaxsmw.io.overlays import write_overlay
+    from jaxsmw.transfer.attributes import transfer_attributes
+
+    bare = MeshData(source.mesh, source.faces)
+    for file, overlay in zip(options.overlay_output, overlays, strict=False):
+        with stopwatch.step("overlays"):
+            carried = transfer_attributes(overlay.added_to(bare), registered)
+            notes = write_overlay(file, overlay.with_values_of(carried))
+        for note in notes:
+            say(f"note: {file}: {note}")
+        report_written(file)
 
 
 def _register(
@@ -255,12 +362,15 @@ def _transfer_landmarks(
     from jaxsmw.transfer.landmarks import transfer_landmarks
 
     with stopwatch.step("landmarks"):
-        transferred = transfer_landmarks(landmarks, registered, expected_error=expected_error)
+        transferred = transfer_landmarks(
+            landmarks, registered, expected_error=expected_error, off_surface=options.off_surface
+        )
     for note in transferred.notes:
         say(f"note: {note}")
     _show_landmarks(transferred)
     if options.landmarks_output:
-        write_landmark_file(options.landmarks_output, transferred.landmarks)
+        for note in write_landmark_file(options.landmarks_output, transferred.landmarks):
+            say(f"note: {options.landmarks_output}: {note}")
         report_written(options.landmarks_output)
     return transferred.landmarks
 
@@ -290,16 +400,24 @@ def _write_meshes(
     stopwatch: Stopwatch,
 ) -> None:
     """Write the registered mesh, and the target with the attributes of the source."""
+    from jaxsmw.io.blend_shapes import write_blend_shapes
     from jaxsmw.transfer.attributes import registered_data, transfer_attributes
 
     if options.registered:
         _write(options.registered, registered_data(source, registered), stopwatch)
+    if not (options.attributes or options.blend_shapes_output):
+        return
+    with stopwatch.step("attributes", announced=True):
+        carried = transfer_attributes(source, registered, target)
+    for note in carried.mesh.notes[len(target.mesh.notes) :]:
+        say(f"note: {note}")
     if options.attributes:
-        with stopwatch.step("attributes", announced=True):
-            carried = transfer_attributes(source, registered, target)
-        for note in carried.mesh.notes[len(target.mesh.notes) :]:
-            say(f"note: {note}")
         _write(options.attributes, carried, stopwatch)
+    if options.blend_shapes_output:
+        own = replace(
+            carried, blend_shapes={name: carried.blend_shapes[name] for name in source.blend_shapes}
+        )
+        report_written(*write_blend_shapes(options.blend_shapes_output, own))
 
 
 def _write(file: str, data: MeshData, stopwatch: Stopwatch) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array, csgraph
 from scipy.spatial import KDTree
 
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, check_number
 from jaxsmw.geometry.arrays import first_equal_rows, ranges, sides_of
 from jaxsmw.geometry.scans import between_neighbors, in_small_components, lost_vertices
 from jaxsmw.wording import count_of
@@ -41,6 +41,10 @@ LARGEST_COORDINATE, LARGEST_DISTANCE = 1e12, 1e6
 # Two boundary vertices are one vertex, which rounding has split, if their distance is at most this share of
 # the shortest edge at both. Numbers with six digits, which many programs write, stay below this share.
 _ROUNDING = 0.01
+# Welding without a tolerance looks for cracks: distances below `_CRACK` shortest edges, which a factor of at
+# least `_GAP` separates from the distances above them. Vertices at a boundary without a crack are one edge
+# apart.
+_CRACK, _GAP = 0.25, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -368,7 +372,7 @@ def make_mesh(
     faces: ArrayLike | None = None,
     *,
     name: str = "mesh",
-    weld: bool = False,
+    weld: bool | float = False,
     notes: Sequence[str] = (),
 ) -> Mesh:
     """Make a mesh from vertices and faces, or from a mesh of another library, after checks and cleaning.
@@ -395,10 +399,13 @@ def make_mesh(
     - `faces`: vertex indices (f, 3), 0-based, as integers or as floats with integer values. The array is
       copied.
     - `name`: the name of the mesh in messages.
-    - `weld`: whether to merge vertices at the same position. If True, faces use only the lowest-numbered
-      vertex at each position, and the others become unreferenced. Welding closes seams along which some
-      programs duplicate vertices. Vertices at the boundary are also merged if rounding can explain their
-      distance, which is then at most 1 % of the shortest edge at both.
+    - `weld`: whether to merge vertices at the same position. Faces then use only the lowest-numbered vertex
+      at each position, and the others become unreferenced. Welding closes seams along which some programs
+      duplicate vertices. Vertices at the boundary are also merged if their distance is at most 1 % of the
+      shortest edge at both, which rounding can explain. A number is a tolerance in the unit of the vertices:
+      vertices at the boundary up to this distance are merged as well, but never the ends of an edge. True
+      finds the tolerance from a gap: if many boundary vertices are less than a quarter of the shortest edge
+      apart, and no others are less than four times as far apart, they are merged. A note states the distance.
     - `notes`: sentences to which this function appends its own notes.
 
     **Returns:** A `Mesh`. Its `notes` report how many faces were dropped or changed by welding, lost
@@ -423,12 +430,15 @@ def make_mesh(
         position = between_neighbors(position, triangles, lost)
     check_extent(position, name)
 
-    if weld:
-        lowest = coincident_vertices(position, triangles)
+    if weld is not False:
+        if weld is not True:
+            check_number("weld", weld)
+        lowest, widest = coincident_vertices(position, triangles, weld)
         welded = int((lowest[triangles] != triangles).any(axis=1).sum())
         triangles = lowest[triangles]
+        place = f"up to {widest:.3g} apart" if widest else "at the same position"
         notes.append(
-            f"Welding changed {count_of(welded, 'face')}: vertices at the same position became one."
+            f"Welding changed {count_of(welded, 'face')}: vertices {place} became one."
             if welded
             else "Welding changed nothing: no two vertices of faces have the same position."
         )
@@ -488,7 +498,11 @@ def _distinct_faces(triangles: Int64[np.ndarray, "f 3"]) -> tuple[Int64[np.ndarr
 def _unusual_vertices(mesh: Mesh) -> list[str]:
     """Return notes about vertices that appear to be duplicated along a seam, and unreferenced vertices."""
     notes = []
-    if seam := int(_split_vertices(mesh)[1].sum()):
+    if len(mesh.faces) > 2 and len(mesh.referenced_indices) == mesh.faces.size:
+        notes.append(
+            f"This is a soup of triangles: no two of its {len(mesh.faces)} triangles share a vertex."
+        )
+    if seam := int(_split_vertices(mesh).sum()):
         notes.append(
             f"{count_of(seam, 'boundary vertex')} with another boundary vertex at the same position: if the "
             "surface should be closed there, weld it (`weld=True`)."
@@ -601,29 +615,67 @@ def _indices(faces: np.ndarray, n: int, name: str) -> Int64[np.ndarray, "f 3"]:
 
 
 def coincident_vertices(
-    position: Float64[np.ndarray, "n 3"], triangles: Int64[np.ndarray, "f 3"]
-) -> Int64[np.ndarray, " n"]:
-    """Return the lowest-numbered vertex at each vertex's position (n,), up to rounding at boundaries."""
+    position: Float64[np.ndarray, "n 3"], triangles: Int64[np.ndarray, "f 3"], weld: bool | float = 0.0
+) -> tuple[Int64[np.ndarray, " n"], float]:
+    """Return the lowest-numbered vertex at each vertex's position (n,), and the largest distance of a merged
+    pair.
+
+    `weld` is as for `make_mesh`; 0 merges boundary vertices only up to rounding. The distance is 0 if
+    rounding can explain all merged pairs.
+    """
     n = len(position)
-    lowest = first_equal_rows(position)
+    lowest, widest, limit = first_equal_rows(position), 0.0, 0.0
     while True:
         corners = lowest[triangles]
         whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-        pairs, split = _split_vertices(Mesh(position, corners[whole]))
+        pairs, distances, shortest = _near_vertices(Mesh(position, corners[whole]))
+        if weld is True:
+            limit = limit or _crack_width(distances / shortest)
+            split = distances <= np.maximum(limit, _ROUNDING) * shortest
+        else:
+            # The ends of an edge are not nearer to each other than the shortest edge is long.
+            split = (distances <= np.maximum(weld, _ROUNDING * shortest)) & (distances < shortest)
         if not split.any():
-            return lowest
+            return lowest, widest
+        beyond = split & (distances > _ROUNDING * shortest)
+        widest = max(widest, float(distances[beyond].max(initial=0.0)))
         _, group = connected_components(pairs[split], n)
         lowest = np.unique(group, return_index=True)[1][group][lowest]
 
 
-def _split_vertices(mesh: Mesh) -> tuple[Int64[np.ndarray, "b 2"], Bool[np.ndarray, " b"]]:
-    """Pair each boundary vertex with the nearest other one, and mark the pairs that rounding can explain."""
+def _crack_width(relative: Float64[np.ndarray, " b"]) -> float:
+    """Return the width of cracks in units of the shortest edges, or 0 if no gap separates them from other
+    pairs.
+
+    `relative` contains the distance from each boundary vertex to the nearest other one, in the same unit.
+    """
+    ordered = np.append(np.sort(np.maximum(relative, _ROUNDING)), np.inf)
+    # Without cracks, the nearest vertex is an end of an edge.
+    gaps = np.minimum(ordered[1:], 1.0) / ordered[:-1]
+    found = np.flatnonzero((ordered[:-1] < _CRACK) & (gaps >= _GAP))
+    return float(ordered[found[-1]]) if len(found) else 0.0
+
+
+def _split_vertices(mesh: Mesh) -> Bool[np.ndarray, " b"]:
+    """Return which boundary vertices are so near to another one that rounding can explain it."""
+    _, distances, shortest = _near_vertices(mesh)
+    return distances <= _ROUNDING * shortest
+
+
+def _near_vertices(
+    mesh: Mesh,
+) -> tuple[Int64[np.ndarray, "b 2"], Float64[np.ndarray, " b"], Float64[np.ndarray, " b"]]:
+    """Pair each boundary vertex with the nearest other one. Return the pairs, their distances, and the
+    shortest edges.
+
+    The shortest edges are those at either vertex of a pair.
+    """
     boundary = np.unique(mesh.boundary_edges)
     if not len(boundary):
-        return np.empty((0, 2), np.int64), np.empty(0, bool)
+        return np.empty((0, 2), np.int64), np.empty(0), np.empty(0)
     shortest = np.full(len(mesh.vertices), np.inf)
     lengths = mesh.lengths(mesh.edges)
     np.minimum.at(shortest, mesh.edges, lengths[:, None])
     distance, nearest = KDTree(mesh.vertices[boundary]).query(mesh.vertices[boundary], k=2)
     pairs = np.stack([boundary, boundary[nearest[:, 1]]], axis=1)
-    return pairs, distance[:, 1] <= _ROUNDING * shortest[pairs].min(axis=1)
+    return pairs, distance[:, 1], shortest[pairs].min(axis=1)

@@ -1,9 +1,9 @@
-"""Meshes together with their colours, textures, blend shapes, skins and other data."""
+"""Meshes together with their colours, textures, blend shapes, skins and other data, and overlays."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,6 +128,62 @@ class MeshData:
                     f"the array of labels {name!a} must contain integers from 0 to {len(names) - 1}, one for "
                     "each label name: correct the array or the names."
                 )
+
+
+class LabelTable(NamedTuple):
+    """The names of the labels 0, 1, … of an array.
+
+    **Attributes:**
+
+    - `names`: the names of the labels, a tuple of strings.
+    - `keys`: the number of each label in its file (labels,), int64.
+    - `colors`: the red, green, blue and alpha components of each label's colour, floats (labels, 4) from 0
+      to 1; None if the file has no colours.
+    """
+
+    names: tuple[str, ...]
+    keys: np.ndarray
+    colors: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Overlay:
+    """Numbers or labels on the n vertices of a mesh, from a file that does not contain the mesh itself.
+
+    **Attributes:**
+
+    - `values`: a dictionary from names to arrays (n,) or (n, c) with numbers for each vertex.
+    - `labels`: a dictionary from the names of arrays of labels 0, 1, … to their tables, each a `LabelTable`.
+    - `name`: the name of the overlay in messages. The name of an overlay from a file is the file's path.
+    - `notes`: a tuple of sentences about data that were left out.
+    """
+
+    values: Mapping[str, np.ndarray]
+    labels: Mapping[str, LabelTable] = field(default_factory=dict)
+    name: str = "overlay"
+    notes: tuple[str, ...] = ()
+
+    def added_to(self, data: MeshData) -> MeshData:
+        """Return the data of a mesh with those of the overlay, which replace vertex data of the same name.
+
+        **Raises:** `InputError` if the overlay does not have one row for each vertex of the mesh.
+        """
+        n = len(data.mesh.vertices)
+        for name, values in self.values.items():
+            if len(values) != n:
+                raise InputError(
+                    f"{self.name}: has values {name!a} for {count_of(len(values), 'vertex')}, but "
+                    f"{data.mesh.name} has {n}: give an overlay of this mesh."
+                )
+        kept = {name: names for name, names in data.label_names.items() if name not in self.values}
+        own = {name: table.names for name, table in self.labels.items()}
+        vertex_data = {**data.vertex_data, **self.values}
+        face_data = {name: values for name, values in data.face_data.items() if name not in self.values}
+        return replace(data, vertex_data=vertex_data, face_data=face_data, label_names={**kept, **own})
+
+    def with_values_of(self, data: MeshData) -> Overlay:
+        """Return the overlay with the values that a mesh has under the same names."""
+        return replace(self, values={name: data.vertex_data[name] for name in self.values})
 
 
 def _rows(data: Mapping[str, Any], what: str, count: int, noun: str) -> dict[str, np.ndarray]:

@@ -37,6 +37,8 @@ from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, checked_texture
 from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
 
+# The usual suffixes of FreeSurfer's surfaces. Surfaces with other suffixes are known by their first bytes.
+_FREESURFER = (".pial", ".white", ".inflated", ".sphere", ".smoothwm", ".midthickness")
 # The functions that read and write files with a suffix, as "module:function". A module of `jaxsmw.io.formats`
 # is loaded when such a file is opened.
 _PARSERS = {
@@ -44,13 +46,33 @@ _PARSERS = {
     **{".mat": "mat:parse_mat", ".vtk": "vtk:parse_vtk", ".vtp": "vtp:parse_vtp", ".npz": "npz:parse_npz"},
     **{".gltf": "gltf:parse_gltf", ".glb": "gltf:parse_glb"},
     **{".xyz": "points:parse_xyz", ".pcd": "pcd:parse_pcd", ".npy": "points:parse_npy"},
+    **{".gii": "brain:parse_gifti"} | dict.fromkeys(_FREESURFER, "brain:parse_surface"),
 }
 _FORMATTERS = {
     **{".off": "off:format_off", ".obj": "obj:format_obj", ".ply": "ply:format_ply"},
     **{".stl": "stl:format_stl", ".mat": "mat:format_mat", ".vtk": "vtk:format_vtk"},
     **{".vtp": "vtp:format_vtp", ".npz": "npz:format_npz"},
     **{".gltf": "gltf_writing:format_gltf", ".glb": "gltf_writing:format_glb"},
+    **{".gii": "brain:format_gifti"} | dict.fromkeys(_FREESURFER, "brain:format_surface"),
 }
+# The first bytes of FreeSurfer's surfaces, and what messages list as the formats that can be read.
+_SURFACE = b"\xff\xff\xfe"
+_KNOWN = (*(suffix for suffix in _PARSERS if suffix not in _FREESURFER), "FreeSurfer's lh.pial")
+# What converts files that this library does not read, by their suffixes.
+_CONVERTERS = {
+    **dict.fromkeys((".step", ".stp", ".iges", ".igs", ".brep", ".fcstd"), "FreeCAD"),
+    **dict.fromkeys((".nii", ".mgz", ".nrrd", ".mha", ".dcm", ".tif"), "3D Slicer, which segments volumes,"),
+    **dict.fromkeys((".gz", ".bz2", ".zip"), "a program that unpacks it"),
+    **dict.fromkeys((".las", ".laz", ".e57", ".pts"), "CloudCompare"),
+    **dict.fromkeys((".vtu", ".vtm", ".vts", ".vti", ".msh", ".inp", ".mesh", ".med"), "ParaView or meshio"),
+    **dict.fromkeys((".ctm", ".wrl", ".x3d", ".asc", ".qobj", ".smf"), "MeshLab"),
+}
+
+
+def _converter(suffix: str) -> str:
+    return _CONVERTERS.get(suffix, "Blender or MeshLab")
+
+
 # The formats whose files begin with text, even if numbers are binary.
 _TEXT = (".off", ".obj", ".ply", ".vtk", ".pcd")
 MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
@@ -64,7 +86,7 @@ def _loaded(function: str) -> Callable[..., Any]:
     return getattr(import_module(f"jaxsmw.io.formats.{module}"), name)
 
 
-def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
+def read_mesh(path: str | os.PathLike[str], *, weld: bool | float = False) -> Mesh:
     """Read a triangle mesh, or a point cloud, from a file in any format of `read_mesh_data`.
 
     Vertices keep the order of the file. Corners of an STL file at the same position become one vertex, and
@@ -75,10 +97,11 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     **Arguments:**
 
     - `path`: the file. The suffix, in upper or lower case, determines the format: `.off`, `.obj`, `.ply`,
-        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.xyz`, `.pcd` or `.npy`.
-    - `weld`: if True, vertices at the same position are merged, as in `make_mesh`. Faces then use only the
-        lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so no vertex is
-        renumbered. The vertices of STL and glTF files are always welded.
+        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.gii`, `.xyz`, `.pcd` or `.npy`. Surfaces of
+        FreeSurfer, such as `lh.pial`, may have any other suffix.
+    - `weld`: if True or a tolerance, vertices at the same position are merged, as in `make_mesh`. Faces then
+        use only the lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so
+        no vertex is renumbered. The vertices of STL and glTF files are always welded.
 
     **Returns:** A `Mesh` whose `name` is the path, with positions (n, 3) in the unit of the file and 0-based
     faces (f, 3). The `notes` of the mesh report changes such as dropped faces, and peculiarities such as
@@ -92,7 +115,7 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool = False) -> Mesh:
     return read_mesh_data(path, weld=weld).mesh
 
 
-def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshData:
+def read_mesh_data(path: str | os.PathLike[str], *, weld: bool | float = False) -> MeshData:
     """Read a mesh together with all data on its vertices and faces.
 
     The data of each format:
@@ -119,6 +142,11 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
       Further attributes, morph targets and skins are read as well. If the file has several parts, the face
       data `group` contains 0-based integers, and `label_names` contains the names of the parts.
     - `.npz`: the arrays that `write_mesh_data` writes, such as `vertices`, `faces` and `vertex_data/NAME`.
+    - `.gii`: a GIFTI file with one surface, and all arrays with one row per vertex. Labels are numbered from
+      0 in the order of the file's table. Positions are those of the file, without its transform. GIFTI and
+      FreeSurfer's files need the extra `brain`.
+    - `.pial`, `.white`, `.inflated` and others: a surface of FreeSurfer, which contains no data. The geometry
+      of the volume is not read. `jaxsmw.io.read_overlay` reads data on the vertices from their own files.
     - `.xyz`: a text file with one point per line. Columns 4 to 6 become `normals` if they are unit vectors.
       Further columns are ignored.
     - `.pcd`: all fields of a file of the Point Cloud Library, which may be text, binary or compressed. The
@@ -148,10 +176,12 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
     data = read_bytes(path)
     suffix = path.suffix.lower()
     if suffix not in _PARSERS:
-        raise InputError(
-            f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
-            f"mesh to one of {', '.join(_PARSERS)}."
-        )
+        if not data.startswith(_SURFACE):
+            raise InputError(
+                f"{path}: the suffix {path.suffix!r} does not belong to a known mesh format: convert the "
+                f"mesh with {_converter(suffix)} to one of {', '.join(_KNOWN)}."
+            )
+        suffix = _FREESURFER[0]
     with naming(path):
         polygons = _parse(data, suffix, path.parent)
         is_strip = np.zeros(len(polygons.sizes), bool) if polygons.strips is None else polygons.strips
@@ -167,8 +197,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool = False) -> MeshD
         name: values[polygon] if values.ndim and len(values) > polygon.max(initial=-1) else values
         for name, values in polygons.face_data.items()
     }
+    if polygons.weld and weld is False:
+        weld = 0.0
     if len(faces) or not len(polygons.vertices):
-        mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld or polygons.weld, notes=notes)
+        mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld, notes=notes)
     else:
         normals = polygons.vertex_data.get(NORMALS)
         mesh = triangulate_points(polygons.vertices, normals, name=str(path), notes=notes)
@@ -270,15 +302,16 @@ def write_mesh_data(path: str | os.PathLike[str], data: MeshData) -> tuple[str, 
     """Write a mesh together with all data on its vertices and faces.
 
     `read_mesh_data` lists the formats, and reads the same data from the file, in the precision of the format:
-    float32 in STL and glTF files, and float64 in the other formats. Colours in OBJ files become floats.
-    Vertices keep their order in all formats except STL. glTF files need one texture vertex per vertex, so
-    vertices are duplicated along texture seams. The file records the duplicates, and `read_mesh_data` joins
-    them again. The write is atomic: an incomplete file never appears at `path`.
+    float32 in STL, glTF, GIFTI and FreeSurfer's files, and float64 in the other formats. Colours in OBJ
+    files become floats. Vertices keep their order in all formats except STL. glTF files need one texture
+    vertex per vertex, so vertices are duplicated along texture seams. The file records the duplicates, and
+    `read_mesh_data` joins them again. The write is atomic: an incomplete file never appears at `path`.
 
     **Arguments:**
 
     - `path`: the file to create or to replace. The suffix determines the format: `.off`, `.obj`, `.ply`,
-        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb` or `.npz`.
+        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.gii`, or one of FreeSurfer's suffixes
+        `.pial`, `.white`, `.inflated`, `.sphere`, `.smoothwm` and `.midthickness`.
     - `data`: a `MeshData`. The file contains all triangles of `data.faces`, including triangles that cleaning
         dropped from `data.mesh`.
 

@@ -7,12 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.interpolate import RBFInterpolator
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
-from jaxsmw.geometry.surface_distance import nearest_surface_points
+from jaxsmw.geometry.sampling import farthest_point_samples
+from jaxsmw.geometry.surface_distance import bounding_box_diagonal, nearest_surface_points
 from jaxsmw.io.landmarks import Landmarks, check_frame
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
+
+# The number of points of X that determine the deformation of space, and the smallest distance between two of
+# them, in units of the diagonal of the box around X.
+_CENTERS, _APART = 1000, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +27,9 @@ class TransferredLandmarks:
 
     **Attributes:**
 
-    - `landmarks`: the `Landmarks` on the surface of Y, in the unit of Y. The names of the coordinate system
-      and of the unit are those of the given landmarks. They are correct only if X and Y have the same ones.
+    - `landmarks`: the `Landmarks` on the surface of Y, or near it if `off_surface` was True, in the unit of
+      Y. The names of the coordinate system and of the unit are those of the given landmarks. They are
+      correct only if X and Y have the same ones.
     - `source_distances`: the distance from each landmark on X to the surface of X (l,), in the unit of X.
     - `expected_errors`: the expected error of each landmark on Y (l,), in the unit of Y; None if no expected
       errors were given.
@@ -40,18 +47,23 @@ def transfer_landmarks(
     registered: RegisteredMesh,
     *,
     expected_error: Float64[np.ndarray, " m"] | None = None,
+    off_surface: bool = False,
 ) -> TransferredLandmarks:
-    """Move landmarks from X to the surface of Y.
+    """Move landmarks from X to Y.
 
     Each landmark is projected onto X, moves with its triangle to the registered mesh, and is projected onto
-    Y.
+    Y. If `off_surface` is True, a thin-plate spline of space moves the landmarks instead (Bookstein 1989),
+    and a landmark inside X stays inside. The spline takes points that are spread evenly over X, and the
+    projections of the landmarks onto X, to their images on Y.
 
     **Arguments:**
 
     - `landmarks`: `Landmarks` with l landmarks on X, in the unit and the coordinate system of X.
     - `registered`: the `RegisteredMesh` of X on Y.
     - `expected_error`: the expected error of each vertex of X (m,), divided by the square root of Y's area;
-      see `Correspondence.expected_error`. The positions do not depend on this argument.
+      see `Correspondence.expected_error`. The positions do not depend on this argument. The expected error of
+      a landmark off the surface is that of its projection.
+    - `off_surface`: True if landmarks lie off the surface on purpose, for example inside a skull.
 
     **Raises:** `InputError` if `expected_error` does not contain one number for each vertex of X, or if
     `jaxsmw.io.check_frame` finds that the landmarks are too far from the surface of X.
@@ -62,17 +74,47 @@ def transfer_landmarks(
             f"{mesh_x.name}: there are expected errors of shape {expected_error.shape} for "
             f"{len(mesh_x.vertices)} vertices: give one for each vertex."
         )
-    notes = check_frame(landmarks, mesh_x)
+    notes = () if off_surface else check_frame(landmarks, mesh_x)
     points, distances = nearest_surface_points(landmarks.positions, mesh_x)
-    images = registered.project(points)
+    images = registered.project(points).positions(mesh_y)
+    if off_surface:
+        _check_near(landmarks, distances, mesh_x)
+        images = _deformed(landmarks.positions, points.positions(mesh_x), images, registered)
     errors = None
     if expected_error is not None:
         at_corners = expected_error[mesh_x.faces[points.faces]]
         errors = np.sqrt(mesh_y.area) * (points.weights * at_corners).sum(axis=1)
-    moved = replace(
-        landmarks, positions=images.positions(mesh_y), name=f"landmarks on {mesh_y.name}", notes=()
-    )
+    moved = replace(landmarks, positions=images, name=f"landmarks on {mesh_y.name}", notes=())
     return TransferredLandmarks(moved, distances, errors, notes)
+
+
+def _check_near(landmarks: Landmarks, distances: Float64[np.ndarray, " l"], mesh: Mesh) -> None:
+    """Refuse landmarks that are farther from a mesh than the mesh is large."""
+    diagonal, farthest = bounding_box_diagonal(mesh), int(distances.argmax())
+    if distances[farthest] > diagonal:
+        raise InputError(
+            f"{landmarks.name}: the landmark {landmarks.names[farthest]!a} is {distances[farthest]:.3g} from "
+            f"the surface of {mesh.name}, whose diagonal is {diagonal:.3g}: give landmarks of this mesh, in "
+            "its unit and coordinates."
+        )
+
+
+def _deformed(
+    positions: Float64[np.ndarray, "l 3"],
+    feet: Float64[np.ndarray, "l 3"],
+    images: Float64[np.ndarray, "l 3"],
+    registered: RegisteredMesh,
+) -> Float64[np.ndarray, "l 3"]:
+    """Move points by the thin-plate spline that takes X and the feet of the points to their images."""
+    mesh_x = registered.mesh_x
+    chosen = farthest_point_samples(mesh_x, min(_CENTERS, len(mesh_x.referenced_indices)))
+    centers = np.concatenate([feet, mesh_x.vertices[chosen]])
+    values = np.concatenate([images, registered.vertices[chosen]])
+    # Centres that nearly coincide would make the system singular.
+    size = _APART * bounding_box_diagonal(mesh_x)
+    _, kept = np.unique(np.rint(centers / size), axis=0, return_index=True)
+    # In three dimensions, the kernel of the thin-plate spline is the distance.
+    return RBFInterpolator(centers[kept], values[kept], kernel="linear", degree=1)(positions)
 
 
 def landmark_vertices(

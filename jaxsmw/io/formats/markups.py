@@ -25,7 +25,7 @@ _NOT_DEFINED = ("undefined", "preview", "missing")
 
 def parse_markups(text: str) -> Landmarks:
     """Parse the control points of a Markups file. The file must contain a single list of points."""
-    markup = _single_list(_parse_json(text))
+    markup = _single_list(parse_json(text))
     coordinates, notes = _coordinate_system(markup)
     unit = markup.get("coordinateUnits")
     if unit is not None and not isinstance(unit, str):
@@ -43,7 +43,7 @@ def parse_markups(text: str) -> Landmarks:
         label, position = point.get("label", ""), point.get("position")
         if not isinstance(label, str):
             _refuse(number, "has a label that is not text")
-        # All numbers are floats here, because `_parse_json` also parses integers as floats.
+        # All numbers are floats here, because `parse_json` also parses integers as floats.
         if not isinstance(position, list) or [type(value) for value in position] != [float] * 3:
             _refuse(number, "has a position that is not a list of three numbers")
         points.add(label.strip(), position)
@@ -52,7 +52,7 @@ def parse_markups(text: str) -> Landmarks:
     )
 
 
-def _parse_json(text: str) -> Any:
+def parse_json(text: str) -> Any:
     """Parse JSON with all numbers as floats, and refuse objects that repeat a key."""
     try:
         # Integers become floats, because `int` refuses integers with many digits. Deep nesting causes a

@@ -55,7 +55,7 @@ def parse_stl(data: bytes) -> Polygons:
     equal = first_equal_rows(corners)
     same = equal
     if np.isfinite(corners).all():
-        same = coincident_vertices(corners, np.arange(len(corners)).reshape(-1, 3))
+        same, _ = coincident_vertices(corners, np.arange(len(corners)).reshape(-1, 3))
     appearance, faces = np.unique(same, return_inverse=True)
     notes.append(
         "STL files have no shared vertices: corners at the same position were merged into "
