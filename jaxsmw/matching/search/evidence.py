@@ -17,8 +17,8 @@ _INTERCEPT, _DEFORMATION, _IN_PLACE, _DISCONTINUITY = -6.6, -3.5, 1.4, -6.7
 _UNCOVERED, _AGREEMENT = -3.1, 1.3
 # The weight of the logarithm of the inconsistency, which only counts between maps of the same pair.
 _INCONSISTENCY = -5.0
-# Smaller inconsistencies are equal. Exact maps have none, but neither has the identity from the mirror image of
-# a body to the body, which is wrong.
+# Smaller inconsistencies are equal. Exact maps have none, but neither has the identity from the mirror image
+# of a body to the body, which is wrong.
 _CONSISTENT = 0.003
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
