@@ -33,23 +33,20 @@ from judged_pairs import (
     count_table,
     is_right,
     known_pairs,
+    prepared,
     reliability,
     reliability_table,
 )
 
-from jaxsmw import Pair, match
+from jaxsmw import match
 from jaxsmw.benchmark.tables import markdown
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import race
 from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.search.search import readings_of
-from jaxsmw.matching.stages import PRESETS
-from jaxsmw.matching.starts import make_start
 from jaxsmw.report.figures import new_figure, save_figure, style_axes
 from jaxsmw.runtime.provenance import made_with
-from jaxsmw.runtime.threads import one_blas_thread
 
 # The number of alternatives among which the right map should be.
 ALTERNATIVES = 3
@@ -84,15 +81,9 @@ def judged(known: KnownPair) -> dict[str, Any]:
 
 def found_by_kinds(known: KnownPair) -> dict[str, Any]:
     """Return whether the first map, and the race of each kind of hypothesis, are right."""
-    preset = PRESETS["accurate"].fitted(min(len(mesh.referenced_indices) for mesh in (known.x, known.y)))
-    pair = Pair.make(known.x, known.y, partial=known.partial)
-    with one_blas_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        prepared = prepare(pair.without_shortcuts(), preset.sizes, given=pair)
-        start = make_start(prepared, "shot")
-        prepared = prepared.describe(preset.number_of_descriptors)
-        outcome = run(prepared.usable(preset).before_final, prepared.spectra, start)
-        first = Reading.of(prepared).with_first(outcome.pointwise_map)
+    with prepared(known) as (shapes, start, preset):
+        outcome = run(preset.before_final, shapes.spectra, start)
+        first = Reading.of(shapes).with_first(outcome.pointwise_map)
         readings = readings_of(first, first.is_asymmetric())
         row: dict[str, Any] = {FIRST: int(is_right(*known.errors(outcome.pointwise_map)))}
         for kind in HYPOTHESES:

@@ -7,7 +7,9 @@ called full, a mask and a head, creatures, and bumpy bodies with their mirror im
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -18,9 +20,13 @@ from jaxtyping import Int, Int64
 from scipy.spatial import KDTree
 from scipy.stats import binomtest
 
-from jaxsmw import Mesh, creature_pair, geodesic_error, make_mesh, read_mesh
+from jaxsmw import PRESETS, Mesh, Pair, Preset, creature_pair, geodesic_error, make_mesh, read_mesh
 from jaxsmw.benchmark.datasets import choose_pairs, open_data_set
 from jaxsmw.evaluation import GroundTruth
+from jaxsmw.matching.outcome import Start
+from jaxsmw.matching.preparation import PreparedPair, prepare
+from jaxsmw.matching.starts import make_start
+from jaxsmw.runtime.threads import one_blas_thread
 
 # A map is right if its mean geodesic error, and the share of its errors above `GROSS`, are below these limits
 # (unit: the square root of the area). Euclidean errors are too small where legs stand close together.
@@ -53,6 +59,22 @@ class KnownPair(NamedTuple):
         points = min(POINTS, len(self.vertices))
         found = geodesic_error(self.y, pointwise_map, truth, number_of_samples=points)
         return float(found.mean), float(np.mean(found.errors > GROSS))
+
+
+@contextmanager
+def prepared(known: KnownPair) -> Iterator[tuple[PreparedPair, Start, Preset]]:
+    """Prepare a pair for the preset `accurate`, and yield the start SHOT and the usable preset as well.
+
+    Inside of the context, warnings are ignored, and the linear algebra uses one thread.
+    """
+    preset = PRESETS["accurate"].fitted(min(len(mesh.referenced_indices) for mesh in (known.x, known.y)))
+    pair = Pair.make(known.x, known.y, partial=known.partial)
+    with one_blas_thread(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        shapes = prepare(pair.without_shortcuts(), preset.sizes, given=pair)
+        start = make_start(shapes, "shot")
+        shapes = shapes.describe(preset.number_of_descriptors)
+        yield shapes, start, shapes.usable(preset)
 
 
 def is_right(mean: float, gross: float) -> bool:

@@ -15,7 +15,6 @@ and a later run continues there.
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -24,18 +23,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from common import make_parser, write_text
 from jaxtyping import Bool, Float
-from judged_pairs import Judged, KnownPair, count_table, is_right, known_pairs, reliability_table
+from judged_pairs import Judged, KnownPair, count_table, is_right, known_pairs, prepared, reliability_table
 from scipy.optimize import minimize
 
-from jaxsmw import Pair
 from jaxsmw.benchmark.tables import markdown
-from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.evidence import probabilities
 from jaxsmw.matching.search.search import search
-from jaxsmw.matching.stages import PRESETS
-from jaxsmw.matching.starts import make_start
 from jaxsmw.runtime.provenance import made_with
-from jaxsmw.runtime.threads import one_blas_thread
 
 # The penalty of large weights, which keeps them finite.
 PENALTY = 0.1
@@ -58,16 +52,10 @@ class JudgedPair(NamedTuple):
 
 def judged_pair(known: KnownPair) -> JudgedPair:
     """Search with all hypotheses, and compare the maps with the truth."""
-    preset = PRESETS["accurate"].fitted(min(len(mesh.referenced_indices) for mesh in (known.x, known.y)))
-    assert preset.search is not None
-    preset = replace(preset, search=replace(preset.search, certain=1.0))
-    pair = Pair.make(known.x, known.y, partial=known.partial)
-    with one_blas_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        prepared = prepare(pair.without_shortcuts(), preset.sizes, given=pair)
-        start = make_start(prepared, "shot")
-        prepared = prepared.describe(preset.number_of_descriptors)
-        maps = search(prepared, start, prepared.usable(preset), mirror="auto")
+    with prepared(known) as (shapes, start, preset):
+        assert preset.search is not None
+        preset = replace(preset, search=replace(preset.search, certain=1.0))
+        maps = search(shapes, start, preset, mirror="auto")
     rows = [(list(one.evidence), known.errors(one.pointwise_map)) for one in maps if one.evidence is not None]
     evidence, errors = zip(*rows, strict=True)
     return JudgedPair(known.kind, np.array(evidence, float), np.array(errors))
