@@ -401,6 +401,12 @@ def test_readings_are_tried_only_where_they_are_possible(pair, lump, monkeypatch
             seen.clear()
             search(prepared, start, never, mirror=mirror, outcome=Outcome(start.pointwise_map))
             assert set(seen) == expected
+    # A cut through a fused surface leaves a boundary, but the given mesh has none.
+    seen.clear()
+    cut = prepare(Pair.make(part, mesh_y), Sizes(40), given=Pair.make(mesh_x, mesh_y)).describe(30)
+    start = Start(np.zeros(len(part.vertices), np.int64))
+    search(cut, start, never, outcome=Outcome(start.pointwise_map))
+    assert set(seen) == {(False, False)}
 
 
 @pytest.mark.slow

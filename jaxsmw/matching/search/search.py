@@ -190,7 +190,8 @@ def _as_parts(reading: Reading) -> Iterator[Reading]:
     The meshes have the same unit of length in the first reading, and different units in the second.
     """
     prepared, pair = reading.prepared, reading.prepared.pair
-    shorter, longer = sorted(map(relative_boundary, pair.meshes))
+    # The boundaries of cuts through fused surfaces do not count.
+    shorter, longer = sorted(map(relative_boundary, prepared.given.meshes))
     if pair.partial or longer < max(_LONG, _LONGER * shorter):
         return
     known: list[float] = []
