@@ -355,21 +355,19 @@ def test_a_certain_map_ends_the_search(pair, monkeypatch):
     assert found.log_odds < 0 and not raced and found.outcome.successful
 
 
-def test_only_the_chosen_map_is_refined_by_further_passes(pair, monkeypatch):
-    """Further passes make wrong maps nearly as good as the right one, so the shares are those before them."""
+def test_only_probable_maps_are_refined_by_further_passes(pair, monkeypatch):
     mesh_x, mesh_y, truth = pair
     prepared = prepare(Pair.make(mesh_x, mesh_y), Sizes(60)).describe(30)
     wrong = upside_down(mesh_x, truth)
     monkeypatch.setattr(
         "jaxsmw.matching.search.search.race", lambda readings, *_: [known_map(readings[0], wrong)]
     )
-    settings = replace(SEARCH.search, certain=1.0, likely=0.0, coarse_from=9.0)
+    settings = replace(SEARCH.search, certain=1.0, coarse_from=9.0)
     (best, *others), (same, *unchanged) = (
         search(prepared, Start(truth), replace(SEARCH, search=one), outcome=Outcome(truth))
         for one in (replace(settings, non_isometric=0.0), replace(settings, passes=0))
     )
-    assert others and [one.share for one in others] == [one.share for one in unchanged]
-    assert best.share == same.share > 0.9 and not np.array_equal(best.pointwise_map, same.pointwise_map)
+    assert others and best.share > 0.9 and not np.array_equal(best.pointwise_map, same.pointwise_map)
     for one, other in zip(others, unchanged, strict=True):
         np.testing.assert_array_equal(one.pointwise_map, other.pointwise_map)
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float, Int64
 
 from jaxsmw.choices import Mirror
 from jaxsmw.core.arrays import namespace
@@ -141,15 +141,22 @@ def search(
         refined = [_refined(one, preset) for one in likely]
         judged = list(different([*judged, *refined]))
         certain = _certain(judged, settings)
-    # Further passes make a wrong map nearly as good as the right one, so the decision comes first.
-    inconsistencies = [one.inconsistency for one in judged] if len(judged) > 1 else None
-    parts = shares([one.log_odds for one in judged], inconsistencies)
-    judged = [
-        replace(judged[number], share=float(parts[number])) for number in np.argsort(-parts, kind="stable")
-    ]
-    best = _finished(judged[0], preset)
-    others = [one for one in judged[1:] if not one.is_twin(best)]
+    # Further passes make some wrong maps nearly as good as the right one, so the evidence before them counts.
+    before = _shares_of(judged)
+    doubtful = before >= settings.likely * before.max()
+    judged = [_finished(one, preset) if again else one for one, again in zip(judged, doubtful, strict=True)]
+    parts = np.sqrt(before * _shares_of(judged))
+    parts /= parts.sum() or 1.0
+    order = np.argsort(-parts, kind="stable")
+    best, *others = (replace(judged[number], share=float(parts[number])) for number in order)
+    others = [one for one in others if not one.is_twin(best)]
     return [replace(best, share=1.0 - sum(one.share for one in others)), *others]
+
+
+def _shares_of(judged: Sequence[Judged]) -> Float[np.ndarray, " c"]:
+    """Return the probability of each of several different maps (c,) to be right, if one of them is."""
+    inconsistencies = [one.inconsistency for one in judged] if len(judged) > 1 else None
+    return shares([one.log_odds for one in judged], inconsistencies)
 
 
 def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
