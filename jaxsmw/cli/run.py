@@ -9,7 +9,18 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from jaxsmw.cli import benchmark, cache, collection, demo, evaluate, match, render, spectrum, transfer
+from jaxsmw.cli import (
+    benchmark,
+    cache,
+    collection,
+    complete,
+    demo,
+    evaluate,
+    match,
+    render,
+    spectrum,
+    transfer,
+)
 from jaxsmw.cli.arguments import add_quiet, shortened
 from jaxsmw.cli.console import flush_output, log_to_console, say, show
 from jaxsmw.errors import InputError
@@ -76,6 +87,7 @@ _COMMANDS = {
     "match": match,
     "transfer": transfer,
     "collection": collection,
+    "complete": complete,
     "evaluate": evaluate,
     "benchmark": benchmark,
     "spectrum": spectrum,

@@ -1,4 +1,7 @@
+from .completion import Completion, complete_mesh
+from .conditioning import GaussianModel, Posterior
 from .consistency import edge_errors
+from .files import read_shape_model
 from .graph import choose_edges, shape_distances
 from .hands import choose_hands
 from .matching import match_collection
@@ -10,18 +13,23 @@ from .synchronization import Network, synchronize
 
 __all__ = [
     "Collection",
+    "Completion",
+    "GaussianModel",
     "MatchedEdge",
     "Network",
+    "Posterior",
     "PreparedShape",
     "ProcrustesAlignment",
     "ShapeModel",
     "align",
     "choose_edges",
     "choose_hands",
+    "complete_mesh",
     "edge_errors",
     "match_collection",
     "match_pairs",
     "prepare_collection",
+    "read_shape_model",
     "shape_distances",
     "shape_model",
     "synchronize",
