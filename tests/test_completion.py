@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import assert_refused, runner
+from known_collections import known_collection
 from messages import refused
 from scipy.spatial.transform import Rotation
 from synthetic import bumpy_mesh
 
 from jaxsmw.collection import (
-    Collection,
     GaussianModel,
     Posterior,
     ShapeModel,
@@ -23,11 +23,11 @@ from jaxsmw.collection import (
 from jaxsmw.collection.conditioning import Family
 from jaxsmw.collection.files import write_model, write_registered, write_summary
 from jaxsmw.creature import creature
+from jaxsmw.geometry.alignment import rigid_fit
+from jaxsmw.geometry.eigenbasis import eigenpairs
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.io.mesh_data import MeshData
 from jaxsmw.io.meshes import read_mesh_data, write_mesh
-from jaxsmw.transfer.registered_mesh import register_mesh
 
 N, VERTICES = 6, 500
 
@@ -88,7 +88,7 @@ def test_a_factor_of_unknown_variance_follows_the_observed_vertices():
     )
     observed, positions = np.arange(30) < 12, np.random.default_rng(1).normal(size=(12, 3))
     first, _ = free.condition(observed, positions, 0.3)
-    second, _ = free.condition(observed, positions + [5.0, -7.0, 100.0], 0.3)
+    second, _ = free.condition(observed, positions + np.array([5.0, -7.0, 100.0]), 0.3)
     np.testing.assert_allclose(second.mean - first.mean, np.tile([5.0, -7.0, 100.0], (30, 1)), atol=1e-8)
     np.testing.assert_allclose(second.factors, first.factors, atol=1e-9)
 
@@ -110,8 +110,6 @@ def test_samples_have_the_deviations_and_lie_within_the_radii():
 
 
 def functions_of(mesh: Mesh) -> np.ndarray:
-    from jaxsmw.geometry.eigenbasis import eigenpairs
-
     return eigenpairs(mesh, 15)[1]
 
 
@@ -127,8 +125,6 @@ def test_calibrated_radii_hold_the_hidden_vertices_of_further_shapes():
     distribution = family.model(shifts)
     assert noise >= distribution.residual
     errors, radii = [], []
-    from jaxsmw.geometry.alignment import rigid_fit
-
     for shape in both[12:]:
         placed = rigid_fit(shape, model.mean, mesh.vertex_areas).apply(shape)
         posterior, _ = distribution.condition(observed, placed[observed], noise)
@@ -154,14 +150,12 @@ def family_of_creatures() -> tuple[ShapeModel, Mesh, np.ndarray]:
 @pytest.mark.filterwarnings("ignore:.*map:UserWarning")
 def test_a_part_is_completed_in_its_own_coordinates():
     model, mean, truth = family_of_creatures()
-    moved = Rotation.from_rotvec([0.1, -0.2, 0.1]).apply(truth) + [3.0, -1.0, 2.0]
+    moved = Rotation.from_rotvec([0.1, -0.2, 0.1]).apply(truth) + np.array([3.0, -1.0, 2.0])
     whole = make_mesh(moved, mean.faces)
     shown = mean.vertices[:, 1] < np.quantile(mean.vertices[:, 1], 0.75)
     completed = complete_mesh(cut(whole, shown), model, mean.faces, preset="paper")
     assert (completed.observed == shown).mean() > 0.9
     errors = np.linalg.norm(completed.mesh.vertices - moved, axis=1)
-    from jaxsmw.geometry.alignment import rigid_fit
-
     aligned = rigid_fit(model.mean[shown], moved[shown]).apply(model.mean)
     assert errors[~shown].mean() < np.linalg.norm(aligned - moved, axis=1)[~shown].mean()
     assert errors[shown].mean() < 0.03
@@ -178,18 +172,10 @@ def test_a_part_is_completed_in_its_own_coordinates():
 def directory(tmp_path_factory) -> Path:
     """Results of a collection whose maps are known; shape 2 has the other hand."""
     body = creature("biped", vertices=VERTICES)
-    corners = np.zeros(VERTICES, np.int64)
-    corners[body.faces[::-1]] = np.arange(len(body.faces))[::-1, None]
-    points = SurfacePoints(corners, (body.faces[corners] == np.arange(VERTICES)[:, None]).astype(float))
-    mirrored = np.arange(N) == 2
-    meshes = tuple(
-        make_mesh(shape * np.where(other, [-1.0, 1.0, 1.0], 1.0), body.faces, name=f"shape{i}")
-        for i, (shape, other) in enumerate(zip(shapes(body, N), mirrored, strict=True))
-    )
-    registered = tuple(register_mesh(meshes[0], mesh, points) for mesh in meshes)
-    collection = Collection(meshes, 0, (points,) * N, mirrored, registered, (), (np.zeros(0), np.zeros(0)))
+    collection = known_collection(shapes(body, N), body.faces, np.arange(N) == 2)
+    template = collection.meshes[0]
     folder = tmp_path_factory.mktemp("model")
-    files = write_registered(collection, MeshData(meshes[0], meshes[0].faces), folder, ".ply")
+    files = write_registered(collection, MeshData(template, template.faces), folder, ".ply")
     files += write_model(collection, collection.shape_model(), folder, ".ply")
     write_summary(collection, {}, folder, {}, files)
     return folder

@@ -74,9 +74,7 @@ def run(options: argparse.Namespace) -> None:
         write_mesh(options.sample, make_mesh(vertices, mean.faces, name="sample"))
         report_written(options.sample)
     deviation, observed = completed.standard_deviation, completed.observed
-    show(
-        f"observed: {observed.mean():.0%} of the vertices of the model, with a noise of {completed.noise:.3g}."
-    )
+    show(f"observed: {observed.mean():.0%} of the model's vertices, with a noise of {completed.noise:.3g}.")
     if not observed.all():
         show(
             f"standard deviation of the others: mean {deviation[~observed].mean():.3g}, largest "

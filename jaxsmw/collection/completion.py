@@ -102,13 +102,9 @@ def complete_mesh(
     part = as_mesh(part, "part")
     mean = make_mesh(model.mean, faces, name="mean shape")
     whole = _check_model(model)
+    scaled = model.alignment.scaled
     correspondence = match(
-        part,
-        mean,
-        preset=preset,
-        partial=True,
-        mirror="no",
-        scale="unknown" if model.alignment.scaled else 1.0,
+        part, mean, preset=preset, partial=True, mirror="no", scale="unknown" if scaled else 1.0
     )
     registered = correspondence.registered_mesh()
     points = registered.points_of_target
@@ -122,11 +118,11 @@ def complete_mesh(
     number = min(_FUNCTIONS, len(mean.referenced_indices) // 10)
     functions = eigenpairs(mean, max(number, 1))[1]
     family = Family(model.mean, whole.modes, whole.scores, model.weights, functions)
-    motions, center = _motions(model.mean, observed, scaled=model.alignment.scaled)
+    motions, center = _motions(model.mean, observed, scaled=scaled)
     noise, calibration = family.calibrate(motions, observed)
     distribution = family.model(motions)
     goals = points[np.flatnonzero(observed)].positions(part)
-    place = _first_place(goals, model.mean[observed], scaled=model.alignment.scaled)
+    place = _first_place(goals, model.mean[observed], scaled=scaled)
     for last in [False] * _ROUNDS + [True]:
         targets = place.apply(goals)
         posterior, means = distribution.condition(observed, targets, noise)

@@ -1,7 +1,7 @@
-"""Gaussian models of shapes: estimated from few shapes, conditioned on a part, and calibrated by leaving out shapes.
+"""Gaussian models of shapes: estimated from few shapes, conditioned on a part, and calibrated.
 
-A shape is the mean, plus a random combination of factors, plus an isotropic residual. The factors are the modes
-of the shapes, smooth fields for what the modes leave out, and motions of the whole shape.
+A shape is the mean, plus a random combination of factors, plus an isotropic residual. The factors are the
+modes of the shapes, smooth fields for what the modes leave out, and motions of the whole shape.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Posterior:
         return np.sqrt((self.factors**2).sum(axis=(0, 2)) / 3 + self.residual**2)
 
     def radii(self, probability: float = _SHARE) -> Float64[np.ndarray, " n"]:
-        """Return the radius of the ball around each vertex that holds the true vertex with a probability (n,).
+        """Return the radii (n,) of balls around the vertices that hold the true vertices with a probability.
 
         The squared distance is a sum of scaled chi-squared variables. A scaled chi-squared distribution with
         the same mean and variance replaces its distribution (Satterthwaite 1946).

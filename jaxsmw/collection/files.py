@@ -17,10 +17,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from jaxsmw.collection.result import Collection
+from jaxsmw.collection.semilandmarks import TITLES, Semilandmarks, Sliders
 from jaxsmw.collection.shape_models import ProcrustesAlignment, ShapeModel, modes_of
 from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.io.formats.npz import read_arrays
+from jaxsmw.io.formats.tps import write_tps
 from jaxsmw.io.landmark_files import write_landmark_file
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.maps import write_pointwise_map
@@ -38,7 +40,7 @@ _ROUNDING = 1e-9
 # The files and directories that contain results. The mean shape is not listed, because users choose its
 # suffix.
 RESULT_FILES = ("collection.json", "index.html", "modes.npz", "scores.csv")
-RESULT_DIRECTORIES = ("maps", "registered", "landmarks", "attributes")
+RESULT_DIRECTORIES = ("maps", "registered", "landmarks", "attributes", "semilandmarks")
 
 
 def write_maps(collection: Collection, directory: Path) -> list[Path]:
@@ -118,6 +120,32 @@ def write_landmarks(
     return written, notes
 
 
+def write_semilandmarks(
+    collection: Collection, names: Sequence[str], found: Semilandmarks, sliders: Sliders, directory: Path
+) -> list[Path]:
+    """Write semilandmarks on all shapes as `.tps` and `.csv`, and the sliders, counted from 1."""
+    folder = make_directory(directory / "semilandmarks")
+    title = ["mesh", *(f"{name}_{axis}" for name in names for axis in "XYZ")]
+    flat = found.positions.reshape(len(found.positions), -1).tolist()
+    tables: dict[str, Iterable[Sequence[object]]] = {
+        "semilandmarks.csv": [
+            title,
+            *([name, *row] for name, row in zip(collection.names, flat, strict=True)),
+        ],
+        "curves.csv": [TITLES, *(sliders.curves + 1).tolist()],
+        "surfaces.csv": [["surface"], *([number + 1] for number in sliders.surfaces.tolist())],
+    }
+    for name, rows in tables.items():
+        with (
+            atomic_write(folder / name) as temporary,
+            temporary.open("w", newline="", encoding="utf-8", errors="surrogateescape") as file,
+        ):
+            csv.writer(file, lineterminator="\n").writerows(rows)
+    with atomic_write(folder / "semilandmarks.tps") as temporary:
+        temporary.write_text(write_tps(collection.names, found.positions), "utf-8", errors="surrogateescape")
+    return [folder / name for name in (*tables, "semilandmarks.tps")]
+
+
 def write_model(collection: Collection, model: ShapeModel, directory: Path, suffix: str) -> list[Path]:
     """Write the mean shape, the modes and the scores; see `docs/how_to/match_collection.md`."""
     template = collection.meshes[collection.template]
@@ -179,8 +207,8 @@ def read_shape_model(directory: str | os.PathLike[str]) -> tuple[ShapeModel, Mes
         mesh = read_mesh(by_name[name])
         if len(mesh.vertices) != len(weights):
             raise InputError(
-                f"{by_name[name]}: has {len(mesh.vertices)} vertices, but modes.npz has {len(weights)}: write "
-                "the collection with --suffix .ply, which keeps the vertices."
+                f"{by_name[name]}: has {len(mesh.vertices)} vertices, but modes.npz has {len(weights)}: run "
+                "`jaxsmw collection` with --suffix .ply, which keeps the vertices."
             )
         aligned.append(mesh.vertices @ matrix.T + move)
     hands = np.sign(np.linalg.det(matrices))
