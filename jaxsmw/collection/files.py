@@ -127,11 +127,9 @@ def write_semilandmarks(
     folder = make_directory(directory / "semilandmarks")
     title = ["mesh", *(f"{name}_{axis}" for name in names for axis in "XYZ")]
     flat = found.positions.reshape(len(found.positions), -1).tolist()
+    positions = ([name, *row] for name, row in zip(collection.names, flat, strict=True))
     tables: dict[str, Iterable[Sequence[object]]] = {
-        "semilandmarks.csv": [
-            title,
-            *([name, *row] for name, row in zip(collection.names, flat, strict=True)),
-        ],
+        "semilandmarks.csv": [title, *positions],
         "curves.csv": [TITLES, *(sliders.curves + 1).tolist()],
         "surfaces.csv": [["surface"], *([number + 1] for number in sliders.surfaces.tolist())],
     }

@@ -1,4 +1,4 @@
-"""Semilandmarks: points on curves and surfaces, which slide until the specimens differ as little as possible."""
+"""Semilandmarks: points on curves and surfaces, which slide until the specimens differ least."""
 
 from __future__ import annotations
 
