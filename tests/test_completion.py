@@ -29,7 +29,7 @@ from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.io.mesh_data import MeshData
 from jaxsmw.io.meshes import read_mesh_data, write_mesh
 
-N, VERTICES = 6, 500
+N, VERTICES = 8, 500
 
 
 def random_model(seed: int = 0, *, n: int = 30, p: int = 7) -> GaussianModel:
@@ -46,7 +46,7 @@ def shapes(mesh: Mesh, count: int, seed: int = 0) -> np.ndarray:
     frequencies = np.linspace(1, 12, 40)
     waves = frequencies[:, None] * Rotation.random(40, rng=random).as_matrix()[:, 0]
     fields = np.sin(unit @ waves.T + random.uniform(0, 6, 40)) / frequencies
-    return unit + 0.04 * fields @ random.normal(size=(count, 40, 3))
+    return unit + 0.08 * fields @ random.normal(size=(count, 40, 3))
 
 
 def cut(mesh: Mesh, kept: np.ndarray, name: str = "part") -> Mesh:
@@ -121,7 +121,7 @@ def test_calibrated_radii_hold_the_hidden_vertices_of_further_shapes():
     family = Family(model.mean, model.modes, model.scores, model.weights, functions_of(mesh))
     observed = mesh.vertices[:, 0] < np.quantile(mesh.vertices[:, 0], 0.6)
     shifts = np.broadcast_to(np.eye(3)[:, None], (3, *mean.shape))
-    noise, calibration = family.calibrate(shifts, observed)
+    noise, calibration = family.calibrate(shifts, observed, 0.0)
     distribution = family.model(shifts)
     assert noise >= distribution.residual
     errors, radii = [], []
@@ -140,11 +140,11 @@ def test_calibrated_radii_hold_the_hidden_vertices_of_further_shapes():
 
 @cache
 def family_of_creatures() -> tuple[ShapeModel, Mesh, np.ndarray]:
-    """Return a model, its mean, and a further shape."""
+    """Return a model, its mean, and a further shape, which the modes describe."""
     body = creature("biped", vertices=VERTICES)
-    all_shapes = shapes(body, N + 1)
-    model = shape_model(all_shapes[:N], weights=body.vertex_areas)
-    return model, make_mesh(model.mean, body.faces, name="mean"), all_shapes[N]
+    model = shape_model(shapes(body, N), weights=body.vertex_areas)
+    truth = model.shape(np.sqrt(model.variances) * [1.0, -1.0, 1.0, 0.0, 0.5, 0.0, -0.5])
+    return model, make_mesh(model.mean, body.faces, name="mean"), truth
 
 
 @pytest.mark.filterwarnings("ignore:.*map:UserWarning")
@@ -157,7 +157,7 @@ def test_a_part_is_completed_in_its_own_coordinates():
     assert (completed.observed == shown).mean() > 0.9
     errors = np.linalg.norm(completed.mesh.vertices - moved, axis=1)
     aligned = rigid_fit(model.mean[shown], moved[shown]).apply(model.mean)
-    assert errors[~shown].mean() < np.linalg.norm(aligned - moved, axis=1)[~shown].mean()
+    assert errors[~shown].mean() < 0.5 * np.linalg.norm(aligned - moved, axis=1)[~shown].mean()
     assert errors[shown].mean() < 0.03
     deviation = completed.standard_deviation
     assert deviation[~shown].mean() > 1.5 * deviation[shown].mean()

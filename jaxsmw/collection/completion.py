@@ -25,7 +25,7 @@ from jaxsmw.matching.stages import Preset, PresetName
 # The number of smooth functions for what the modes leave out, at most a tenth of the vertices. (Entry R52)
 _FUNCTIONS = 40
 # The number of rounds that align the part and find the nearest points on the part. (Entry R52)
-_ROUNDS = 4
+_ROUNDS = 3
 # With fewer shapes, no shape can be left out to estimate what a model of the others leaves out.
 _FEWEST_SHAPES = 3
 # The fewest observed vertices that determine the position of a part.
@@ -119,21 +119,18 @@ def complete_mesh(
     functions = eigenpairs(mean, max(number, 1))[1]
     family = Family(model.mean, whole.modes, whole.scores, model.weights, functions)
     motions, center = _motions(model.mean, observed, scaled=scaled)
-    noise, calibration = family.calibrate(motions, observed)
     distribution = family.model(motions)
     goals = points[np.flatnonzero(observed)].positions(part)
     place = _first_place(goals, model.mean[observed], scaled=scaled)
-    for last in [False] * _ROUNDS + [True]:
-        targets = place.apply(goals)
-        posterior, means = distribution.condition(observed, targets, noise)
-        rest = np.sqrt(((posterior.mean[observed] - targets) ** 2).mean())
-        if last:
-            break
+    # The errors of the map are measured on the mean shape, in units of the root of its area.
+    error = float(correspondence.expected_error().mean() * np.sqrt(mean.area))
+    noise, calibration = family.calibrate(motions, observed, error)
+    for _ in range(_ROUNDS):
+        posterior, means = distribution.condition(observed, place.apply(goals), noise)
         place = place.then_undone(means[-len(motions) :], center)
-        posterior, _ = distribution.condition(observed, place.apply(goals), max(noise, float(rest)))
+        posterior, _ = distribution.condition(observed, place.apply(goals), noise)
         goals = _nearest(place.undone(posterior.mean), mean, observed, part)
-    noise = max(noise, float(rest))
-    posterior, _ = distribution.condition(observed, targets, noise)
+    posterior, _ = distribution.condition(observed, place.apply(goals), noise)
     size = place.size
     factors = calibration * (posterior.factors @ place.matrix) / size**2
     vertices = place.undone(posterior.mean)

@@ -23,6 +23,9 @@ from jaxsmw.runtime.threads import one_blas_thread
 _EVALUATED = 200
 # The radii of the calibrated posterior hold this share of the vertices of shapes that were left out.
 _SHARE = 0.9
+# The noise is at most this multiple of the standard deviation of the shapes. With more noise, the mean shape
+# would be the best completion.
+_MOST_NOISE = 10
 # Variances below this multiple of the total variance are rounding errors.
 _SMALLEST = 1e-12
 
@@ -188,6 +191,11 @@ class Family:
             max(float(left) / (3 * len(scores)), smallest),
         )
 
+    @property
+    def spread(self) -> float:
+        """The standard deviation of the shapes around their mean, of each coordinate."""
+        return float(np.sqrt(self.scores.var(axis=0).sum() / 3))
+
     def model(self, motions: Float64[np.ndarray, "g n 3"]) -> GaussianModel:
         """Return the distribution of a further shape, up to motions of which nothing is known."""
         kind, fields = self._whole, self._fields(motions)
@@ -209,13 +217,18 @@ class Family:
         return scipy.linalg.block_diag(kind.directions, smooth, np.eye(motions))
 
     def calibrate(
-        self, motions: Float64[np.ndarray, "g n 3"], observed: Bool[np.ndarray, " n"]
+        self,
+        motions: Float64[np.ndarray, "g n 3"],
+        observed: Bool[np.ndarray, " n"],
+        error: float,
     ) -> tuple[float, float]:
         """Find the noise and the calibration with which parts of shapes that were left out are completed.
 
-        Each shape is completed from its observed vertices by a model of the other shapes. The noise has the
-        largest predictive likelihood of the hidden vertices. It is larger than the residual, because
-        neighbouring vertices have similar residuals. The calibration is the factor of the standard deviations
+        Each shape is completed from its observed vertices by a model of the other shapes. A random
+        combination of the smooth functions is added to the observed positions, because the errors of maps are
+        smooth. `error` is its root mean square length. The noise has the largest
+        predictive likelihood of the hidden vertices. It is larger than the residual, because neighbouring
+        vertices have similar residuals and errors. The calibration is the factor of the standard deviations
         with which the radii of a further shape hold at least 90 % of its true hidden vertices.
 
         **Returns:** The noise, a standard deviation in the unit of the shapes, and the calibration.
@@ -225,13 +238,17 @@ class Family:
         fields = self._fields(motions)
         seen, unseen = fields[:, observed].reshape(len(fields), -1), fields[:, hidden]
         gram, number = seen @ seen.T, len(self.modes)
+        smooth = slice(number, number + 3 * self.functions.shape[1])
+        random = np.random.default_rng(0)
         cases = []
         for kind, left_out in zip(self._others, self.scores, strict=True):
             factors, away = self._factors(kind, len(motions)), left_out - kind.center
+            field = random.standard_normal(smooth.stop - smooth.start)
+            field *= error / np.linalg.norm(field)
             cases.append(
                 (
                     factors @ gram @ factors.T,
-                    factors @ gram[:, :number] @ away,
+                    factors @ (gram[:, :number] @ away + gram[:, smooth] @ field),
                     1 / _variances(kind, len(motions)),
                     np.tensordot(factors, unseen, axes=1),
                     np.tensordot(away, unseen[:number], axes=1),
@@ -252,16 +269,18 @@ class Family:
             return float(np.mean([_surprise(one) for one in completed(float(np.exp(logarithm)))]))
 
         least = np.sqrt(self._whole.residual)
-        most = max(np.sqrt(self.scores.var(axis=0).sum()), 2 * least)
+        most = max(_MOST_NOISE * self.spread, 2 * least)
         with one_blas_thread():
             found = minimize_scalar(surprise, bounds=np.log([least, most]), options={"xatol": 0.1})
             noise = float(np.exp(found.x))
-            ratios = [np.linalg.norm(one.mean, axis=1) / one.radii(_SHARE) for one in completed(noise)]
+            ratios = np.array(
+                [np.linalg.norm(one.mean, axis=1) / one.radii(_SHARE) for one in completed(noise)]
+            )
         # Vertices of one shape have similar errors, so N shapes are a small sample. The larger share corrects
         # for its size (Dunn, Wasserman, Ramdas, "Distribution-free prediction sets for two-layer hierarchical
         # models", JASA 2023).
         share = min(_SHARE * (1 + 1 / len(cases)), 1.0)
-        return noise, float(np.quantile(np.concatenate(ratios), share))
+        return noise, float(np.quantile(ratios, share))
 
 
 def _surprise(errors: Posterior) -> float:
