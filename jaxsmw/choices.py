@@ -24,6 +24,9 @@ MirrorCollection = Literal["auto", "no"]
 """Whether mirror images of some meshes are matched instead of the meshes; see `jaxsmw.match_collection`."""
 DEFAULT_MIRROR: MirrorCollection = "auto"
 
+Sliding = Literal["bending", "procrustes"]
+"""What semilandmarks minimise when they slide; see `jaxsmw.collection.slide_semilandmarks`."""
+
 EDGES_PER_SHAPE = 4
 """The default number of matched pairs of a collection, divided by the number of shapes."""
 

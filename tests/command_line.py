@@ -12,7 +12,17 @@ from jaxsmw.cli.run import run_command
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.io.meshes import write_mesh
 
-COMMANDS = ("demo", "match", "transfer", "collection", "evaluate", "benchmark", "spectrum", "render")
+COMMANDS = (
+    "demo",
+    "match",
+    "transfer",
+    "collection",
+    "complete",
+    "evaluate",
+    "benchmark",
+    "spectrum",
+    "render",
+)
 # Options that make the paper's method fast. The mirror test would compile further programs.
 SMALL = ("--eigenvectors", "20", "--filters", "4", "--mirror", "no")
 

@@ -24,6 +24,7 @@ from jaxsmw.collection import edges, match_collection
 from jaxsmw.collection.files import write_registered
 from jaxsmw.creature import CREATURES, creature
 from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.geometry.surface_distance import distances_to_surface
 from jaxsmw.io import Landmarks, MeshData, read_landmark_file, write_landmark_file
 from jaxsmw.runtime.cache import Store
 
@@ -408,8 +409,14 @@ def result_directory(directory, meshes, tmp_path_factory):
     landmarks = directory.parent / "shape1.csv"
     positions = meshes[1].vertices[[3, 50, 400]]
     write_landmark_file(landmarks, Landmarks(("a", "b", "c"), positions))
+    sliders = directory.parent / "sliders.csv"
+    sliders.write_text("before,slide,after\na,b,c\n")
+    sliders = directory.parent / "sliders.csv"
+    sliders.write_text("before,slide,after\na,b,c\n")
     code = run_command(
         ["collection", str(directory), "--output", str(output), *OPTIONS, "--landmarks", str(landmarks),
+         "--sliders", str(sliders),
+         "--sliders", str(sliders),
          "--attributes-of", str(directory / "shape0.ply"), "--template", str(directory / "shape2.obj")]
     )  # fmt: skip
     assert code == 0
@@ -456,6 +463,49 @@ def test_landmarks_appear_on_all_other_meshes(result_directory, shapes):
         assert carried.names == ("a", "b", "c")
         offsets = carried.positions - mesh.vertices[other[rows]]
         assert np.linalg.norm(offsets, axis=1).max() < 0.2 * np.sqrt(mesh.area)
+
+
+def test_semilandmarks_are_written_for_all_meshes(result_directory, meshes):
+    """The first and the last landmark do not slide, and the second slides on the surface."""
+    rows = list(csv.reader((result_directory / "semilandmarks" / "semilandmarks.csv").open()))
+    assert [row[0] for row in rows] == ["mesh", *(f"shape{number}" for number in range(4))]
+    for number in (0, 2, 3):
+        points = np.array(rows[number + 1][1:], float).reshape(3, 3)
+        carried = read_landmark_file(result_directory / "landmarks" / f"shape{number}.csv").positions
+        np.testing.assert_allclose(points[[0, 2]], carried[[0, 2]], atol=1e-12)
+        assert distances_to_surface(points, meshes[number]).max() < 1e-5 * np.sqrt(meshes[number].area)
+    assert (result_directory / "semilandmarks" / "semilandmarks.tps").read_text().count("LM3=3\n") == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "naming"),
+    [
+        ("a,c,b\n", ("--landmarks", "{}"), "no landmark has the name 'c'"),
+        ("a,b\n", ("--landmarks", "{}"), "line 1 is no slider"),
+        (None, ("--landmarks", "{}"), "sliders.csv: does not exist"),
+        ("a,b,c\n", (), "--sliders: has no effect without --landmarks"),
+    ],
+)
+def test_bad_sliders_are_refused_before_the_computation(
+    directory, meshes, run, tmp_path, text, options, naming
+):
+    landmarks, sliders = tmp_path / "shape1.csv", tmp_path / "sliders.csv"
+    write_landmark_file(landmarks, Landmarks(("a", "b"), meshes[1].vertices[:2]))
+    if text is not None:
+        sliders.write_text(text)
+    words = [word.format(landmarks) for word in options]
+    outcome = run(
+        "collection",
+        directory,
+        "--output",
+        tmp_path / "out",
+        *OPTIONS,
+        *words,
+        "--sliders",
+        sliders,
+        "--quiet",
+    )
+    assert outcome.code == 2 and naming in outcome.errors
 
 
 def test_landmarks_in_another_unit_are_refused_before_the_computation(directory, meshes, run, tmp_path):

@@ -113,6 +113,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "of transfer --landmarks",
             "--landmarks-of FILE": "mesh of DIRECTORY to which the landmarks belong (default: the mesh with "
             "the name of the landmark file)",
+            "--sliders FILE": "table (.csv) with the columns before, slide and after, which contain names of "
+            "landmarks: these landmarks slide along curves. In rows with slide alone, they slide on the "
+            "surface",
             "--attributes-of FILE": "mesh of DIRECTORY whose colours, labels, texture coordinates and other "
             "attributes are transferred to all meshes",
         },
@@ -251,8 +254,10 @@ def _write(
         write_maps,
         write_model,
         write_registered,
+        write_semilandmarks,
         write_summary,
     )
+    from jaxsmw.collection.semilandmarks import place_semilandmarks
     from jaxsmw.io.landmark_files import check_readable_suffix
     from jaxsmw.report.collection_page import write_collection_page
     from jaxsmw.runtime.provenance import machine
@@ -278,6 +283,9 @@ def _write(
         files += written
         for note in notes:
             say(f"note: {note}")
+        if meshes.sliders is not None:
+            slid = place_semilandmarks(collection, meshes.landmarks, meshes.sliders, source=landmarks_of)
+            files += write_semilandmarks(collection, meshes.landmarks.names, slid, meshes.sliders, directory)
     if attributes_of is not None:
         files += write_attributes(collection, attributes_of, kept, directory, options.suffix)
     unlisted = ("directory", "output", "quiet", "run")

@@ -16,6 +16,7 @@ from jaxsmw.runtime.files import size_of_file
 from jaxsmw.wording import count_of
 
 if TYPE_CHECKING:
+    from jaxsmw.collection.semilandmarks import Sliders
     from jaxsmw.io.landmarks import Landmarks
     from jaxsmw.io.mesh_data import MeshData
 
@@ -27,13 +28,15 @@ class Meshes(NamedTuple):
     """The meshes of the directory that can be read, and the reasons why other files cannot be read.
 
     The keys are file names. `names` contains unique names for the results, such as `cat` for `cat.ply`, or
-    `cat_ply` if there are two cats. `landmarks` belong to the mesh of `--landmarks-of`.
+    `cat_ply` if there are two cats. `landmarks` belong to the mesh of `--landmarks-of`. `sliders` are among
+    these landmarks.
     """
 
     data: dict[str, MeshData]
     names: dict[str, str]
     unreadable: dict[str, str]
     landmarks: Landmarks | None
+    sliders: Sliders | None = None
 
 
 def check_collection(options: argparse.Namespace) -> dict[str, Path]:
@@ -46,7 +49,7 @@ def check_collection(options: argparse.Namespace) -> dict[str, Path]:
     from jaxsmw.io.meshes import check_mesh_suffix
 
     files = _mesh_files(options)
-    refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_of")
+    refuse_without(options, "--landmarks", bool(options.landmarks), "landmarks_of", "sliders")
     if not options.suffix.startswith("."):
         options.suffix = f".{options.suffix}"
     check_mesh_suffix(f"mesh{options.suffix}")
@@ -61,8 +64,10 @@ def check_collection(options: argparse.Namespace) -> dict[str, Path]:
     if options.landmarks:
         size_of_file(options.landmarks)
         suffix = check_readable_suffix(options.landmarks)
+        if options.sliders:
+            size_of_file(options.sliders)
         options.landmarks_of = options.landmarks_of or _mesh_of(options.landmarks, suffix, files)
-    inputs = [*map(str, files.values()), *([options.landmarks] if options.landmarks else [])]
+    inputs = [*map(str, files.values()), *filter(None, (options.landmarks, options.sliders))]
     check_outputs(inputs, directories=[(options.output, RESULT_FILES)])
     _refuse_results_as_inputs(options.output, inputs, files)
     if _same(options.output, Path(options.directory)):
@@ -147,12 +152,16 @@ def _mesh_of(landmarks: str, suffix: str, files: Mapping[str, Path]) -> str:
 def read_collection(options: argparse.Namespace, files: Mapping[str, Path]) -> Meshes:
     """Read the meshes and the landmarks, and check that they fit the options and earlier results."""
     from jaxsmw.collection.files import check_replaceable
+    from jaxsmw.collection.semilandmarks import read_sliders
     from jaxsmw.io.landmark_files import read_landmark_file
     from jaxsmw.io.landmarks import check_frame
     from jaxsmw.io.meshes import read_mesh_data
 
     _note_other_files(options)
     landmarks = read_landmark_file(options.landmarks) if options.landmarks else None
+    sliders = None
+    if landmarks is not None and options.sliders:
+        sliders = read_sliders(options.sliders, landmarks.names)
 
     data: dict[str, MeshData] = {}
     unreadable = {}
@@ -175,7 +184,7 @@ def read_collection(options: argparse.Namespace, files: Mapping[str, Path]) -> M
     if landmarks is not None:
         check_frame(landmarks, data[Path(options.landmarks_of).name].mesh)
     check_replaceable(Path(options.output), names)
-    meshes = Meshes(data, dict(zip(data, names, strict=True)), unreadable, landmarks)
+    meshes = Meshes(data, dict(zip(data, names, strict=True)), unreadable, landmarks, sliders)
     _keep_template(options, meshes)
     return meshes
 

@@ -12,6 +12,9 @@ import json
 import re
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+from jaxtyping import Float64
+
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.landmark_tables import parse_table
 from jaxsmw.io.formats.markups import parse_json, parse_markups
@@ -51,8 +54,16 @@ def parse_tps(text: str) -> Landmarks:
 
 
 def format_tps(landmarks: Landmarks) -> str:
-    rows = "\n".join(" ".join(map(repr, position)) for position in landmarks.positions.tolist())
-    return f"LM3={len(landmarks)}\n{rows}\nID=0\n"
+    return format_specimens(["0"], landmarks.positions[None])
+
+
+def format_specimens(names: Sequence[str], positions: Float64[np.ndarray, "N l 3"]) -> str:
+    """Return the text of a `.tps` file with the positions of l landmarks on N specimens, which have names."""
+    blocks = []
+    for name, points in zip(names, positions.tolist(), strict=True):
+        rows = "\n".join(" ".join(map(repr, position)) for position in points)
+        blocks.append(f"LM3={len(points)}\n{rows}\nID={name}\n")
+    return "\n".join(blocks)
 
 
 def parse_nts(text: str) -> Landmarks:
