@@ -467,7 +467,7 @@ def test_landmarks_appear_on_all_other_meshes(result_directory, shapes):
 
 def test_semilandmarks_are_written_for_all_meshes(result_directory, meshes):
     """The first and the last landmark do not slide, and the second slides on the surface."""
-    rows = list(csv.reader((result_directory / "semilandmarks" / "semilandmarks.csv").open()))
+    rows = list(csv.reader((result_directory / "semilandmarks" / "semilandmarks.csv").read_text().splitlines()))
     assert [row[0] for row in rows] == ["mesh", *(f"shape{number}" for number in range(4))]
     for number in (0, 2, 3):
         points = np.array(rows[number + 1][1:], float).reshape(3, 3)

@@ -168,11 +168,11 @@ def test_a_collection_gives_semilandmarks_and_files(tmp_path):
     files = write_semilandmarks(collection, names, found, sliders, tmp_path)
     assert all(file.is_file() for file in files)
     folder = tmp_path / "semilandmarks"
-    rows = list(csv.reader((folder / "semilandmarks.csv").open()))
+    rows = list(csv.reader((folder / "semilandmarks.csv").read_text().splitlines()))
     assert rows[0][:4] == ["mesh", "p0_X", "p0_Y", "p0_Z"]
     np.testing.assert_array_equal(np.array(rows[2][1:], float).reshape(20, 3), found.positions[1])
-    assert list(csv.reader((folder / "curves.csv").open()))[1] == ["1", "9", "2"]
-    assert list(csv.reader((folder / "surfaces.csv").open()))[:2] == [["surface"], ["11"]]
+    assert list(csv.reader((folder / "curves.csv").read_text().splitlines()))[1] == ["1", "9", "2"]
+    assert list(csv.reader((folder / "surfaces.csv").read_text().splitlines()))[:2] == [["surface"], ["11"]]
     blocks = (folder / "semilandmarks.tps").read_text().split("\n\n")
     lines = blocks[1].splitlines()
     assert (lines[0], lines[-1], len(blocks)) == ("LM3=20", "ID=shape1", 4)
@@ -233,9 +233,7 @@ def test_a_missing_table_is_refused(tmp_path):
         ({"curves": [[0, 10, 1]]}, ("point 10 slides twice",)),
         ({"surfaces": [25]}, ("between 0 and 19",)),
         ({"curves": [], "surfaces": []}, ("no point slides",)),
-        ({"sliding": "energy"}, ("energy", "bending, procrustes")),
         ({"rounds": 0}, ("rounds is 0", "at least 1")),
-        ({"rounds": 2.0}, ("rounds is 2.0", "whole number")),
         ({"coincide": True}, ("coincide", "remove one")),
     ],
 )
