@@ -17,7 +17,6 @@ COMMANDS = (
     "match",
     "transfer",
     "collection",
-    "complete",
     "evaluate",
     "benchmark",
     "spectrum",

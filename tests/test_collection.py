@@ -411,11 +411,8 @@ def result_directory(directory, meshes, tmp_path_factory):
     write_landmark_file(landmarks, Landmarks(("a", "b", "c"), positions))
     sliders = directory.parent / "sliders.csv"
     sliders.write_text("before,slide,after\na,b,c\n")
-    sliders = directory.parent / "sliders.csv"
-    sliders.write_text("before,slide,after\na,b,c\n")
     code = run_command(
         ["collection", str(directory), "--output", str(output), *OPTIONS, "--landmarks", str(landmarks),
-         "--sliders", str(sliders),
          "--sliders", str(sliders),
          "--attributes-of", str(directory / "shape0.ply"), "--template", str(directory / "shape2.obj")]
     )  # fmt: skip
@@ -467,7 +464,9 @@ def test_landmarks_appear_on_all_other_meshes(result_directory, shapes):
 
 def test_semilandmarks_are_written_for_all_meshes(result_directory, meshes):
     """The first and the last landmark do not slide, and the second slides on the surface."""
-    rows = list(csv.reader((result_directory / "semilandmarks" / "semilandmarks.csv").read_text().splitlines()))
+    rows = list(
+        csv.reader((result_directory / "semilandmarks" / "semilandmarks.csv").read_text().splitlines())
+    )
     assert [row[0] for row in rows] == ["mesh", *(f"shape{number}" for number in range(4))]
     for number in (0, 2, 3):
         points = np.array(rows[number + 1][1:], float).reshape(3, 3)
