@@ -101,8 +101,8 @@ def bending_energy_matrix(reference: Float64[np.ndarray, "k 3"]) -> Float64[np.n
     """Return the bending energy matrix B of thin-plate splines in space (k, k), from a reference.
 
     The spline that takes the reference to points Y has the bending energy trace(Yᵀ B Y), up to a constant
-    factor (Bookstein, "Landmark methods for forms without landmarks", MedIA 1997). Its kernel is -|r|. Affine
-    maps have no energy.
+    factor (Bookstein, "Landmark methods for forms without landmarks", MedIA 1997). Its kernel is minus the
+    distance. Affine maps have no energy.
 
     **Raises:** `InputError` if two points of the reference coincide.
     """
