@@ -54,12 +54,17 @@ def path(text: str) -> str:
     return text
 
 
+def _number(text: str) -> float:
+    """Return a number, or NaN if the text is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def positive_number(text: str) -> float:
     """An argument type for positive numbers."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
+    number = _number(text)
     if 0 < number < math.inf:
         return number
     raise argparse.ArgumentTypeError(f"{shortened(text)!r} is not a positive number")
@@ -177,10 +182,7 @@ def add_weld(parser: argparse.ArgumentParser) -> None:
 
 def _tolerance(text: str) -> float:
     """An argument type for lengths of at least 0. Python would take a mesh behind `--weld` for its length."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
+    number = _number(text)
     if 0 <= number < math.inf:
         return number
     raise argparse.ArgumentTypeError(

@@ -185,12 +185,11 @@ def _write(
 def _show(found: Asymmetry) -> None:
     import numpy as np
 
-    weights = found.alignment.weights
-    squares = (found.differences**2).sum(axis=2) @ weights
+    squares = found.mean_squares(found.differences)
     show(f"asymmetry, root mean square over the surface: {np.sqrt(squares.mean()):.4g}, in the meshes' unit.")
     if len(squares) > 1:
-        directional = float(np.sqrt((found.directional**2).sum(axis=1) @ weights))
-        fluctuating = float(np.sqrt(np.mean((found.fluctuating**2).sum(axis=2) @ weights)))
+        directional = np.sqrt(found.mean_squares(found.directional))
+        fluctuating = np.sqrt(found.mean_squares(found.fluctuating).mean())
         show(
             f"directional: {directional:.4g} (probability without directional asymmetry: "
             f"{found.probability:.3g}); fluctuating, with the errors of the maps: {fluctuating:.4g}."

@@ -101,9 +101,9 @@ class Asymmetry:
         count = len(self.differences)
         individuals = self.symmetric - self.symmetric.mean(axis=0)
         sums = (
-            2 * self._squares(individuals).sum(),
-            count / 2 * self._squares(self.directional),
-            self._squares(self.fluctuating).sum() / 2,
+            2 * self.mean_squares(individuals).sum(),
+            count / 2 * self.mean_squares(self.directional),
+            self.mean_squares(self.fluctuating).sum() / 2,
         )
         freedom = (count - 1, 1, count - 1)
         names = ("individuals", "sides", "individuals x sides")
@@ -114,8 +114,8 @@ class Asymmetry:
         first, second, third = (Effect(*row) for row in rows)
         return first, second, third
 
-    def _squares(self, fields: Float64[np.ndarray, "*N n 3"]) -> Float64[np.ndarray, "*N"]:
-        """Return the mean square of displacements over the surface."""
+    def mean_squares(self, fields: Float64[np.ndarray, "*N n 3"]) -> Float64[np.ndarray, "*N"]:
+        """Return the mean squares over the surface of displacements (n, 3), in squared units of length."""
         return np.asarray((fields**2).sum(axis=-1) @ self.alignment.weights)
 
 
@@ -153,16 +153,15 @@ def asymmetry(
             f"there are {len(shapes)} shapes, but {len(counterparts)} counterparts: give one for each shape."
         )
     mirrored = [np.asarray(points) * _REFLECTION for points in counterparts]
-    found = Asymmetry(align([*shapes, *mirrored], scale=scale, weights=weights), 1.0)
+    alignment = align([*shapes, *mirrored], scale=scale, weights=weights)
     count = len(shapes)
-    if count == 1:
-        return found
-    weighted = found.differences * np.sqrt(found.alignment.weights)[:, None]
+    weighted = alignment.aligned[:count] - alignment.aligned[count:]
+    weighted *= np.sqrt(alignment.weights)[:, None]
     products = np.tensordot(weighted, weighted, axes=((1, 2), (1, 2)))
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], (permutations, count))
     signs = np.vstack([np.ones(count), signs])  # the sides as they are count as one exchange
     squares = np.einsum("pi,ij,pj->p", signs, products, signs)
-    return Asymmetry(found.alignment, float(np.mean(squares >= squares[0] * (1 - 1e-12))))
+    return Asymmetry(alignment, float(np.mean(squares >= squares[0] * (1 - 1e-12))))
 
 
 def mirror_points(mesh: Mesh, *, preset: PresetName = DEFAULT_PRESET) -> SurfacePoints:

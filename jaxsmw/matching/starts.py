@@ -128,9 +128,9 @@ _Features = tuple[Float[np.ndarray, "a d"], Float[np.ndarray, "b d"]]
 """Features of X (a, d) and of Y (b, d), with one row per compared vertex."""
 
 
-def _finite(prepared: PreparedPair, name: str, compared: _Features) -> _Features:
-    if all(np.isfinite(of_shape).all() for of_shape in compared):
-        return compared
+def _finite(prepared: PreparedPair, name: str, features: _Features) -> _Features:
+    if all(np.isfinite(of_shape).all() for of_shape in features):
+        return features
     raise InputError(
         f"{prepared.pair.name}: {name} descriptors are not defined on these meshes with "
         f"{len(prepared.x.spectrum.eigenvalues)} eigenvectors: compute more eigenvectors, or choose another "
@@ -259,13 +259,13 @@ _ELSEWHERE = 100.0
 
 def _landmark_features(prepared: PreparedPair, landmarks: Int[np.ndarray, "l 2"]) -> _Features:
     """Append the weighted geodesic distances to all landmarks to SHOT."""
-    both = []
+    features = []
     units = prepared.pair.units_of_length
     for shape, vertices, unit, shot in zip(prepared.shapes, landmarks.T, units, prepared.shot, strict=True):
         distances = geodesic_distances(shape.mesh, vertices.astype(np.int64)).T / unit
         distances = _LANDMARK_WEIGHT * np.where(np.isfinite(distances), distances, _ELSEWHERE)
-        both.append(np.hstack([shot, shape.at_compared(distances)]))
-    return both[0], both[1]
+        features.append(np.hstack([shot, shape.at_compared(distances)]))
+    return features[0], features[1]
 
 
 def _check_landmarks(pair: Pair, landmarks: np.ndarray) -> None:
@@ -323,14 +323,14 @@ def check_nearest(
         )
 
 
-def nearest_map(prepared: PreparedPair, compared: _Features) -> Int64[np.ndarray, " m"]:
+def nearest_map(prepared: PreparedPair, features: _Features) -> Int64[np.ndarray, " m"]:
     """Compute a pointwise map of all vertices of X (m,) by nearest-neighbour search in feature space.
 
     **Raises:** `ArithmeticError` if the search is wrong; see `check_nearest`.
     """
     x, y = prepared.shapes
     dtype, mask = y.spectrum.eigenvectors.dtype, np.asarray(y.compared_spectrum.mask)
-    of_x, of_y = (of_shape.astype(dtype) for of_shape in compared)
+    of_x, of_y = (of_shape.astype(dtype) for of_shape in features)
     xp = namespace(y.spectrum.eigenvectors)
     nearest = np.asarray(nearest_neighbor(xp.asarray(of_x), xp.asarray(of_y), database_mask=mask), np.int64)
     check_nearest(of_x, of_y, np.flatnonzero(mask), nearest)
