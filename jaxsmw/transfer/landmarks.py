@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.interpolate import RBFInterpolator
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
@@ -106,6 +105,8 @@ def _deformed(
     registered: RegisteredMesh,
 ) -> Float64[np.ndarray, "l 3"]:
     """Move points by the thin-plate spline that takes X and the feet of the points to their images."""
+    from scipy.interpolate import RBFInterpolator  # 0.1 s, which only landmarks off the surface need
+
     mesh_x = registered.mesh_x
     chosen = farthest_point_samples(mesh_x, min(_CENTERS, len(mesh_x.referenced_indices)))
     centers = np.concatenate([feet, mesh_x.vertices[chosen]])
