@@ -96,11 +96,13 @@ class Proxy:
         return mirrored_descriptors(known[radius]) if self.mirrored else known[radius]
 
     def sampled_spectrum(self, descriptors: Float[np.ndarray, "s d"] | None) -> Spectrum:
-        """Return the spectrum at the samples, with the areas of the samples and perhaps with descriptors."""
+        """Return the spectrum at the samples, with all else of the proxy and perhaps with descriptors."""
         at_samples = self.spectrum.sample(self.samples.vertices)
         xp, dtype = namespace(at_samples.eigenvectors), at_samples.eigenvectors.dtype
-        areas = self.areas * float(np.sum(self.spectrum.vertex_areas))
-        sampled = replace(at_samples, vertex_areas=xp.asarray(areas, dtype), positions=None, normals=None)
+        area = float(np.sum(self.spectrum.vertex_areas))
+        positions = self.positions * self.unit * (area / self.mesh.area) ** 0.5
+        sampled = replace(at_samples, vertex_areas=xp.asarray(self.areas * area, dtype))
+        sampled = sampled.with_positions(xp.asarray(positions, dtype), xp.asarray(self.normals, dtype))
         columns = None if descriptors is None else xp.asarray(descriptors, dtype)
         return sampled.with_descriptors(columns).with_crease_eigenvectors(None)
 

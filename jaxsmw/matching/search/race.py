@@ -4,29 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool
 
-from jaxsmw.core.refiners.feature_regression import FeatureRegression
+from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError
 from jaxsmw.matching.executor import run_all
 from jaxsmw.matching.judge import discontinuous_parts, orientation_reversal
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.search.evidence import Evidence
-from jaxsmw.matching.search.hypotheses import HYPOTHESES, Hypothesis
+from jaxsmw.matching.search.hypotheses import HYPOTHESES, Hypothesis, by_descriptors
 from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
 
-# The stages of the race: those of the preset `accurate` with fewer eigenvectors.
+# The stages of the race. (Entry R49 of docs/research_log.md)
 _STAGES = (
     Stage(WaveletPreservation(), number_of_eigenvectors=50),
-    Stage(FeatureRegression((20, 20, 26, 35)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),
+    Stage(Registration((20, 35, 60)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),
 )
 # The number of the best maps that are mended in each round, and the number of rounds.
 _MENDED, _ROUNDS = 4, 2
@@ -79,6 +79,13 @@ def race(
         found += _refined([move for best in new for move in _moves(best, readings)])
         moved += new
     return list(different(found))
+
+
+def other_hand(reading: Reading) -> Reading:
+    """Return the reading in which X has the other hand, with the map from SHOT as its first map."""
+    mirrored = reading.mirror()
+    candidates = _refined(list(islice(_hypotheses(mirrored, (by_descriptors,)), 1)))
+    return replace(mirrored, first=candidates[0].matches) if candidates else mirrored
 
 
 def hand_evidence(reading: Reading) -> float:

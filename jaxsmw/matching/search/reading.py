@@ -53,8 +53,8 @@ class Reading:
         return cls(prepared, x, y)
 
     def mirror(self) -> Reading:
-        """Return the reading in which X has the other hand."""
-        return Reading(self.prepared.mirror(), self.x.mirror(), self.y, self.first)
+        """Return the reading in which X has the other hand. It has no first map."""
+        return Reading(self.prepared.mirror(), self.x.mirror(), self.y)
 
     def with_first(self, pointwise_map: Int64[np.ndarray, " m"]) -> Reading:
         """Return the reading for which a map X -> Y (m,) is the map of the first start."""
@@ -124,11 +124,9 @@ class Reading:
     def agreement(self, matches: SampleMap) -> float:
         """Return the share of X's area, from 0 to 1, on which a map of samples agrees with the first map.
 
-        The first map is that of the other hand if X is mirrored. The two maps are then not compared.
+        Without a first map, the share is 0.
         """
-        if self.first is None or self.x.mirrored:
-            return 0.0
-        return 1 - self.difference(self.first, matches)
+        return 0.0 if self.first is None else 1 - self.difference(self.first, matches)
 
 
 # The radii of SHOT, in units of 0.06, and the least mean asymmetry of asymmetric shapes. (Entry R23)

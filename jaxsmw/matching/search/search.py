@@ -24,7 +24,7 @@ from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probabilities, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
-from jaxsmw.matching.search.race import Candidate, Kind, different, race
+from jaxsmw.matching.search.race import Candidate, Kind, different, other_hand, race
 from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
@@ -188,7 +188,7 @@ def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
 def readings_of(reading: Reading, both_hands: bool) -> list[Reading]:
     """Return a reading, and those with a shape as a part of the other. Both hands double them."""
     readings = [reading, *_as_parts(reading)]
-    return [hand for one in readings for hand in (one, one.mirror())] if both_hands else readings
+    return [hand for one in readings for hand in (one, other_hand(one))] if both_hands else readings
 
 
 def _as_parts(reading: Reading) -> Iterator[Reading]:
