@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -208,17 +208,22 @@ def write_tables(
     return summaries
 
 
+def share_of_pairs(data_set: DataSet, pairs: Collection[tuple[str, str]]) -> str:
+    """Return how many pairs of a data set were chosen, such as `2 of 6 pairs`."""
+    # A user's list of pairs can contain pairs that the data set does not list.
+    listed = {pair.names for pair in data_set.pairs}
+    return f"{len(pairs)} of {len(listed)} pairs" if listed.issuperset(pairs) else f"{len(pairs)} given pairs"
+
+
 def _introduction(data_set: DataSet, results: Results, settings: Settings) -> str:
     """Return the paragraph above the table of `summary.md`."""
     pairs = {(row["source"], row["target"]) for row in results.rows}
-    # A user's list of pairs can contain pairs that the data set does not list.
-    listed = pairs <= {pair.names for pair in data_set.pairs}
-    share = f"{len(pairs)} of {len(data_set.pairs)}" if listed else f"{len(pairs)} given"
+    share = share_of_pairs(data_set, pairs)
     points = "all points" if settings.evaluated_points is None else f"{settings.evaluated_points} points"
     machines = "; ".join(sorted({row["machine"] for row in results.rows}))
     initial = DEFAULT_INITIAL_MAP if settings.init == DEFAULT_MATCH_INIT else Path(settings.init).name
     sentences = [
-        f"{share} pairs of the data set ({data_set.layout}) were measured. All methods start "
+        f"{share} of the data set ({data_set.layout}) were measured. All methods start "
         f"from the same initial map ({initial}).",
         "Errors are mean geodesic errors in thousandths of the square root of the target's area, at "
         f"{points} of the ground truth.",

@@ -137,7 +137,7 @@ def _measure(options: argparse.Namespace) -> None:
     from jaxsmw.benchmark.datasets import open_data_set
     from jaxsmw.benchmark.measurement import Settings
     from jaxsmw.benchmark.opponents.registry import find_methods, suited_methods
-    from jaxsmw.benchmark.tables import markdown_table, write_tables
+    from jaxsmw.benchmark.tables import markdown_table, share_of_pairs, write_tables
     from jaxsmw.runtime.workers import open_executor
 
     data_set = open_data_set(options.data)
@@ -150,7 +150,8 @@ def _measure(options: argparse.Namespace) -> None:
     if Path(output).resolve() == data_set.directory.resolve():
         raise InputError(f"{output}: is the directory of the data set: choose another directory.")
     directory = make_directory(output)
-    report_progress(f"{data_set.layout}, {len(pairs)} of {len(data_set.pairs)} pairs")
+    share = share_of_pairs(data_set, {pair.names for pair in pairs})
+    report_progress(f"{data_set.layout}, {share}")
     announce_consequence(f"finished pairs are kept in {output}, and the same command continues from there")
     with quiet_children(), open_executor(options.workers, options.scheduler) as executor:
         results = run_benchmark(data_set, pairs, directory, methods, settings, executor, quiet=options.quiet)
