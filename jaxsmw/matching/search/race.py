@@ -23,10 +23,11 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
 
-# The stages of the race. (Entry R49 of docs/research_log.md)
+# The stages of the race. Coarse levels move limbs that finer levels leave in place. (Entry R49 of
+# docs/research_log.md)
 _STAGES = (
     Stage(WaveletPreservation(), number_of_eigenvectors=50),
-    Stage(Registration((20, 35, 60)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),
+    Stage(Registration((8, 12, 20, 35, 60)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),
 )
 # The number of the best maps that are mended in each round, and the number of rounds.
 _MENDED, _ROUNDS = 4, 2
