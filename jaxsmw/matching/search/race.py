@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -62,7 +62,7 @@ Kind = TypeVar("Kind", bound=Candidate)
 
 
 def race(
-    readings: Sequence[Reading], known: Iterable[Candidate], hypotheses: Sequence[Hypothesis] = HYPOTHESES
+    readings: Sequence[Reading], known: Sequence[Candidate], hypotheses: Sequence[Hypothesis] = HYPOTHESES
 ) -> list[Candidate]:
     """Refine maps of samples together, and return different maps, the best first.
 
@@ -73,7 +73,8 @@ def race(
     - `hypotheses`: the kinds of hypothesis that are refined as well, for each reading.
     """
     starts = [task for reading in readings for task in _hypotheses(reading, hypotheses)]
-    found = _refined([*starts, *(_Task(one.reading, one.matches) for one in known)])
+    # Coarse levels can turn a map that only exchanges two limbs, so it is mended as it is, too.
+    found = [*known, *_refined([*starts, *(_Task(one.reading, one.matches) for one in known)])]
     moved: list[Candidate] = []
     for _ in range(_ROUNDS):
         new = [best for best in islice(different(found), _MENDED) if best not in moved]
