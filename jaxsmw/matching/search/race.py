@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool
 
+from jaxsmw.core.refiners.feature_regression import FeatureRegression
 from jaxsmw.core.refiners.registration import Registration
 from jaxsmw.core.refiners.wavelet_preservation import WaveletPreservation
 from jaxsmw.errors import InputError
@@ -23,12 +24,15 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
 
-# The stages of the race. Coarse levels move limbs that finer levels leave in place. (Entry R49 of
+# The stages by which all maps are refined, and those by which the given number of the best maps is refined
+# once more. Coarse levels of registration move limbs that finer levels leave in place. (Entry R49 of
 # docs/research_log.md)
 _STAGES = (
     Stage(WaveletPreservation(), number_of_eigenvectors=50),
-    Stage(Registration((8, 12, 20, 35, 60)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),
+    Stage(FeatureRegression((20, 20, 26, 35)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),
 )
+_LAST_STAGES = (Stage(Registration((8, 12, 20, 35, 60)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),)
+_REGISTERED = 10
 # The number of the best maps that are mended in each round, and the number of rounds.
 _MENDED, _ROUNDS = 4, 2
 # Two maps are different if they differ on at least this share of the area.
@@ -62,7 +66,7 @@ Kind = TypeVar("Kind", bound=Candidate)
 
 
 def race(
-    readings: Sequence[Reading], known: Sequence[Candidate], hypotheses: Sequence[Hypothesis] = HYPOTHESES
+    readings: Sequence[Reading], known: Iterable[Candidate], hypotheses: Sequence[Hypothesis] = HYPOTHESES
 ) -> list[Candidate]:
     """Refine maps of samples together, and return different maps, the best first.
 
@@ -73,14 +77,14 @@ def race(
     - `hypotheses`: the kinds of hypothesis that are refined as well, for each reading.
     """
     starts = [task for reading in readings for task in _hypotheses(reading, hypotheses)]
-    # Coarse levels can turn a map that only exchanges two limbs, so it is mended as it is, too.
-    found = [*known, *_refined([*starts, *(_Task(one.reading, one.matches) for one in known)])]
+    found = _refined([*starts, *map(_Task.of, known)])
     moved: list[Candidate] = []
     for _ in range(_ROUNDS):
         new = [best for best in islice(different(found), _MENDED) if best not in moved]
         found += _refined([move for best in new for move in _moves(best, readings)])
         moved += new
-    return list(different(found))
+    best = islice(different(found), _REGISTERED)
+    return list(different(_refined([_Task.of(one) for one in best], _LAST_STAGES)))
 
 
 def other_hand(reading: Reading) -> Reading:
@@ -120,6 +124,10 @@ class _Task(NamedTuple):
     matches: SampleMap
     excluded: Bool[np.ndarray, " s"] | None = None
 
+    @classmethod
+    def of(cls, candidate: Candidate) -> _Task:
+        return cls(candidate.reading, candidate.matches)
+
 
 def _hypotheses(reading: Reading, hypotheses: Sequence[Hypothesis] = HYPOTHESES) -> Iterator[_Task]:
     for hypothesis in hypotheses:
@@ -128,12 +136,12 @@ def _hypotheses(reading: Reading, hypotheses: Sequence[Hypothesis] = HYPOTHESES)
                 yield _Task(reading, matches)
 
 
-def _refined(tasks: Sequence[_Task]) -> list[Candidate]:
+def _refined(tasks: Sequence[_Task], by: Sequence[Stage] = _STAGES) -> list[Candidate]:
     """Refine maps of samples, and judge those whose refinement succeeds."""
     if not tasks:
         return []
     fewest = min(len(side.areas) for task in tasks for side in (task.reading.x, task.reading.y))
-    stages = [stage.fitted(fewest) for stage in _STAGES]
+    stages = [stage.fitted(fewest) for stage in by]
     starts = [(task.reading.spectra, Start(task.matches, excluded=task.excluded)) for task in tasks]
     return [
         Candidate(task.reading, outcome.pointwise_map, Evidence.of(task.reading, outcome.pointwise_map))
