@@ -25,9 +25,9 @@ from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.alternatives import alternatives
 from jaxsmw.matching.search.evidence import Evidence, deformation, discontinuity, probabilities, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
-from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, other_hand, race
+from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, race
 from jaxsmw.matching.search.reading import Reading
-from jaxsmw.matching.search.search import Judged, search
+from jaxsmw.matching.search.search import Judged, other_hand, search
 from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.stages import Preset, Sizes, Stage
 
@@ -309,7 +309,8 @@ def test_a_mostly_reversed_map_is_tried_for_the_other_hand(lump):
 def test_the_other_hand_has_a_first_map_of_its_own(lump):
     reading = read(lump, turned(lump.mirrored()))
     right = reading.reduced(order_of(lump))
-    assert other_hand(reading.with_first(order_of(lump))).agreement(right) > 0.9
+    other = other_hand(reading, SEARCH, Start(order_of(lump), "shot"))
+    assert other.agreement(right) > 0.9
     assert reading.mirror().agreement(right) == 0
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import NamedTuple, TypeVar
 
@@ -19,7 +19,7 @@ from jaxsmw.matching.executor import run_all
 from jaxsmw.matching.judge import discontinuous_parts, orientation_reversal
 from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.search.evidence import Evidence
-from jaxsmw.matching.search.hypotheses import HYPOTHESES, Hypothesis, by_descriptors
+from jaxsmw.matching.search.hypotheses import HYPOTHESES, Hypothesis
 from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
@@ -85,13 +85,6 @@ def race(
         moved += new
     best = islice(different(found), _REGISTERED)
     return list(different(_refined([_Task.of(one) for one in best], _LAST_STAGES)))
-
-
-def other_hand(reading: Reading) -> Reading:
-    """Return the reading in which X has the other hand, with the map from SHOT as its first map."""
-    mirrored = reading.mirror()
-    candidates = _refined(list(islice(_hypotheses(mirrored, (by_descriptors,)), 1)))
-    return replace(mirrored, first=candidates[0].matches) if candidates else mirrored
 
 
 def hand_evidence(reading: Reading) -> float:

@@ -24,11 +24,12 @@ from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probabilities, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
-from jaxsmw.matching.search.race import Candidate, Kind, different, other_hand, race
+from jaxsmw.matching.search.race import Candidate, Kind, different, race
 from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset
+from jaxsmw.matching.starts import INITIAL_MAPS, make_start
 
 logger = logging.getLogger("jaxsmw")
 
@@ -124,7 +125,8 @@ def search(
     # nearly its own mirror image, such as a person, needs no second hand: its left stays its left.
     both_hands = hypotheses and mirror == "auto" and reading.is_asymmetric()
     certain = _ends_the_search(first, settings) and not both_hands
-    readings = readings_of(reading, both_hands) if hypotheses and not certain else [reading]
+    other = other_hand(reading, preset, start) if both_hands else None
+    readings = readings_of(reading, other) if hypotheses and not certain else [reading]
     for number in range(_ROUNDS):
         if certain:
             break
@@ -185,10 +187,20 @@ def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
     return [maps[number] for number in order if parts[number] >= settings.likely * parts[order[0]]]
 
 
-def readings_of(reading: Reading, both_hands: bool) -> list[Reading]:
-    """Return a reading, and those with a shape as a part of the other. Both hands double them."""
+def readings_of(reading: Reading, other: Reading | None = None) -> list[Reading]:
+    """Return a reading and those with a shape as a part of the other, perhaps also with the other hand."""
     readings = [reading, *_as_parts(reading)]
-    return [hand for one in readings for hand in (one, other_hand(one))] if both_hands else readings
+    hands = [replace(one.mirror(), first=other.first) for one in readings] if other else []
+    return readings + hands
+
+
+def other_hand(reading: Reading, preset: Preset, start: Start) -> Reading:
+    """Return the reading in which X has the other hand, with the map of its own first start."""
+    mirrored = reading.mirror().described(preset)
+    if start.origin not in INITIAL_MAPS:
+        return mirrored
+    spectra, again = mirrored.prepared.spectra, make_start(mirrored.prepared, start.origin)
+    return mirrored.with_first(run(preset.before_final, spectra, again).pointwise_map)
 
 
 def _as_parts(reading: Reading) -> Iterator[Reading]:
