@@ -148,6 +148,17 @@ def test_results_are_kept_and_methods_can_be_added(pairs, tmp_path):
         Comparison.read(tmp_path)
 
 
+def test_a_method_without_results_for_some_pairs_is_visible(pairs, tmp_path):
+    measured(["initial"], pairs, output=tmp_path)
+    measured({"added": first_match}, pairs[:1], output=tmp_path)
+    stored = Comparison.read(tmp_path)
+    lines = [line.split(" | ") for line in str(stored).splitlines()]
+    at = lines[0].index("pairs")
+    assert [line[at] for line in lines[2:]] == ["3", "1 of 3"]
+    assert np.isnan(stored.errors("added")).tolist() == [False, True, True]
+    assert " of " not in str(stored.select(pairs=stored.pairs[:1]))
+
+
 def test_a_method_that_fails_has_no_error(pairs):
     comparison = measured({"first": first_match, "failing": failing}, pairs[:2])
     assert np.isnan(comparison.errors("failing")).all() and np.isfinite(comparison.errors("first")).all()

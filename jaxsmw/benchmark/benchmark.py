@@ -42,8 +42,8 @@ class Results(NamedTuple):
 
     **Attributes:**
 
-    - `rows`: one row with the keys of `RESULT_COLUMNS` for each pair and method. A pair is left out if any
-      method has no result for this pair.
+    - `rows`: one row with the keys of `RESULT_COLUMNS` for each pair and method. `run_benchmark` leaves out a
+      pair if any of its methods has no result for this pair. `Comparison.read` keeps all stored rows.
     - `shapes`: one row with the keys of `SHAPE_COLUMNS` for each measured shape, by the name of the shape.
     - `failures`: the error message of each shape or pair that could not be measured, by its name.
     """

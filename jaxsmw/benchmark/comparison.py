@@ -177,6 +177,8 @@ class Comparison:
     def read(cls, output: str | os.PathLike[str], *, seed: int = 0) -> Comparison:
         """Read the results that `compare` or `jaxsmw benchmark` stored in the directory `output`.
 
+        A method that was added later can lack results for some pairs; see `table`.
+
         **Raises:** `InputError` if the directory contains no results, or if they are damaged.
         """
         path = Path(output) / "results.csv"
@@ -212,7 +214,7 @@ class Comparison:
         return tuple(dict.fromkeys((row["source"], row["target"]) for row in self.results.rows))
 
     def errors(self, method: str) -> Float64[np.ndarray, " p"]:
-        """Return the error of a method on each of the p `pairs`; NaN where the method failed."""
+        """Return the error of a method on each of the p `pairs`; NaN where it failed or has no result."""
         by_pair = self._errors[self._checked(method)]
         return np.array([by_pair.get(pair, np.nan) for pair in self.pairs])
 
@@ -233,7 +235,9 @@ class Comparison:
         """Return a Markdown table with one row for each method.
 
         The columns are those of `jaxsmw benchmark`. The differences are those from the reference, by default
-        from the first method.
+        from the first method. All other numbers are those of the pairs on which the method did not fail. The
+        column `pairs` shows "2 of 30" if the method has results for 2 of the 30 `pairs`; `select` the pairs
+        that all methods share before you compare means.
         """
         reference = self._checked(reference)
         summaries = summarize_methods(self.results, seed=self.seed, reference=reference)
