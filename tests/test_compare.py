@@ -56,6 +56,11 @@ def broken(spectrum_x, spectrum_y, start_map):
     raise KeyError("no such thing")
 
 
+class Misspelled(Meyer):
+    def __call__(self, points, eigenvalues):
+        return undefined_name
+
+
 def failing(spectrum_x, spectrum_y, start_map):
     raise ArithmeticError("did not converge")
 
@@ -157,6 +162,23 @@ def test_a_method_without_results_for_some_pairs_is_visible(pairs, tmp_path):
     assert [line[at] for line in lines[2:]] == ["3", "1 of 3"]
     assert np.isnan(stored.errors("added")).tolist() == [False, True, True]
     assert " of " not in str(stored.select(pairs=stored.pairs[:1]))
+
+
+def test_a_fault_in_own_code_is_named_at_once_and_can_be_corrected(pairs, tmp_path):
+    """The second pair is not measured, and the name of the method remains free until it has a result."""
+    called = []
+
+    def counted(spectrum_x, spectrum_y, start_map):
+        called.append(spectrum_x)
+        raise NameError("no such name")
+
+    for method in (WaveletPreservation(Misspelled()), counted):
+        with pytest.raises(InputError, match=r"mine raised NameError at .*test_compare\.py, line") as caught:
+            measured({"mine": method}, pairs, output=tmp_path)
+        assert isinstance(caught.value.__cause__, NameError)
+    assert len(called) == 1
+    measured({"mine": first_match}, pairs[:1], output=tmp_path)
+    assert (tmp_path / "methods.csv").read_text().count("mine") == 1
 
 
 def test_a_method_that_fails_has_no_error(pairs):

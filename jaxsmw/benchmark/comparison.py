@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 import os
 import pickle
@@ -118,7 +117,8 @@ def compare(
     pair has no ground truth, or if two pairs or two different meshes have the same name. `InputError` is also
     raised if `output` contains results of other data, settings, methods or versions, if an argument is out of
     range, if a method cannot be sent to workers, if the workers end abruptly, or if no pair could be
-    measured, for example because a function raises an error or returns no map.
+    measured, for example because a function returns no map. If the code of a method raises another error on
+    the first pair, the comparison ends with an `InputError` at once, whose `__cause__` is that error.
     """
     check_whole_number("number_of_eigenvectors", number_of_eigenvectors, 1)
     check_whole_number("iterations", iterations, 1)
@@ -144,6 +144,7 @@ def compare(
                 quiet=quiet,
                 number_of_eigenvectors=most,
                 timed_shapes=False,
+                stops_at_fault=True,
             )
         except BrokenProcessPool as error:
             raise InputError(
@@ -307,17 +308,12 @@ class MapMethod(Method):
         assert pair.meshes is not None
         seen = pair.spectra.seen_by(Stage(number_of_eigenvectors=self.number_of_eigenvectors))
         x, y, initial_map = jax.device_put((*seen.both, np.asarray(pair.initial_map)))
-        try:
-            images = np.asarray(self.function(x, y, initial_map))
-        except (InputError, ArithmeticError):
-            raise
-        except Exception as error:
-            frames = inspect.trace()
-            frame = ([one for one in frames if "site-packages" not in one.filename] or frames)[-1]
+        found = self.function(x, y, initial_map)
+        if hasattr(found, "pointwise_map"):
             raise InputError(
-                f"the method {self.name} raised {type(error).__name__} at {frame.filename}, line "
-                f"{frame.lineno} ({error}): correct the function."
-            ) from error
+                f"the map of the method {self.name} is a {type(found).__name__}: return its .pointwise_map."
+            )
+        images = np.asarray(found)
         return check_pointwise_map(images, *pair.meshes, f"map of the method {self.name}")
 
 

@@ -176,7 +176,7 @@ def claimed_directory(
         # Some versions of `filelock` would report a lock of another process instead.
         raise InputError(
             f"{directory}: cannot be locked, because files cannot be created or locked there: give another "
-            "--output, on a file system with locks."
+            "output directory, on a file system with locks."
         )
     # The operating system releases the lock even if the process is killed.
     lock = FileLock(directory / ".lock", timeout=0)
@@ -185,11 +185,11 @@ def claimed_directory(
     except Timeout:
         raise InputError(
             f"{directory}: another process is adding results: wait until this process ends, or give another "
-            "--output."
+            "output directory."
         ) from None
     except OSError as error:
         raise InputError(
-            f"{directory}: cannot be locked ({error.strerror}): give another --output, or remove the "
+            f"{directory}: cannot be locked ({error.strerror}): give another output directory, or remove the "
             "directory."
         ) from error
     try:
@@ -213,12 +213,13 @@ def _check_origin(
                 if before.get(name) != now.get(name):
                     raise InputError(
                         f"{directory}: contains results with {name} = {before.get(name)} ({group}), but this "
-                        f"run has {name} = {now.get(name)}: give another --output, or remove the directory."
+                        f"run has {name} = {now.get(name)}: give another output directory, or remove "
+                        "this one."
                     )
     elif any(directory.glob("*.csv")):
         raise InputError(
             f"{directory}: contains results of unknown origin, because provenance.json is missing: give "
-            "another --output."
+            "another output directory."
         )
     else:
         contents = {**wanted, "noted": dict(noted)} if noted else wanted
@@ -232,5 +233,7 @@ def _read_provenance(path: Path) -> dict[str, dict[str, Any]]:
     except (OSError, ValueError, RecursionError):
         stored = None
     if not isinstance(stored, dict) or not all(isinstance(group, dict) for group in stored.values()):
-        raise InputError(f"{path}: the file is damaged: give another --output, or remove its directory.")
+        raise InputError(
+            f"{path}: the file is damaged: give another output directory, or remove its directory."
+        )
     return stored
