@@ -149,6 +149,10 @@ def test_results_are_kept_and_methods_can_be_added(pairs, tmp_path):
         measured({"Meyer": MWP}, [(x, moved, truth)], output=output)
     with pytest.raises(InputError, match=r"seed = 0 .*but this run has seed = 1"):
         measured({"Meyer": MWP}, pairs, output=output, seed=1)
+    with pytest.raises(InputError, match=r"20 eigenvectors of each shape.* the method large needs 30"):
+        measured({"large": Stage(MWP, number_of_eigenvectors=30)}, pairs, output=output)
+    measured(["initial"], pairs[:1], output=output, number_of_eigenvectors=10)
+    assert "nan" in (output / "shapes.csv").read_text()
     with pytest.raises(InputError, match=r"results\.csv: does not exist"):
         Comparison.read(tmp_path)
 

@@ -41,7 +41,7 @@ from jaxsmw.geometry.surface_points import SurfacePoints, check_points, check_po
 from jaxsmw.matching.stages import Preset, Stage, choose_preset
 from jaxsmw.report.figures import draw_intervals, save_figure
 from jaxsmw.runtime.files import make_directory
-from jaxsmw.runtime.provenance import value_digest
+from jaxsmw.runtime.provenance import read_provenance, value_digest
 from jaxsmw.runtime.workers import Workers
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def compare(
 
     Each shape is prepared once for all methods and pairs. If the comparison is interrupted or killed, the
     same call with the same `output` measures only what is missing. A later call with the same `output` can
-    add methods and pairs.
+    add pairs, and methods that need no more eigenvectors than the first call computed.
 
     **Arguments:**
 
@@ -98,7 +98,7 @@ def compare(
       `CreaturePair`, or a tuple `(mesh_x, mesh_y, truth)`. In a tuple, `truth` is a `GroundTruth`, or the
       true points of all vertices of X: a map (m,) or `SurfacePoints`.
     - `number_of_eigenvectors`: the number for refiners without levels, and for functions; 100 by default.
-      Each shape gets at least as many eigenvectors.
+      Each shape gets as many eigenvectors as any method needs, or as in the first call with `output`.
     - `iterations`: the number for refiners without levels; 3 by default.
     - `init`: the initial map of all methods, a name that `jaxsmw.match` accepts, or a directory with maps in
       files `X_Y.map`. With `"auto"` (the default), it is `"shot"`; presets may also try others.
@@ -131,7 +131,6 @@ def compare(
     settings = Settings(init, evaluated_points=evaluated_points, seed=seed)
     if workers is not None:
         _check_sendable(every)
-    most = max(number_of_eigenvectors, *(method.number_of_eigenvectors for method in every.values()))
     with _directory(output) as directory, nullcontext() if workers is None else Workers(workers) as executor:
         try:
             results = run_benchmark(
@@ -142,7 +141,7 @@ def compare(
                 settings,
                 executor,
                 quiet=quiet,
-                number_of_eigenvectors=most,
+                number_of_eigenvectors=_computed_number(directory, number_of_eigenvectors, every),
                 timed_shapes=False,
                 stops_at_fault=True,
             )
@@ -423,6 +422,24 @@ def _free_name(mesh: Mesh, names: Mapping[int, str]) -> str:
     """Return the name of a mesh, with a number behind it if another mesh has this name."""
     numbered = (f"{mesh.name} {number}" for number in itertools.count(2))
     return next(name for name in itertools.chain([mesh.name], numbered) if name not in names.values())
+
+
+def _computed_number(directory: Path, number_of_eigenvectors: int, methods: Mapping[str, Method]) -> int:
+    """Return the number of eigenvectors of each shape, which is that of all results in a directory."""
+    needed = {"the argument number_of_eigenvectors": number_of_eigenvectors}
+    needed |= {f"the method {name}": method.number_of_eigenvectors for name, method in methods.items()}
+    what, most = max(needed.items(), key=lambda item: item[1])
+    path = directory / "provenance.json"
+    stored = read_provenance(path).get("settings", {}).get("number_of_eigenvectors") if path.exists() else 0
+    if not isinstance(stored, int) or stored == 0:
+        return most
+    if stored < most:
+        raise InputError(
+            f"{directory}: contains results with {stored} eigenvectors of each shape, on which initial maps "
+            f"can depend, but {what} needs {most}: give another output directory, and begin there with this "
+            "number."
+        )
+    return stored
 
 
 def _check_sendable(methods: Mapping[str, Method]) -> None:

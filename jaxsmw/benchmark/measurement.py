@@ -108,7 +108,8 @@ SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
 """A dictionary from the name of each column of `shapes.csv` to the function that parses its values.
 
 The file contains one row for each shape. `digest` is a hash of the mesh file. `seconds_spectrum` and
-`seconds_descriptors` are the wall times of the precomputation.
+`seconds_descriptors` are the wall times of the precomputation, or NaN if `compare` has measured the shape,
+because `compare` uses the cache.
 """
 
 

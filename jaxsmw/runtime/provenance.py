@@ -205,7 +205,7 @@ def _check_origin(
     path = directory / "provenance.json"
     wanted = json.loads(json.dumps(provenance))
     if path.exists():
-        stored = _read_provenance(path)
+        stored = read_provenance(path)
         stored.pop("noted", None)
         for group in {**stored, **wanted}:
             before, now = stored.get(group, {}), wanted.get(group, {})
@@ -227,7 +227,8 @@ def _check_origin(
             temporary.write_text(json.dumps(contents, indent=2) + "\n", "utf-8")
 
 
-def _read_provenance(path: Path) -> dict[str, dict[str, Any]]:
+def read_provenance(path: Path) -> dict[str, dict[str, Any]]:
+    """Read the groups of a file `provenance.json`; raise `InputError` if the file is damaged."""
     try:
         stored = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
