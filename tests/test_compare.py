@@ -52,6 +52,15 @@ def wrong_length(spectrum_x, spectrum_y, start_map):
     return start_map[1:]
 
 
+def whole_result(spectrum_x, spectrum_y, start_map):
+    return refine(spectrum_x, spectrum_y, start_map, iterations=1)
+
+
+class WithoutStatus(WaveletPreservation):
+    def update(self, prepared, pointwise_map, previous):
+        return jnp.eye(K)
+
+
 def broken(spectrum_x, spectrum_y, start_map):
     raise KeyError("no such thing")
 
@@ -290,10 +299,13 @@ def test_bad_input_gets_one_sentence(pairs, unchecked):
         ({1: MWP}, pairs, "the name of a method is 1"),
         ({"Meyer": Meyer()}, pairs, "the method 'Meyer' is Meyer"),
         ({"Meyer": WaveletPreservation}, pairs, "the method 'Meyer' is <class"),
+        (["zoomotu"], pairs, "not a method .did you mean 'zoomout'.*fast, paper"),
+        ({"f": whole_result}, pairs[:1], "method f is a Refinement: return its .pointwise_map"),
+        ({"r": WithoutStatus()}, pairs[:1], "WithoutStatus.update must return a State and a status code"),
         ({"theirs": "no-such-method"}, pairs, "'no-such-method' is not a method"),
         (["mwp", "mwp"], pairs, "'mwp' is listed twice"),
         (one, [], "there are no pairs"),
-        (one, 3, "pairs is 3"),
+        (one, 3, "pairs is of type int"),
         (one, "no-such-directory", "is not a directory"),
         (one, [(x, y)], "pair 0 is tuple without ground truth"),
         (one, [(x, y, truth[1:])], "641 true points for the 642 vertices"),

@@ -321,7 +321,8 @@ def _named_methods(
 ) -> dict[str, Method]:
     if isinstance(methods, str) or not isinstance(methods, Mapping | Sequence):
         raise InputError(
-            f"methods is {methods!r}: give a dictionary from names to methods, or a list of names."
+            f"methods is of type {type(methods).__name__}: give a dictionary from names to methods, or a "
+            "list of names."
         )
     if not methods:
         raise InputError("there are no methods to compare: give at least one.")
@@ -343,7 +344,7 @@ def _as_method(name: str, method: Compared, number_of_eigenvectors: int, iterati
     if isinstance(method, str):
         if method in get_args(PresetName):
             return Matched(f"jaxsmw.match with the preset {method}", choose_preset(method))
-        return next(iter(find_methods([method]).values()))
+        return next(iter(find_methods([method], get_args(PresetName)).values()))
     if isinstance(method, Preset):
         return Matched(f"jaxsmw.match with a preset ({value_digest(method)})", method)
     if isinstance(method, Refiner):
@@ -377,7 +378,9 @@ def _known_pairs(
     if isinstance(pairs, DataSet):
         return list(pairs.pairs)
     if not isinstance(pairs, Iterable):
-        raise InputError(f"pairs is {pairs!r}: give a data set, its directory, or a list of pairs.")
+        raise InputError(
+            f"pairs is of type {type(pairs).__name__}: give a data set, its directory, or a list of pairs."
+        )
     names: dict[int, str] = {}
     every = [_known_pair(number, pair, names) for number, pair in enumerate(pairs)]
     if not every:
@@ -401,8 +404,9 @@ def _known_pair(number: int, pair: Any, names: dict[int, str]) -> AnyPair:
         pair = pair.source, pair.target, pair.truth
     if not isinstance(pair, tuple | list) or len(pair) != 3:
         raise InputError(
-            f"pair {number} is {type(pair).__name__} without ground truth: give a pair of a data set, a "
-            "CreaturePair, or a tuple of the source, the target and the true points on the target."
+            f"pair {number} is {type(pair).__name__} without ground truth: give a list of pairs, "
+            "each a pair of a data set, a CreaturePair, or a tuple of the source, the target and the true "
+            "points on the target."
         )
     meshes = as_mesh(pair[0], "source mesh"), as_mesh(pair[1], "target mesh")
     truth, m = pair[2], len(meshes[0].vertices)
