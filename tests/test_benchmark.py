@@ -534,10 +534,10 @@ def test_tables_summarise_the_rows():
     assert other.mean == pytest.approx(45) and other.failures == 1 and np.isnan(other.seconds)
     assert other.difference.mean == pytest.approx(20)
     text = markdown_table(summaries)
-    assert "| a_b | 45.0 | 45.0 | +20.0" in text and "| — | — | 1 |" in text
+    assert "| a_b | 45.0 | 45.0 | +20.0" in text and "| — | — | 5 | 1 |" in text
     latex = latex_table(summaries)
     assert r"mwp & \textbf{30.0} &" in latex and r"a\_b & 45.0 &" in latex and "—" not in latex
-    assert all(line.count("&") == 9 for line in latex.splitlines()[2:] if "&" in line)
+    assert all(line.count("&") == 10 for line in latex.splitlines()[2:] if "&" in line)
 
 
 def test_tables_show_the_overlap_of_two_parts():

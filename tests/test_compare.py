@@ -52,8 +52,22 @@ def wrong_length(spectrum_x, spectrum_y, start_map):
     return start_map[1:]
 
 
+def whole_result(spectrum_x, spectrum_y, start_map):
+    return refine(spectrum_x, spectrum_y, start_map, iterations=1)
+
+
+class WithoutStatus(WaveletPreservation):
+    def update(self, prepared, pointwise_map, previous):
+        return jnp.eye(K)
+
+
 def broken(spectrum_x, spectrum_y, start_map):
     raise KeyError("no such thing")
+
+
+class Misspelled(Meyer):
+    def __call__(self, points, eigenvalues):
+        return undefined_name
 
 
 def failing(spectrum_x, spectrum_y, start_map):
@@ -144,8 +158,40 @@ def test_results_are_kept_and_methods_can_be_added(pairs, tmp_path):
         measured({"Meyer": MWP}, [(x, moved, truth)], output=output)
     with pytest.raises(InputError, match=r"seed = 0 .*but this run has seed = 1"):
         measured({"Meyer": MWP}, pairs, output=output, seed=1)
+    with pytest.raises(InputError, match=r"20 eigenvectors of each shape.* the method large needs 30"):
+        measured({"large": Stage(MWP, number_of_eigenvectors=30)}, pairs, output=output)
+    measured(["initial"], pairs[:1], output=output, number_of_eigenvectors=10)
+    assert "nan" in (output / "shapes.csv").read_text()
     with pytest.raises(InputError, match=r"results\.csv: does not exist"):
         Comparison.read(tmp_path)
+
+
+def test_a_method_without_results_for_some_pairs_is_visible(pairs, tmp_path):
+    measured(["initial"], pairs, output=tmp_path)
+    measured({"added": first_match}, pairs[:1], output=tmp_path)
+    stored = Comparison.read(tmp_path)
+    lines = [line.split(" | ") for line in str(stored).splitlines()]
+    at = lines[0].index("pairs")
+    assert [line[at] for line in lines[2:]] == ["3", "1 of 3"]
+    assert np.isnan(stored.errors("added")).tolist() == [False, True, True]
+    assert " of " not in str(stored.select(pairs=stored.pairs[:1]))
+
+
+def test_a_fault_in_own_code_is_named_at_once_and_can_be_corrected(pairs, tmp_path):
+    """The second pair is not measured, and the name of the method remains free until it has a result."""
+    called = []
+
+    def counted(spectrum_x, spectrum_y, start_map):
+        called.append(spectrum_x)
+        raise NameError("no such name")
+
+    for method in (WaveletPreservation(Misspelled()), counted):
+        with pytest.raises(InputError, match=r"mine raised NameError at .*test_compare\.py, line") as caught:
+            measured({"mine": method}, pairs, output=tmp_path)
+        assert isinstance(caught.value.__cause__, NameError)
+    assert len(called) == 1
+    measured({"mine": first_match}, pairs[:1], output=tmp_path)
+    assert (tmp_path / "methods.csv").read_text().count("mine") == 1
 
 
 def test_a_method_that_fails_has_no_error(pairs):
@@ -253,10 +299,13 @@ def test_bad_input_gets_one_sentence(pairs, unchecked):
         ({1: MWP}, pairs, "the name of a method is 1"),
         ({"Meyer": Meyer()}, pairs, "the method 'Meyer' is Meyer"),
         ({"Meyer": WaveletPreservation}, pairs, "the method 'Meyer' is <class"),
+        (["zoomotu"], pairs, "not a method .did you mean 'zoomout'.*fast, paper"),
+        ({"f": whole_result}, pairs[:1], "method f is a Refinement: return its .pointwise_map"),
+        ({"r": WithoutStatus()}, pairs[:1], "WithoutStatus.update must return a State and a status code"),
         ({"theirs": "no-such-method"}, pairs, "'no-such-method' is not a method"),
         (["mwp", "mwp"], pairs, "'mwp' is listed twice"),
         (one, [], "there are no pairs"),
-        (one, 3, "pairs is 3"),
+        (one, 3, "pairs is of type int"),
         (one, "no-such-directory", "is not a directory"),
         (one, [(x, y)], "pair 0 is tuple without ground truth"),
         (one, [(x, y, truth[1:])], "641 true points for the 642 vertices"),

@@ -83,7 +83,7 @@ def test_damaged_provenance_is_refused(tmp_path, contents):
     origin = {"settings": {"seed": 0}}
     (tmp_path / "provenance.json").write_text(contents)
     with (
-        refused("provenance.json", "damaged", "another --output"),
+        refused("provenance.json", "damaged", "another output directory"),
         claimed_directory(tmp_path, origin),
     ):
         pass

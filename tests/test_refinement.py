@@ -566,11 +566,11 @@ def test_arguments_of_wrong_types_are_named():
         [sys.executable, "-c", _ARGUMENTS_OF_WRONG_TYPES], check=True, capture_output=True, text=True
     )
     facts = (
-        ("refiner", "WaveletPreservation", "Refiner is needed"),
+        ("refiner", "create it with WaveletPreservation()", "Refiner is needed"),
         ("refiner", "'paper'", "Refiner is needed"),
         ("spectrum of Y", "None", "Spectrum is needed"),
         ("initial map", "list", "array is needed"),
-        ("bank", "'meyer'", "FilterBank is needed"),
+        ("bank", "'meyer'", "FilterBank is needed, such as Meyer()"),
         ("filters of Meyer", "integer", "3.5"),
         ("levels", "(3.5,)", "integers"),
         ("levels", "35", "integers"),

@@ -21,6 +21,7 @@ from jaxsmw.benchmark.measurement import (
     OPTIONAL_FIGURES,
     RESULT_COLUMNS,
     SHAPE_COLUMNS,
+    MethodError,
     Settings,
     Task,
     measure_pairs,
@@ -42,8 +43,8 @@ class Results(NamedTuple):
 
     **Attributes:**
 
-    - `rows`: one row with the keys of `RESULT_COLUMNS` for each pair and method. A pair is left out if any
-      method has no result for this pair.
+    - `rows`: one row with the keys of `RESULT_COLUMNS` for each pair and method. `run_benchmark` leaves out a
+      pair if any of its methods has no result for this pair. `Comparison.read` keeps all stored rows.
     - `shapes`: one row with the keys of `SHAPE_COLUMNS` for each measured shape, by the name of the shape.
     - `failures`: the error message of each shape or pair that could not be measured, by its name.
     """
@@ -58,7 +59,7 @@ class Results(NamedTuple):
             return
         error = InputError(
             "some shapes or pairs could not be measured: correct these faults, and run the same benchmark "
-            "again (all other results are kept):"
+            "again (stored results are kept):"
         )
         for cause in self.causes():
             error.add_note(cause)
@@ -83,6 +84,7 @@ def run_benchmark(
     quiet: bool = False,
     number_of_eigenvectors: int | None = None,
     timed_shapes: bool = True,
+    stops_at_fault: bool = False,
 ) -> Results:
     """Run every method on every pair, and store the errors and times in CSV files.
 
@@ -102,6 +104,7 @@ def run_benchmark(
     - `number_of_eigenvectors`: the number that is computed for each shape; by default, it suffices for the
       `methods` and for all of `METHODS`.
     - `timed_shapes`: whether to compute shapes anew and measure the time; if False, the cache is used.
+    - `stops_at_fault`: whether the first pair raises its `MethodError`, before other pairs are matched.
 
     **Raises:** `InputError` if `output` contains damaged results, or results that were measured with other
     data, settings, methods or software versions. `InputError` is also raised if another process is adding
@@ -118,7 +121,7 @@ def run_benchmark(
         measure = partial(measure_pairs, settings=settings, number_of_eigenvectors=number)
         at_once = _PAIRS_AT_ONCE if executor is None and chosen_backend("auto") == "jax" else 1
         tasks = store.missing_pairs(methods)
-        failed |= _measure_in_batches(measure, tasks, at_once, executor, store.results, quiet)
+        failed |= _measure_in_batches(measure, tasks, at_once, executor, store.results, quiet, stops_at_fault)
         return store.collected(methods, failed)
 
 
@@ -163,21 +166,24 @@ class _Store:
             if strangers := [row["shape"] for row in self.shapes.rows if row["shape"] not in own]:
                 raise InputError(
                     f"{output}: contains results of another data set, with a shape {strangers[0]} that is "
-                    f"not in {data_set.directory}: give another --output."
+                    f"not in {data_set.directory}: give another output directory."
                 )
         for name, file in self.files.items():
             if (name,) in self.shapes and self.shapes[(name,)]["digest"] != shape_digest(file):
                 raise InputError(
                     f"{file if isinstance(file, Path) else name}: has changed since results in {output} were "
-                    "measured: give another --output."
+                    "measured: give another output directory."
                 )
+        # A method that failed on all pairs may have been corrected since.
+        measured = {row["method"] for row in self.results.rows}
+        self.methods.remove([(name,) for name in methods if name not in measured])
         new = {name: method.reference for name, method in methods.items() if (name,) not in self.methods}
         for name, method in methods.items():
             if name not in new and self.methods[(name,)]["reference"] != method.reference:
                 raise InputError(
                     f"{output}: contains results of another method {name}, "
                     f"{self.methods[(name,)]['reference']}, but now it is {method.reference}: give another "
-                    "name or another --output."
+                    "name or another output directory."
                 )
         self.methods.append([{"method": name, "reference": text} for name, text in new.items()])
 
@@ -213,16 +219,19 @@ def _measure_in_batches(
     executor: Executor | None,
     journal: Journal,
     quiet: bool,
+    stops_at_fault: bool,
 ) -> dict[str, BaseException]:
     """Measure batches of pairs as `_measure_all` does, and the pairs of a failed batch one by one."""
     names = list(tasks)
     batches = {names[i]: names[i : i + at_once] for i in range(0, len(names), at_once)}
     of_batches = {first: [tasks[name] for name in batch] for first, batch in batches.items()}
-    failed = _measure_all("pairs", measure, of_batches, executor, journal, quiet)
+    # A fault on one pair of a batch does not show that the method fails on every pair.
+    stops = stops_at_fault and at_once == 1
+    failed = _measure_all("pairs", measure, of_batches, executor, journal, quiet, stops)
     if at_once == 1:
         return failed
     alone = {name: tasks[name] for first in failed for name in batches[first]}
-    return _measure_in_batches(measure, alone, 1, executor, journal, quiet)
+    return _measure_in_batches(measure, alone, 1, executor, journal, quiet, stops_at_fault)
 
 
 def _measure_all(
@@ -232,15 +241,21 @@ def _measure_all(
     executor: Executor | None,
     journal: Journal,
     quiet: bool,
+    stops_at_fault: bool = False,
 ) -> dict[str, BaseException]:
-    """Run all tasks, append their rows to a journal, and return the exceptions of failed tasks by name."""
+    """Run all tasks, append their rows to a journal, and return the exceptions of failed tasks by name.
+
+    With `stops_at_fault`, a `MethodError` of the task that ends first is raised.
+    """
     if not tasks:
         return {}
     failed: dict[str, BaseException] = {}
     sizes = {name: len(task) if isinstance(task, list) else 1 for name, task in tasks.items()}
     total = sum(sizes.values())
     with tqdm(total=total, desc=what, unit=what[:-1], smoothing=0, disable=quiet) as progress:
-        for name, result in run_tasks(measure, tasks, executor):
+        for number, (name, result) in enumerate(run_tasks(measure, tasks, executor)):
+            if stops_at_fault and number == 0 and isinstance(result, MethodError):
+                raise result
             if isinstance(result, BaseException):
                 failed[name] = result
             else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 import os
 import pickle
@@ -42,7 +41,7 @@ from jaxsmw.geometry.surface_points import SurfacePoints, check_points, check_po
 from jaxsmw.matching.stages import Preset, Stage, choose_preset
 from jaxsmw.report.figures import draw_intervals, save_figure
 from jaxsmw.runtime.files import make_directory
-from jaxsmw.runtime.provenance import value_digest
+from jaxsmw.runtime.provenance import read_provenance, value_digest
 from jaxsmw.runtime.workers import Workers
 
 if TYPE_CHECKING:
@@ -78,7 +77,7 @@ def compare(
 
     Each shape is prepared once for all methods and pairs. If the comparison is interrupted or killed, the
     same call with the same `output` measures only what is missing. A later call with the same `output` can
-    add methods and pairs.
+    add pairs, and methods that need no more eigenvectors than the first call computed.
 
     **Arguments:**
 
@@ -99,7 +98,7 @@ def compare(
       `CreaturePair`, or a tuple `(mesh_x, mesh_y, truth)`. In a tuple, `truth` is a `GroundTruth`, or the
       true points of all vertices of X: a map (m,) or `SurfacePoints`.
     - `number_of_eigenvectors`: the number for refiners without levels, and for functions; 100 by default.
-      Each shape gets at least as many eigenvectors.
+      Each shape gets as many eigenvectors as any method needs, or as in the first call with `output`.
     - `iterations`: the number for refiners without levels; 3 by default.
     - `init`: the initial map of all methods, a name that `jaxsmw.match` accepts, or a directory with maps in
       files `X_Y.map`. With `"auto"` (the default), it is `"shot"`; presets may also try others.
@@ -118,7 +117,8 @@ def compare(
     pair has no ground truth, or if two pairs or two different meshes have the same name. `InputError` is also
     raised if `output` contains results of other data, settings, methods or versions, if an argument is out of
     range, if a method cannot be sent to workers, if the workers end abruptly, or if no pair could be
-    measured, for example because a function raises an error or returns no map.
+    measured, for example because a function returns no map. If the code of a method raises another error on
+    the first pair, the comparison ends with an `InputError` at once, whose `__cause__` is that error.
     """
     check_whole_number("number_of_eigenvectors", number_of_eigenvectors, 1)
     check_whole_number("iterations", iterations, 1)
@@ -131,7 +131,6 @@ def compare(
     settings = Settings(init, evaluated_points=evaluated_points, seed=seed)
     if workers is not None:
         _check_sendable(every)
-    most = max(number_of_eigenvectors, *(method.number_of_eigenvectors for method in every.values()))
     with _directory(output) as directory, nullcontext() if workers is None else Workers(workers) as executor:
         try:
             results = run_benchmark(
@@ -142,8 +141,9 @@ def compare(
                 settings,
                 executor,
                 quiet=quiet,
-                number_of_eigenvectors=most,
+                number_of_eigenvectors=_computed_number(directory, number_of_eigenvectors, every),
                 timed_shapes=False,
+                stops_at_fault=True,
             )
         except BrokenProcessPool as error:
             raise InputError(
@@ -176,6 +176,8 @@ class Comparison:
     @classmethod
     def read(cls, output: str | os.PathLike[str], *, seed: int = 0) -> Comparison:
         """Read the results that `compare` or `jaxsmw benchmark` stored in the directory `output`.
+
+        A method that was added later can lack results for some pairs; see `table`.
 
         **Raises:** `InputError` if the directory contains no results, or if they are damaged.
         """
@@ -212,7 +214,7 @@ class Comparison:
         return tuple(dict.fromkeys((row["source"], row["target"]) for row in self.results.rows))
 
     def errors(self, method: str) -> Float64[np.ndarray, " p"]:
-        """Return the error of a method on each of the p `pairs`; NaN where the method failed."""
+        """Return the error of a method on each of the p `pairs`; NaN where it failed or has no result."""
         by_pair = self._errors[self._checked(method)]
         return np.array([by_pair.get(pair, np.nan) for pair in self.pairs])
 
@@ -233,7 +235,9 @@ class Comparison:
         """Return a Markdown table with one row for each method.
 
         The columns are those of `jaxsmw benchmark`. The differences are those from the reference, by default
-        from the first method.
+        from the first method. All other numbers are those of the pairs on which the method did not fail. The
+        column `pairs` shows "2 of 30" if the method has results for 2 of the 30 `pairs`; `select` the pairs
+        that all methods share before you compare means.
         """
         reference = self._checked(reference)
         summaries = summarize_methods(self.results, seed=self.seed, reference=reference)
@@ -303,17 +307,12 @@ class MapMethod(Method):
         assert pair.meshes is not None
         seen = pair.spectra.seen_by(Stage(number_of_eigenvectors=self.number_of_eigenvectors))
         x, y, initial_map = jax.device_put((*seen.both, np.asarray(pair.initial_map)))
-        try:
-            images = np.asarray(self.function(x, y, initial_map))
-        except (InputError, ArithmeticError):
-            raise
-        except Exception as error:
-            frames = inspect.trace()
-            frame = ([one for one in frames if "site-packages" not in one.filename] or frames)[-1]
+        found = self.function(x, y, initial_map)
+        if hasattr(found, "pointwise_map"):
             raise InputError(
-                f"the method {self.name} raised {type(error).__name__} at {frame.filename}, line "
-                f"{frame.lineno} ({error}): correct the function."
-            ) from error
+                f"the map of the method {self.name} is a {type(found).__name__}: return its .pointwise_map."
+            )
+        images = np.asarray(found)
         return check_pointwise_map(images, *pair.meshes, f"map of the method {self.name}")
 
 
@@ -322,7 +321,8 @@ def _named_methods(
 ) -> dict[str, Method]:
     if isinstance(methods, str) or not isinstance(methods, Mapping | Sequence):
         raise InputError(
-            f"methods is {methods!r}: give a dictionary from names to methods, or a list of names."
+            f"methods is of type {type(methods).__name__}: give a dictionary from names to methods, or a "
+            "list of names."
         )
     if not methods:
         raise InputError("there are no methods to compare: give at least one.")
@@ -344,7 +344,7 @@ def _as_method(name: str, method: Compared, number_of_eigenvectors: int, iterati
     if isinstance(method, str):
         if method in get_args(PresetName):
             return Matched(f"jaxsmw.match with the preset {method}", choose_preset(method))
-        return next(iter(find_methods([method]).values()))
+        return next(iter(find_methods([method], get_args(PresetName)).values()))
     if isinstance(method, Preset):
         return Matched(f"jaxsmw.match with a preset ({value_digest(method)})", method)
     if isinstance(method, Refiner):
@@ -378,7 +378,9 @@ def _known_pairs(
     if isinstance(pairs, DataSet):
         return list(pairs.pairs)
     if not isinstance(pairs, Iterable):
-        raise InputError(f"pairs is {pairs!r}: give a data set, its directory, or a list of pairs.")
+        raise InputError(
+            f"pairs is of type {type(pairs).__name__}: give a data set, its directory, or a list of pairs."
+        )
     names: dict[int, str] = {}
     every = [_known_pair(number, pair, names) for number, pair in enumerate(pairs)]
     if not every:
@@ -402,8 +404,9 @@ def _known_pair(number: int, pair: Any, names: dict[int, str]) -> AnyPair:
         pair = pair.source, pair.target, pair.truth
     if not isinstance(pair, tuple | list) or len(pair) != 3:
         raise InputError(
-            f"pair {number} is {type(pair).__name__} without ground truth: give a pair of a data set, a "
-            "CreaturePair, or a tuple of the source, the target and the true points on the target."
+            f"pair {number} is {type(pair).__name__} without ground truth: give a list of pairs, "
+            "each a pair of a data set, a CreaturePair, or a tuple of the source, the target and the true "
+            "points on the target."
         )
     meshes = as_mesh(pair[0], "source mesh"), as_mesh(pair[1], "target mesh")
     truth, m = pair[2], len(meshes[0].vertices)
@@ -423,6 +426,24 @@ def _free_name(mesh: Mesh, names: Mapping[int, str]) -> str:
     """Return the name of a mesh, with a number behind it if another mesh has this name."""
     numbered = (f"{mesh.name} {number}" for number in itertools.count(2))
     return next(name for name in itertools.chain([mesh.name], numbered) if name not in names.values())
+
+
+def _computed_number(directory: Path, number_of_eigenvectors: int, methods: Mapping[str, Method]) -> int:
+    """Return the number of eigenvectors of each shape, which is that of all results in a directory."""
+    needed = {"the argument number_of_eigenvectors": number_of_eigenvectors}
+    needed |= {f"the method {name}": method.number_of_eigenvectors for name, method in methods.items()}
+    what, most = max(needed.items(), key=lambda item: item[1])
+    path = directory / "provenance.json"
+    stored = read_provenance(path).get("settings", {}).get("number_of_eigenvectors") if path.exists() else 0
+    if not isinstance(stored, int) or stored == 0:
+        return most
+    if stored < most:
+        raise InputError(
+            f"{directory}: contains results with {stored} eigenvectors of each shape, on which initial maps "
+            f"can depend, but {what} needs {most}: give another output directory, and begin there with this "
+            "number."
+        )
+    return stored
 
 
 def _check_sendable(methods: Mapping[str, Method]) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsmw.errors import InputError
+from jaxsmw.runtime.files import atomic_write
 
 Row = dict[str, Any]
 """A row of a journal, by column names. In rows from a file, all values are text."""
@@ -96,7 +97,7 @@ class Journal:
         if other := [row for row in rows if set(row) != set(fields)]:
             raise InputError(
                 f"{self.path}: has the columns {', '.join(fields)}, but a result has {', '.join(other[0])}: "
-                "give another --output, or remove the file."
+                "give another output directory, or remove the file."
             )
         writer = csv.DictWriter(text, fields, lineterminator="\n")
         try:
@@ -110,10 +111,23 @@ class Journal:
         except OSError as error:
             raise InputError(
                 f"{self.path}: cannot be written ({error.strerror}): check the directory and its free space, "
-                "or give another --output."
+                "or give another output directory."
             ) from error
         self._fields = fields
         self._remember({name: str(value) for name, value in row.items()} for row in rows)
+
+    def remove(self, keys: Collection[tuple[str, ...]]) -> None:
+        """Replace the file by one without the rows that have one of the keys.
+
+        **Raises:** `InputError` if the file cannot be written.
+        """
+        if self._rows.keys().isdisjoint(keys):
+            return
+        self._rows = {key: row for key, row in self._rows.items() if key not in keys}
+        with atomic_write(self.path) as temporary, temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self._fields, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(self._rows.values())
 
     def _read(self, contents: bytes, columns: Columns) -> None:
         """Parse complete lines, check their values, and store their rows in memory."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -107,7 +108,8 @@ SHAPE_COLUMNS: dict[str, Callable[[str], Any]] = {
 """A dictionary from the name of each column of `shapes.csv` to the function that parses its values.
 
 The file contains one row for each shape. `digest` is a hash of the mesh file. `seconds_spectrum` and
-`seconds_descriptors` are the wall times of the precomputation.
+`seconds_descriptors` are the wall times of the precomputation, or NaN if `compare` has measured the shape,
+because `compare` uses the cache.
 """
 
 
@@ -202,6 +204,10 @@ def measure_shape(
     return [{"shape": name, "digest": shape_digest(file), "vertices": len(mesh.vertices), **seconds}]
 
 
+class MethodError(InputError):
+    """The error for a fault in the code of a method, such as a misspelled name; the fault is its cause."""
+
+
 Task = tuple[AnyPair, Mapping[str, Method]]
 """A pair, and the methods by name that match it."""
 
@@ -212,18 +218,39 @@ def measure_pairs(tasks: Sequence[Task], settings: Settings, number_of_eigenvect
     **Returns:** A list with one row for each pair and method, which has the keys of `RESULT_COLUMNS`. The
     statistics and the seconds of a method that failed are NaN.
 
-    **Raises:** `InputError` if a file cannot be read, or if a pair cannot be prepared; `ArithmeticError` if
-    the computation of an initial map fails numerically.
+    **Raises:** `InputError` if a file cannot be read, or if a pair cannot be prepared; `MethodError` if a
+    method raises any error but these two; `ArithmeticError` if the computation of an initial map fails
+    numerically.
     """
     prepared = [_PreparedTask.of(*task, settings, number_of_eigenvectors) for task in tasks]
     rows = []
     for name in dict.fromkeys(name for _, methods in tasks for name in methods):
         matched = [one for one, (_, methods) in zip(prepared, tasks, strict=True) if name in methods]
         method = next(methods[name] for _, methods in tasks if name in methods)
-        results = _timed(name, method, [one.input for one in matched])
+        with _naming_method(name):
+            results = _timed(name, method, [one.input for one in matched])
         for one, measured in zip(matched, results, strict=True):
             rows.append(one.row(name, measured, settings))
     return rows
+
+
+@contextmanager
+def _naming_method(name: str) -> Iterator[None]:
+    """Raise a `MethodError` that names the method and the line for each unexpected error in the block."""
+    try:
+        yield
+    except (InputError, ArithmeticError):
+        raise
+    except Exception as error:
+        lines = traceback.extract_tb(error.__traceback__)
+        # The fault is probably not in this package or in another library that the method calls.
+        foreign = (f"{Path(__file__).parents[1]}{os.sep}", "<@beartype")
+        own = [one for one in lines if not one.filename.startswith(foreign)]
+        line = ([one for one in own if "site-packages" not in one.filename] or own or lines)[-1]
+        raise MethodError(
+            f"the method {name} raised {type(error).__name__} at {line.filename}, line {line.lineno} "
+            f"({error}): correct its code."
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,6 +38,7 @@ class MethodSummary(NamedTuple):
       the true overlap; NaN for methods that predict no overlap, and for data sets without pairs of parts.
     - `seconds`: the median time in seconds from the initial map to the result; NaN for published maps.
     - `pipeline_seconds`: the same with the precomputation of both shapes.
+    - `pairs`: the number of pairs for which the method has a result, and the number of all pairs.
     - `failures`: the number of pairs on which the method failed.
     - `curve`: the mean correspondence quality curve (t,) at the thresholds `CURVE`.
     """
@@ -51,6 +52,7 @@ class MethodSummary(NamedTuple):
     overlap: float
     seconds: float
     pipeline_seconds: float
+    pairs: tuple[int, int]
     failures: int
     curve: Float64[np.ndarray, " t"]
 
@@ -67,6 +69,7 @@ def summarize_methods(
     for row in results.rows:
         by_method.setdefault(row["method"], []).append(row)
     of_reference = pair_errors(by_method.get(reference, ()))
+    every_pair = {(row["source"], row["target"]) for row in results.rows}
     for name, own in by_method.items():
         good = [row for row in own if row["result"] == "successful"]
         errors = pair_errors(good)
@@ -86,6 +89,7 @@ def summarize_methods(
             overlap=_mean((_column(good, "overlap_source") + _column(good, "overlap_target")) / 2),
             seconds=_median(seconds),
             pipeline_seconds=_median(seconds + precomputing),
+            pairs=(len(own), len(every_pair)),
             failures=len(own) - len(good),
             curve=np.mean(np.array(curves, float), axis=0) if curves else np.full(len(CURVE), np.nan),
         )
@@ -137,6 +141,7 @@ _COLUMNS: _Columns = (
     ("overlap IoU", lambda s: _text("{:.1%}", s.overlap)),
     ("refinement, s", lambda s: _text("{:.2f}", s.seconds)),
     ("with precomputation, s", lambda s: _text("{:.2f}", s.pipeline_seconds)),
+    ("pairs", lambda s: str(s.pairs[0]) if s.pairs[0] == s.pairs[1] else "{} of {}".format(*s.pairs)),
     ("failed", lambda s: str(s.failures)),
 )
 

@@ -49,14 +49,18 @@ def check_array(name: str, value: object) -> None:
         check_kind(name, value, np.ndarray)
 
 
-def check_kind(name: str, value: object, kind: type) -> None:
-    """Raise `TypeError` if the value does not have the type `kind`."""
+def check_kind(name: str, value: object, kind: type, example: str = "") -> None:
+    """Raise `TypeError` if the value does not have the type `kind`, of which `example` is a value."""
     if isinstance(value, kind):
         return
     shown = repr(value) if isinstance(value, str | int | float | type | None) else type(value).__name__
     shown = "an array" if is_array(value) else shown
     needed = {np.ndarray: "an array", int: "an integer"}.get(kind, f"a {kind.__name__}")
-    raise TypeError(f"the {name} is {shown}, but {needed} is needed")
+    if isinstance(value, type) and issubclass(value, kind):
+        cure = f": create it with {value.__name__}()"
+    else:
+        cure = f", such as {example}" if example else ""
+    raise TypeError(f"the {name} is {shown}, but {needed} is needed{cure}")
 
 
 def check_matches(name: str, pointwise_map: Array | np.ndarray, number_of_vertices: int) -> None:

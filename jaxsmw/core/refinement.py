@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int32
@@ -244,7 +244,7 @@ class _Loop:
     ) -> _Progress:
         """Compute the first state from the initial map. The first step compares its map with `first_map`."""
         xp = namespace(pointwise_map)
-        state, result = self.refiner.update(prepared, pointwise_map, None)
+        state, result = _update(self.refiner, prepared, pointwise_map, None)
         return _Progress(
             first_map,
             state,
@@ -284,7 +284,7 @@ class _Loop:
         )
 
         def update() -> tuple[State, RESULTS, Array, Array]:
-            state, result = self.refiner.update(self.prepared, after, previous)
+            state, result = _update(self.refiner, self.prepared, after, previous)
             result = where(progress.result == RESULTS.successful, checked(state, result), progress.result)
             energy = self.recorded(self.refiner.energy, self.prepared, state, after)
             return state, result, energy, progress.iterations + 1
@@ -301,6 +301,19 @@ class _Loop:
         return progress, History(self.undefined, self.undefined, self.undefined, maps)
 
 
+def _update(
+    refiner: Refiner, prepared: Prepared, pointwise_map: Int32[Array, " s"], previous: State | None
+) -> tuple[State, RESULTS]:
+    """Return what `update` of the refiner returns, or raise `TypeError` if it is no state with a status."""
+    updated: Any = refiner.update(prepared, pointwise_map, previous)
+    if not isinstance(updated, tuple) or len(updated) != 2 or not isinstance(updated[0], State):
+        raise TypeError(
+            f"{type(refiner).__name__}.update must return a State and a status code: return "
+            "State(functional_map), RESULTS.successful"
+        )
+    return updated
+
+
 def _check_arguments(
     spectrum_x: Spectrum,
     spectrum_y: Spectrum,
@@ -308,7 +321,7 @@ def _check_arguments(
     refiner: Refiner,
     samples: Samples | None,
 ) -> None:
-    check_kind("refiner", refiner, Refiner)
+    check_kind("refiner", refiner, Refiner, "WaveletPreservation()")
     check_spectra(spectrum_x, spectrum_y)
     check_matches("initial map", pointwise_map, len(spectrum_x.mask))
     if samples is not None:

@@ -102,8 +102,8 @@ def refine_softly(
     forward-mode derivatives are NaN.
     """
     check_option("differentiation", differentiation, get_args(Differentiation))
-    check_kind("refiner", refiner, WaveletPreservation)
-    check_kind("recovery", recovery, Recovery)
+    check_kind("refiner", refiner, WaveletPreservation, "WaveletPreservation()")
+    check_kind("recovery", recovery, Recovery, "Softmax()")
     check_spectra(spectrum_x, spectrum_y)
     if not tolerance > 0:
         raise ValueError(f"refine_softly needs a positive tolerance, not {tolerance}")
@@ -181,7 +181,7 @@ class WaveletPreservationLayer(Module):
     tolerance: float = field(static=True, default=1e-4)
 
     def __check_init__(self) -> None:
-        check_kind("recovery of features", self.recovery_of_features, Recovery)
+        check_kind("recovery of features", self.recovery_of_features, Recovery, "Softmax()")
 
     def __call__(
         self,

@@ -176,7 +176,7 @@ def claimed_directory(
         # Some versions of `filelock` would report a lock of another process instead.
         raise InputError(
             f"{directory}: cannot be locked, because files cannot be created or locked there: give another "
-            "--output, on a file system with locks."
+            "output directory, on a file system with locks."
         )
     # The operating system releases the lock even if the process is killed.
     lock = FileLock(directory / ".lock", timeout=0)
@@ -185,11 +185,11 @@ def claimed_directory(
     except Timeout:
         raise InputError(
             f"{directory}: another process is adding results: wait until this process ends, or give another "
-            "--output."
+            "output directory."
         ) from None
     except OSError as error:
         raise InputError(
-            f"{directory}: cannot be locked ({error.strerror}): give another --output, or remove the "
+            f"{directory}: cannot be locked ({error.strerror}): give another output directory, or remove the "
             "directory."
         ) from error
     try:
@@ -205,7 +205,7 @@ def _check_origin(
     path = directory / "provenance.json"
     wanted = json.loads(json.dumps(provenance))
     if path.exists():
-        stored = _read_provenance(path)
+        stored = read_provenance(path)
         stored.pop("noted", None)
         for group in {**stored, **wanted}:
             before, now = stored.get(group, {}), wanted.get(group, {})
@@ -213,12 +213,13 @@ def _check_origin(
                 if before.get(name) != now.get(name):
                     raise InputError(
                         f"{directory}: contains results with {name} = {before.get(name)} ({group}), but this "
-                        f"run has {name} = {now.get(name)}: give another --output, or remove the directory."
+                        f"run has {name} = {now.get(name)}: give another output directory, or remove "
+                        "this one."
                     )
     elif any(directory.glob("*.csv")):
         raise InputError(
             f"{directory}: contains results of unknown origin, because provenance.json is missing: give "
-            "another --output."
+            "another output directory."
         )
     else:
         contents = {**wanted, "noted": dict(noted)} if noted else wanted
@@ -226,11 +227,14 @@ def _check_origin(
             temporary.write_text(json.dumps(contents, indent=2) + "\n", "utf-8")
 
 
-def _read_provenance(path: Path) -> dict[str, dict[str, Any]]:
+def read_provenance(path: Path) -> dict[str, dict[str, Any]]:
+    """Read the groups of a file `provenance.json`; raise `InputError` if the file is damaged."""
     try:
         stored = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError):
         stored = None
     if not isinstance(stored, dict) or not all(isinstance(group, dict) for group in stored.values()):
-        raise InputError(f"{path}: the file is damaged: give another --output, or remove its directory.")
+        raise InputError(
+            f"{path}: the file is damaged: give another output directory, or remove its directory."
+        )
     return stored

@@ -5,6 +5,7 @@ A method is imported when it is looked up, so the help text of the command line 
 
 from __future__ import annotations
 
+import difflib
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -71,12 +72,13 @@ def suited_methods(pairs: Sequence[AnyPair]) -> dict[str, Method]:
     return {name: method for name, method in known_methods().items() if method.suits(pairs)}
 
 
-def find_methods(names: Iterable[str]) -> dict[str, Method]:
+def find_methods(names: Iterable[str], others: Sequence[str] = ()) -> dict[str, Method]:
     """Return methods by name.
 
     A name can also be the path of a directory with maps `X_Y.map` of another program. The name of the method
     is then the name of the directory. `accurate:TEMPLATE` is `accurate` through a template, which is a mesh
     file or a built-in shape; see `jaxsmw.match`. Duplicate names are ignored.
+    The message about an unknown name also lists `others`, which are names that the caller accepts.
 
     **Raises:** `InputError` if a name is neither a known method nor a directory, if two directories or two
     templates have the same name, or if a template cannot be read.
@@ -97,8 +99,11 @@ def find_methods(names: Iterable[str]) -> dict[str, Method]:
             continue
         # Unlike `Path.is_dir`, `os.path.isdir` raises no error if a name is too long for the file system.
         if not os.path.isdir(name):
+            listed = list(dict.fromkeys([*available, *others]))
+            near = difflib.get_close_matches(name, listed, n=1)
+            meant = f" (did you mean {near[0]!r}?)" if near else ""
             raise InputError(
-                f"{name!r} is not a method: choose from {', '.join(available)}, or give a directory with "
+                f"{name!r} is not a method{meant}: choose from {', '.join(listed)}, or give a directory with "
                 "maps X_Y.map."
             )
         directory = Path(name).resolve()

@@ -67,8 +67,8 @@ class WaveletPreservation(Refiner[PreparedWavelets, State]):
     bases: tuple[str, ...] = field(static=True, default=("laplacian",))
 
     def __check_init__(self) -> None:
-        check_kind("bank", self.bank, FilterBank)
-        check_kind("solution", self.solution, Solution)
+        check_kind("bank", self.bank, FilterBank, "Meyer()")
+        check_kind("solution", self.solution, Solution, "LeastSquares()")
         check_option("convention", self.convention, get_args(Convention))
         check_option("lambda_max", self.lambda_max, ("own", "common"))
         named = isinstance(self.bases, tuple) and all(isinstance(name, str) for name in self.bases)
