@@ -199,8 +199,10 @@ def other_hand(reading: Reading, preset: Preset, start: Start) -> Reading:
     mirrored = reading.mirror().described(preset)
     if start.origin not in INITIAL_MAPS:
         return mirrored
-    spectra, again = mirrored.prepared.spectra, make_start(mirrored.prepared, start.origin)
-    return mirrored.with_first(run(preset.before_final, spectra, again).pointwise_map)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they repeat those of the first start
+        again = make_start(mirrored.prepared, start.origin)
+    return mirrored.with_first(run(preset.before_final, mirrored.prepared.spectra, again).pointwise_map)
 
 
 def _as_parts(reading: Reading) -> Iterator[Reading]:
