@@ -196,11 +196,11 @@ def readings_of(reading: Reading, other: Reading | None = None) -> list[Reading]
 
 def other_hand(reading: Reading, preset: Preset, start: Start) -> Reading:
     """Return the reading in which X has the other hand, with the map of its own first start."""
-    mirrored = reading.mirror().described(preset)
     if start.origin not in INITIAL_MAPS:
-        return mirrored
+        return reading.mirror()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they repeat those of the first start
+        mirrored = reading.mirror().described(preset)
         again = make_start(mirrored.prepared, start.origin)
     return mirrored.with_first(run(preset.before_final, mirrored.prepared.spectra, again).pointwise_map)
 
