@@ -137,7 +137,15 @@ def draw(results: Sequence[Judged], file: Path) -> None:
     axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
     for _, number, stated, share, least, most in reliability(results):
         axes.errorbar(stated, share, [[share - least], [most - share]], color="C0", marker="o", capsize=3)
-        axes.annotate(str(number), (stated, share), xytext=(5, -11), textcoords="offset points", fontsize=8)
+        axes.annotate(
+            str(number),
+            (stated, least),
+            xytext=(0, -5),
+            textcoords="offset points",
+            fontsize=8,
+            ha="center",
+            va="top",
+        )
     axes.set(xlabel="probability that the map is right", ylabel="share of right maps", ylim=(-0.02, 1.04))
     style_axes(axes)
     save_figure(file, figure)
