@@ -308,7 +308,7 @@ def test_published_maps_serve_as_initial_maps_and_as_methods(measure, tmp_path):
     (tmp_path / "perfect" / "mesh000_mesh001.map").write_text("1\n2\n")
     found = measure(["initial", str(tmp_path / "perfect")], output=other, pairs="6")
     assert list(found.failures) == ["mesh000 to mesh001"] and len(found.rows) == 10
-    with pytest.raises(InputError, match=r"all other results are kept\):\nmesh000 to mesh001: .*has 2 lines"):
+    with pytest.raises(InputError, match=r"stored results are kept\):\nmesh000 to mesh001: .*has 2 lines"):
         found.check()
 
 
