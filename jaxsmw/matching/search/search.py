@@ -190,8 +190,9 @@ def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
 def readings_of(reading: Reading, other: Reading | None = None) -> list[Reading]:
     """Return a reading and those with a shape as a part of the other, perhaps also with the other hand."""
     readings = [reading, *_as_parts(reading)]
-    hands = [replace(one.mirror(), first=other.first) for one in readings] if other else []
-    return readings + hands
+    if other is None:
+        return readings
+    return [*readings, other, *(replace(one.mirror(), first=other.first) for one in readings[1:])]
 
 
 def other_hand(reading: Reading, preset: Preset, start: Start) -> Reading:
