@@ -54,7 +54,7 @@ from jaxsmw.core.linear_algebra import (
     solve_positive_definite,
     symmetric_eigenvalues,
 )
-from jaxsmw.core.module import Module, field
+from jaxsmw.core.module import Module, field, looped
 from jaxsmw.core.spectrum import Spectrum, by_basis
 
 if TYPE_CHECKING:
@@ -106,6 +106,7 @@ def _least_squares(eigenvectors: Float[Array, "n k"]) -> Float[Array, "n k"]:
     return solve_positive_definite(gram, eigenvectors.T).T
 
 
+@looped
 def encode(
     pointwise_map: PointwiseMap,
     spectrum_x: Spectrum,

@@ -15,7 +15,7 @@ from typing import Any, ParamSpec, TypeVar, dataclass_transform
 
 import numpy as np
 
-from jaxsmw.core.arrays import is_array
+from jaxsmw.core.arrays import is_array, is_tracer
 
 Parameters = ParamSpec("Parameters")
 Returned = TypeVar("Returned")
@@ -140,6 +140,18 @@ def jitted(function: Callable[Parameters, Returned]) -> Callable[Parameters, Ret
     @functools.wraps(function)
     def call(*arguments: Parameters.args, **options: Parameters.kwargs) -> Returned:
         return compiled()(*arguments, **options)
+
+    return call
+
+
+def looped(function: Callable[Parameters, Returned]) -> Callable[Parameters, Returned]:
+    """Decorate a function that computes NumPy arrays at once, and that `jax.vmap` calls in a loop on CPUs."""
+    compiled = jitted(function)
+
+    @functools.wraps(function)
+    def call(*arguments: Parameters.args, **options: Parameters.kwargs) -> Returned:
+        traced = any(map(is_tracer, leaves((*arguments, *options.values()))))
+        return (compiled if traced else function)(*arguments, **options)
 
     return call
 
