@@ -157,7 +157,7 @@ def test_shapes_that_are_too_coarse_for_descriptors_are_measured(tmp_path):
     assert float(row["seconds_descriptors"]) >= 0
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_the_overlap_of_two_real_parts_is_measured(shared):
     data_set = open_data_set(shared / "data" / "partial_smal")
     pair = data_set.known_pairs["cuts_19_cow_04", "cuts_9_dog_01"]

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 
 from jaxsmw.choices import Mirror
 from jaxsmw.core.arrays import namespace
@@ -145,8 +145,8 @@ def search(
         certain = _certain(judged, settings)
     # Further passes make some wrong maps nearly as good as the right one, so the evidence before them counts.
     before = _shares_of(judged)
-    doubtful = before >= settings.likely * before.max()
-    judged = [_finished(one, preset) if again else one for one, again in zip(judged, doubtful, strict=True)]
+    probable = _probable(before, settings)
+    judged = [_finished(one, preset) if again else one for one, again in zip(judged, probable, strict=True)]
     parts = np.sqrt(before * _shares_of(judged))
     parts /= parts.sum() or 1.0
     order = np.argsort(-parts, kind="stable")
@@ -181,10 +181,15 @@ def _certain(judged: Sequence[Judged], settings: SearchSettings) -> bool:
 
 
 def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
-    """Return the most probable maps, the best first, if they are not much less probable than the best."""
+    """Return the most probable maps, the best first."""
     parts = shares([one.log_odds for one in maps])
     order = np.argsort(-parts, kind="stable")[: settings.finalists]
-    return [maps[number] for number in order if parts[number] >= settings.likely * parts[order[0]]]
+    return [maps[number] for number in order[_probable(parts[order], settings)]]
+
+
+def _probable(parts: Float[np.ndarray, " c"], settings: SearchSettings) -> Bool[np.ndarray, " c"]:
+    """Return which maps are not much less probable than the best one, given the share of each (c,)."""
+    return parts >= settings.likely * parts.max(initial=0.0)
 
 
 def readings_of(reading: Reading, other: Reading | None = None) -> list[Reading]:
