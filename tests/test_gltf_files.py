@@ -3,9 +3,11 @@
 import base64
 import json
 import struct
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import DracoPy
 import numpy as np
 import pytest
 import trimesh
@@ -16,6 +18,7 @@ from messages import assert_names, refusal
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOGeometry import vtkGLTFReader
 
+from jaxsmw.creature import creature
 from jaxsmw.errors import InputError
 from jaxsmw.io import read_mesh, read_mesh_data, write_mesh_data
 
@@ -297,6 +300,60 @@ def test_vtk_opens_written_files(tmp_path, suffix, seam):
     assert np.allclose(weights[faces], data.skin.weights[data.faces], atol=1e-6)
 
 
+# --------------------------------------------------------------------------------------- compression
+
+
+def compressed(vertices, faces, colors=None, **more) -> Builder:
+    """A file whose mesh is compressed by Google's library, without loss of positions."""
+    file = Builder()
+    content = DracoPy.encode(vertices, faces, quantization_bits=0, preserve_order=True, colors=colors, **more)
+    attributes = {"POSITION": file.add(vertices, view=0)}
+    if colors is not None:
+        attributes["COLOR_0"] = file.add(colors, view=0)
+    indices = file.add(faces.ravel(), view=0)
+    for accessor in file.json["accessors"]:
+        del accessor["bufferView"]
+    names = {DracoPy.AttributeType.POSITION: "POSITION", DracoPy.AttributeType.COLOR: "COLOR_0"}
+    listed = DracoPy.decode(content).attributes
+    numbers = {names[attribute["attribute_type"]]: attribute["unique_id"] for attribute in listed}
+    extension = {"bufferView": file.view(content), "attributes": numbers}
+    file.mesh({"attributes": attributes, "indices": indices, "extensions": {DRACO: extension}})
+    file.json["extensionsRequired"] = [DRACO]
+    file.nodes({"mesh": 0})
+    return file
+
+
+def test_compressed_meshes_keep_positions_order_and_data(tmp_path):
+    mesh = creature(vertices=500)
+    vertices, faces = mesh.vertices.astype("f4"), mesh.faces.astype("u4")
+    colors = np.random.default_rng(0).integers(0, 256, (len(vertices), 3), np.uint8)
+    data = read_mesh_data(compressed(vertices, faces, colors).save(tmp_path))
+    np.testing.assert_array_equal(data.mesh.vertices, vertices)
+    np.testing.assert_array_equal(data.faces, faces)
+    np.testing.assert_array_equal(data.vertex_data["colors"], colors)
+
+
+def test_compressed_meshes_contradict_their_accessors(tmp_path):
+    square = SQUARE, FACES.astype("u4").reshape(-1, 3)
+    for change, fault in {
+        "accessors__0__count": "accessor 0 does not have the shape of its compressed numbers",
+        "accessors__1__count": "accessor 1 does not have the shape of its compressed numbers",
+    }.items():
+        file = compressed(*square)
+        file.json["accessors"][int(change[11])]["count"] = 3
+        assert fault in refused_file(file.save(tmp_path))
+    file = compressed(*square)
+    primitive = file.json["meshes"][0]["primitives"][0]
+    primitive["extensions"][DRACO]["attributes"]["POSITION"] = 7
+    assert "the compressed attribute 'POSITION' does not exist" in refused_file(file.save(tmp_path))
+
+
+def test_compression_names_the_package_that_it_needs(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "DracoPy", None)
+    path = compressed(SQUARE, FACES.astype("u4").reshape(-1, 3)).save(tmp_path)
+    assert "pip install 'jaxsmw[draco]'" in refused_file(path)
+
+
 # ------------------------------------------------------------------------------------------ hostile
 
 
@@ -317,6 +374,7 @@ def changed(**paths):
 
 
 P = "meshes__0__primitives__0"
+DRACO = "KHR_draco_mesh_compression"
 SPARSE = {"count": 1, "indices": {"bufferView": 1, "componentType": 5123}, "values": {"bufferView": 0}}
 HOSTILE = {
     "no asset": (changed(asset={}), "version 2.0"),
@@ -324,8 +382,9 @@ HOSTILE = {
     "version 3": (changed(asset={"version": "3.0"}), "version 2.0"),
     "later version needed": (changed(asset={"version": "2.1", "minVersion": "2.1"}), "version 2.0"),
     "version a list": (changed(asset={"version": [2]}), "version 2.0"),
-    "draco": (changed(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),
-    "draco, not required": (changed(**{f"{P}__extensions": {"KHR_draco_mesh_compression": {}}}), "without compression"),
+    "draco without a view": (changed(**{f"{P}__extensions": {DRACO: {}}}), "uses bufferViews['None']"),
+    "draco without a mesh": (changed(**{f"{P}__extensions": {DRACO: {"bufferView": 0}}}), "a compressed mesh that is not complete"),
+    "draco a word": (changed(**{f"{P}__extensions": {DRACO: "x"}}), f"'{DRACO}' is not valid"),
     "meshopt": (changed(extensionsRequired=["EXT_meshopt_compression"]), "EXT_meshopt_compression"),
     "meshopt, not required": (changed(bufferViews__0__extensions={"EXT_meshopt_compression": {}}), "without compression"),
     "unknown extension": (changed(extensionsRequired=["VENDOR_cubes"]), "VENDOR_cubes"),

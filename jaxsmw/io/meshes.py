@@ -140,7 +140,8 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool | float = False) 
       compressed. Compression with LZ4 needs the extra `vtk`.
     - `.gltf`, `.glb`: glTF 2.0 files. The attribute TEXCOORD_0 is the texture, and COLOR_0 becomes `colors`.
       Further attributes, morph targets and skins are read as well. If the file has several parts, the face
-      data `group` contains 0-based integers, and `label_names` contains the names of the parts.
+      data `group` contains 0-based integers, and `label_names` contains the names of the parts. Draco
+      compression needs the extra `draco`.
     - `.npz`: the arrays that `write_mesh_data` writes, such as `vertices`, `faces` and `vertex_data/NAME`.
     - `.gii`: a GIFTI file with one surface, and all arrays with one row per vertex. Labels are numbered from
       0 in the order of the file's table. Positions are those of the file, without its transform. GIFTI and

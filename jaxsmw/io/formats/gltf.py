@@ -30,6 +30,8 @@ _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # Files may require these extensions, which do not change how positions, faces and attributes are read.
 _HARMLESS = re.compile(r"KHR_mesh_quantization|(KHR|EXT)_(materials|texture|lights|animation|xmp).*")
+# An extension that this reader understands, if the package DracoPy is installed.
+_DRACO = "KHR_draco_mesh_compression"
 _NOT_DATA = re.compile(r"POSITION|NORMAL|TANGENT|TEXCOORD_0|(JOINTS|WEIGHTS)_\d+")
 # The largest accepted numbers of vertices, triangle corners, displacements and weights. There is one
 # displacement per vertex and blend shape, and one weight per vertex and joint.
@@ -140,10 +142,8 @@ class _Scene:
             if document.integer(primitive, "mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
                 self.ignored += 1
                 continue
-            if "KHR_draco_mesh_compression" in document.dict_of(primitive, "extensions"):
-                raise InputError(
-                    "is compressed with KHR_draco_mesh_compression: export the mesh without compression."
-                )
+            if _DRACO in (extensions := document.dict_of(primitive, "extensions")):
+                document.decompress(primitive, document.dict_of(extensions, _DRACO))
             key = repr((primitive.get("attributes"), primitive.get("targets")))
             if key not in parts:
                 parts[key] = self._part(primitive, matrix, shape_names, nodes_of_joints)
@@ -363,6 +363,7 @@ class _Document:
         self.folder = folder
         self.binary: bytes | None = None
         self.buffers: dict[int, bytes] = {}
+        self.decompressed: dict[int, np.ndarray] = {}  # the rows of compressed accessors
         text = self._unpack(data) if data[:4] == b"glTF" else data
         try:
             self.json = json.loads(text.decode("utf-8-sig"), parse_constant=_refuse_constant)
@@ -374,7 +375,7 @@ class _Document:
         if not re.fullmatch(r"2\.\d{1,3}", version, re.ASCII) or least != "2.0":
             raise InputError("does not have the version 2.0 of glTF: export the mesh again as glTF 2.0.")
         for name in self.list_of(self.json, "extensionsRequired"):
-            if not isinstance(name, str) or not _HARMLESS.fullmatch(name):
+            if name != _DRACO and not (isinstance(name, str) and _HARMLESS.fullmatch(name)):
                 raise InputError(
                     f"needs the extension {excerpt(str(name))}, which is not supported: export the mesh "
                     "without compression and without this extension."
@@ -483,6 +484,27 @@ class _Document:
             "a .glb file."
         )
 
+    def decompress(self, primitive: dict[str, Any], compressed: dict[str, Any]) -> None:
+        """Read the accessors of a primitive that are compressed by Draco.
+
+        The accessors still state the types and the numbers of elements.
+        """
+        index = compressed.get("bufferView")
+        length = self.integer(self.item("bufferViews", index), "byteLength")
+        mesh = _draco_mesh(self.view(index, 0, length, "u1", 1).tobytes())
+        arrays = {attribute["unique_id"]: attribute["data"] for attribute in mesh.attributes}
+        attributes = self.dict_of(primitive, "attributes")
+        found: list[tuple[Any, np.ndarray]] = [(primitive.get("indices"), mesh.faces.reshape(-1, 1))]
+        for name, number in self.dict_of(compressed, "attributes").items():
+            array = arrays.get(number) if isinstance(number, int) else None
+            if array is None or name not in attributes:
+                raise damaged(f"the compressed attribute {excerpt(str(name))} does not exist")
+            found.append((attributes[name], array.reshape(len(array), -1)))
+        for accessor, values in found:
+            self.item("accessors", accessor)
+            if not np.array_equal(self.decompressed.setdefault(accessor, values), values, equal_nan=True):
+                raise damaged(f"accessor {accessor} belongs to several compressed primitives")
+
     def view(self, index: Any, offset: int, count: int, kind: str, columns: int) -> np.ndarray:
         """Return `count` rows of a buffer view as numbers (count, columns). The rows start at `offset`."""
         description = self.item("bufferViews", index)
@@ -519,7 +541,12 @@ class _Document:
             raise damaged(f"accessor {index} does not have a suitable type")
         if rows is not None and count != rows:
             raise damaged(f"accessor {index} has {count} elements instead of {rows}")
-        if "bufferView" in description:
+        if index in self.decompressed:
+            values = self.decompressed[index]
+            if values.shape != (count, width):
+                raise damaged(f"accessor {index} does not have the shape of its compressed numbers")
+            values = values.astype(kind)
+        elif "bufferView" in description:
             offset = self.integer(description, "byteOffset", 0)
             values = self.view(description["bufferView"], offset, count, kind, width)
         elif rows is None:  # limits memory: an accessor without data can state any number of elements
@@ -554,6 +581,23 @@ def _as_floats(values: np.ndarray, is_fraction: bool) -> np.ndarray:
     if not is_fraction:
         return values.astype(np.float64)
     return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
+
+
+def _draco_mesh(data: bytes) -> Any:
+    """Decompress a mesh. On 10 000 damaged files, DracoPy raised exceptions or returned wrong numbers."""
+    try:
+        import DracoPy
+    except ImportError:
+        raise InputError(
+            f"is compressed with {_DRACO}, which needs the package DracoPy: run pip install "
+            "'jaxsmw[draco]', or export the mesh without compression."
+        ) from None
+    try:
+        mesh = DracoPy.decode(data)
+        mesh.faces, mesh.attributes  # noqa: B018 (point clouds have no faces)
+    except Exception:  # any exception is possible for damaged files
+        raise export_again("contains a compressed mesh that is not complete") from None
+    return mesh
 
 
 def _refuse_constant(name: str) -> NoReturn:
