@@ -34,7 +34,9 @@ from jaxsmw.io.overlays import read_overlay
 
 CORPUS = Path(__file__).parent / "corpus"
 MESHES = sorted(
-    p.name for p in CORPUS.iterdir() if re.match(r"jaxsmw|trimesh|vtk|scipy|points\.(xyz|npy)|.*pcd", p.name)
+    p.name
+    for p in CORPUS.iterdir()
+    if re.match(r"jaxsmw|trimesh|vtk|scipy|pycollada|draco|points\.(xyz|npy)|.*pcd", p.name)
 )
 OVERLAYS = sorted(p.name for p in CORPUS.iterdir() if p.name.startswith("overlay"))
 LANDMARKS = sorted(p.name for p in CORPUS.iterdir() if p.name.startswith("landmarks"))

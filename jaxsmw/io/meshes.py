@@ -44,7 +44,8 @@ _FREESURFER = (".pial", ".white", ".inflated", ".sphere", ".smoothwm", ".midthic
 _PARSERS = {
     **{".off": "off:parse_off", ".obj": "obj:parse_obj", ".ply": "ply:parse_ply", ".stl": "stl:parse_stl"},
     **{".mat": "mat:parse_mat", ".vtk": "vtk:parse_vtk", ".vtp": "vtp:parse_vtp", ".npz": "npz:parse_npz"},
-    **{".gltf": "gltf:parse_gltf", ".glb": "gltf:parse_glb"},
+    **{".gltf": "gltf:parse_gltf", ".glb": "gltf:parse_glb", ".3mf": "threemf:parse_3mf"},
+    **{".dae": "dae:parse_dae"},
     **{".xyz": "points:parse_xyz", ".pcd": "pcd:parse_pcd", ".npy": "points:parse_npy"},
     **{".gii": "brain:parse_gifti"} | dict.fromkeys(_FREESURFER, "brain:parse_surface"),
 }
@@ -75,10 +76,10 @@ def _converter(suffix: str) -> str:
 
 # The formats whose files begin with text, even if numbers are binary.
 _TEXT = (".off", ".obj", ".ply", ".vtk", ".pcd")
-MESH_SUFFIXES = tuple(suffix for suffix in _FORMATTERS if suffix != ".npz")
-"""The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
-POINT_CLOUD_SUFFIXES = tuple(suffix for suffix in _PARSERS if suffix not in _FORMATTERS)
+POINT_CLOUD_SUFFIXES = (".xyz", ".pcd", ".npy")
 """The suffixes of files that contain only points."""
+MESH_SUFFIXES = tuple(suffix for suffix in _PARSERS if suffix not in (*POINT_CLOUD_SUFFIXES, ".npz"))
+"""The suffixes of files that are certainly meshes. Many `.npz` files contain something else."""
 
 
 def _loaded(function: str) -> Callable[..., Any]:
@@ -97,8 +98,8 @@ def read_mesh(path: str | os.PathLike[str], *, weld: bool | float = False) -> Me
     **Arguments:**
 
     - `path`: the file. The suffix, in upper or lower case, determines the format: `.off`, `.obj`, `.ply`,
-        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.npz`, `.gii`, `.xyz`, `.pcd` or `.npy`. Surfaces of
-        FreeSurfer, such as `lh.pial`, may have any other suffix.
+        `.stl`, `.mat`, `.vtk`, `.vtp`, `.gltf`, `.glb`, `.3mf`, `.dae`, `.npz`, `.gii`, `.xyz`, `.pcd` or
+        `.npy`. Surfaces of FreeSurfer, such as `lh.pial`, may have any other suffix.
     - `weld`: if True or a tolerance, vertices at the same position are merged, as in `make_mesh`. Faces then
         use only the lowest-numbered of these vertices. The other vertices stay in the mesh without faces, so
         no vertex is renumbered. The vertices of STL and glTF files are always welded.
@@ -142,6 +143,10 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool | float = False) 
       Further attributes, morph targets and skins are read as well. If the file has several parts, the face
       data `group` contains 0-based integers, and `label_names` contains the names of the parts. Draco
       compression needs the extra `draco`.
+    - `.3mf`: all objects of the build, at their places. Vertices of different objects stay different. The
+      unit of the file, colours and textures are not read. The face data `group` is as in glTF files.
+    - `.dae`: all geometries of the scene of a COLLADA file, at their places, skinned ones in their bind pose.
+      Textures are not read. The files need the extra `collada`. The face data `group` is as in glTF files.
     - `.npz`: the arrays that `write_mesh_data` writes, such as `vertices`, `faces` and `vertex_data/NAME`.
     - `.gii`: a GIFTI file with one surface, and all arrays with one row per vertex. Labels are numbered from
       0 in the order of the file's table. Positions are those of the file, without its transform. GIFTI and

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.arrays import first_equal_rows
-from jaxsmw.io.formats.polygons import Polygons, unique_name, unique_names
+from jaxsmw.io.formats.polygons import MOST_VERTICES, Polygons, face_groups, unique_name, unique_names
 from jaxsmw.io.formats.text import damaged, excerpt, export_again
 from jaxsmw.io.mesh_data import COLORS, Skin
 from jaxsmw.runtime.files import read_bytes
@@ -33,9 +33,9 @@ _HARMLESS = re.compile(r"KHR_mesh_quantization|(KHR|EXT)_(materials|texture|ligh
 # An extension that this reader understands, if the package DracoPy is installed.
 _DRACO = "KHR_draco_mesh_compression"
 _NOT_DATA = re.compile(r"POSITION|NORMAL|TANGENT|TEXCOORD_0|(JOINTS|WEIGHTS)_\d+")
-# The largest accepted numbers of vertices, triangle corners, displacements and weights. There is one
-# displacement per vertex and blend shape, and one weight per vertex and joint.
-_MOST_VERTICES, _MOST_CORNERS, _MOST_DISPLACEMENTS, _MOST_WEIGHTS = 10**7, 6 * 10**7, 2**24, 2**25
+# The largest accepted numbers of triangle corners, displacements and weights. There is one displacement per
+# vertex and blend shape, and one weight per vertex and joint.
+_MOST_CORNERS, _MOST_DISPLACEMENTS, _MOST_WEIGHTS = 6 * 10**7, 2**24, 2**25
 
 
 def parse_gltf(data: bytes, folder: Path) -> Polygons:
@@ -162,8 +162,8 @@ class _Scene:
         vertices = document.floats(attributes.get("POSITION"), 3)
         n = len(vertices)
         self.vertices += n
-        if self.vertices > _MOST_VERTICES:
-            raise InputError(f"describes more than {_MOST_VERTICES} vertices: decimate the mesh.")
+        if self.vertices > MOST_VERTICES:
+            raise InputError(f"describes more than {MOST_VERTICES} vertices: decimate the mesh.")
         data = self._vertex_data(attributes, n)
         coordinates = None
         if "TEXCOORD_0" in attributes:
@@ -257,11 +257,9 @@ class _Scene:
                 notes.append(
                     f"The vertex data {name!a} were ignored, because only some primitives have them."
                 )
-        face_data, label_names = {}, {}
-        if len(groups) > 1:
-            number = {name: i for i, name in enumerate(dict.fromkeys(name for _, name in groups))}
-            face_data["group"] = np.repeat([number[name] for _, name in groups], [len(f) for f, _ in groups])
-            label_names["group"] = tuple(number)
+        face_data, label_names = face_groups(
+            [name for _, name in groups], [len(faces) for faces, _ in groups]
+        )
         polygons = Polygons(
             vertices,
             corners,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -72,6 +72,47 @@ def triangles_of(
     first = np.where(is_strip[face], step, 0)
     corners = first + odd, np.where(odd, step, step + 1), step + 2
     return start[:, None] + np.stack(corners, axis=1), face
+
+
+# The largest number of vertices of a scene, in which a small file can repeat its meshes.
+MOST_VERTICES = 10**7
+
+
+def joined(parts: Iterable[tuple[str, np.ndarray, np.ndarray]], notes: tuple[str, ...] = ()) -> Polygons:
+    """Join the named parts of a scene. The faces (f, 3) of a part are indices of its own vertices (n, 3)."""
+    names, vertices, faces, number = [], [], [], 0
+    for name, of_part, corners in parts:
+        if len(corners) and not are_vertices(corners, len(of_part)):
+            raise damaged(f"a triangle of {name!a} uses a vertex that does not exist")
+        names.append(name)
+        vertices.append(of_part)
+        faces.append(corners + number)
+        number += len(of_part)
+        if number > MOST_VERTICES:
+            raise InputError(f"describes more than {MOST_VERTICES} vertices: decimate the mesh.")
+    if not names:
+        raise InputError("contains no triangles: export the mesh again as triangles.")
+    sizes = [len(of_part) for of_part in faces]
+    face_data, label_names = face_groups(names, sizes)
+    corners = np.concatenate(faces).ravel()
+    return Polygons(
+        np.concatenate(vertices),
+        corners,
+        np.full(sum(sizes), 3),
+        notes,
+        face_data=face_data,
+        label_names=label_names,
+    )
+
+
+def face_groups(
+    names: Sequence[str], sizes: Sequence[int]
+) -> tuple[dict[str, np.ndarray], dict[str, tuple[str, ...]]]:
+    """Return the face data `group`, and its label names, of parts with the given numbers of faces."""
+    if len(names) < 2:
+        return {}, {}
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return {"group": np.repeat([numbers[name] for name in names], sizes)}, {"group": tuple(numbers)}
 
 
 def are_vertices(corners: np.ndarray, n: int) -> bool:
