@@ -221,8 +221,18 @@ def test_the_number_of_cores_changes_nothing(spaces, cores, monkeypatch):
     problems = [SearchProblem(*(points.astype(np.float32) for points in space)) for space in spaces.values()]
     expected = [nearest_neighbor(*problem) for problem in problems]
     monkeypatch.setattr(host_search, "_cores", lambda: cores)
+    monkeypatch.setattr(host_search, "_THREADS_FROM", 0)
     for found, wanted in zip(nearest_in_both(*problems), expected, strict=True):
         np.testing.assert_array_equal(found, wanted)
+
+
+def test_small_searches_start_no_threads(monkeypatch):
+    monkeypatch.setattr(host_search, "_cores", lambda: 2)
+    monkeypatch.setattr(host_search, "ThreadPoolExecutor", None)
+    points = np.random.default_rng(0).normal(size=(1000, 5))
+    np.testing.assert_array_equal(nearest_neighbor(points, points), np.arange(1000))
+    with pytest.raises(TypeError):
+        nearest_neighbor(np.tile(points, (6, 1)), points)
 
 
 def test_two_searches_can_have_different_sizes(method):

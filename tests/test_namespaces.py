@@ -248,6 +248,7 @@ def test_too_few_samples_are_reported(pair):
 def test_the_number_of_threads_does_not_change_the_map(pair, name, monkeypatch):
     x, y, initial_map, _ = pair
     maps = []
+    monkeypatch.setattr(host_search, "_THREADS_FROM", 0)
     for threads in (1, 2):
         monkeypatch.setattr(host_search, "_cores", lambda threads=threads: threads)
         with threadpool_limits(threads):
@@ -261,6 +262,7 @@ def test_the_number_of_threads_does_not_change_the_map(pair, name, monkeypatch):
 @pytest.mark.sampled
 def test_the_number_of_threads_does_not_change_a_match(monkeypatch):
     maps = []
+    monkeypatch.setattr(host_search, "_THREADS_FROM", 0)
     for threads in (1, 2):
         monkeypatch.setattr(host_search, "_cores", lambda threads=threads: threads)
         with threadpool_limits(threads), recomputing():
