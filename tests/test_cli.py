@@ -479,7 +479,7 @@ def test_maps_are_written_and_read_as_matlab_files(run, pair, tmp_path):
         ("the robust Laplacian (laplacian='robust').", "the robust Laplacian (--laplacian robust)."),
         ('set mirror="no"; if', "set --mirror no; if"),
         ("scale=1.5.ply: pass index_base=1.", "scale=1.5.ply: pass --index-base 1."),
-        ("Set partial=True and scale=\"unknown\" to", "Set --partial and --scale unknown to"),
+        ("again with partial=True and scale=\"unknown\", which", "again with --partial and --scale unknown, which"),
         ("(see Correspondence.alternatives)", "(see match --alternatives 3)"),
         ("that jaxsmw.report.summary.write_report writes", "that --report DIR writes"),
         ("landmarks with init=landmarks.", "landmarks with --init landmarks:FILE."),
@@ -611,6 +611,7 @@ def test_the_quality_of_the_map_is_printed(run, pair, tmp_path, monkeypatch):
         )
         assert next(lines) == "other maps:  1. mirrored, right with probability 20 %"
         assert next(lines) == "             2. mirrored, right with probability below 1 %"
+        assert next(lines) == "             none of these maps is right with probability 5 %"
 
 
 @pytest.mark.parametrize("name", ["map.txt", "map", "a.b.npy"])

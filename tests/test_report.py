@@ -132,6 +132,11 @@ def test_the_report_shows_other_maps_that_could_be_right(found: Correspondence, 
     ]
     # The second alternative is the initial map, and the first is neither map.
     assert shown[3]["map"] == shown[1]["map"] != shown[2]["map"]
+    assert '<p class="fault">' not in page
+    write_report(tmp_path, replace(found, probability=0.1, alternatives=others, mirrored=True))
+    _, page = read(tmp_path)
+    assert '<p class="fault">Be careful: the map is wrong as a whole with a probability of 90 %' in page
+    assert '<p class="fault">The source was matched as its mirror image' in page
 
 
 def test_a_comparison_explains_its_errors(errors: dict[str, GeodesicError], tmp_path: Path) -> None:

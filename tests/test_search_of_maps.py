@@ -447,12 +447,13 @@ def test_a_wrong_map_is_reported_with_what_could_be_done(pair):
     ):
         found = match(mesh_x, mesh_y, preset="paper", init=upside_down(mesh_x, truth))
     assert found.suspicious and found.wrong_probability() == 1 - found.probability > 0.5
+    assert found.none_probability() == pytest.approx(found.wrong_probability())
 
 
 def test_a_recognised_part_is_reported_with_all_settings_that_say_so(pair):
     mesh_x, mesh_y, truth = pair
     found = match(mesh_x, mesh_y, preset="paper", init=truth, mirror="no")
-    for scale, cure in ((1.0, "Set partial=True to say so"), (2.0, 'partial=True and scale="unknown" to')):
+    for scale, cure in ((1.0, "with partial=True, which"), (2.0, 'partial=True and scale="unknown", which')):
         part = replace(found, pair=replace(found.pair, partial=True, scale=scale))
         text, *_ = advice(part, partial=False)
         assert cure in text and not list(advice(part, partial=True))

@@ -113,6 +113,11 @@ def show_quality(correspondence: Correspondence) -> None:
         show(
             f"{name:12} {number}. {other.difference}, right with probability {percentage(other.probability)}"
         )
+    if correspondence.alternatives:
+        show(
+            f"{'':12} none of these maps is right with probability "
+            f"{percentage(correspondence.none_probability())}"
+        )
 
 
 def show_match(

@@ -587,7 +587,8 @@ def numeric_rows(values: ArrayLike, what: str, name: str) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{expected}, but these values cannot be converted to an array.") from None
     if array.size == 0:
-        raise InputError(f"{name}: there are no {what}: give at least one row.")
+        cure = "; triangulate_points makes the faces of a point cloud" if what == "faces" else ""
+        raise InputError(f"{name}: there are no {what}: give at least one row{cure}.")
     if array.dtype.kind not in "iuf" or array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"{expected}, but these values are {array.dtype.name} of shape {array.shape}.")
     return array

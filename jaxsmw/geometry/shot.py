@@ -67,7 +67,7 @@ def shot_descriptors(
     """
     descriptors, lonely = _cached(mesh, radius, samples, required)
     if lonely > 0.01:
-        warnings.warn(_too_coarse(mesh, lonely, radius, required), stacklevel=2)
+        warnings.warn(_too_coarse(mesh, lonely, radius, "use a finer mesh"), stacklevel=2)
     return descriptors
 
 
@@ -123,7 +123,10 @@ def _cached(
             )
         lonely = number_lonely / len(vertices)
         if lonely > 0.5:
-            raise InputError(_too_coarse(mesh, lonely, radius, required))
+            cure = "use a finer mesh"
+            if not required:
+                cure += ", or the initial map 'wks' with the preset 'paper', which do not use SHOT"
+            raise InputError(_too_coarse(mesh, lonely, radius, cure))
         descriptors = mesh.spread(descriptors) if samples is None else descriptors
         return {"descriptors": descriptors, "lonely": np.asarray(lonely)}
 
@@ -139,12 +142,10 @@ def mirrored_descriptors(descriptors: Float32[np.ndarray, "n 352"]) -> Float32[n
     return np.ascontiguousarray(sectors[:, ::-1]).reshape(descriptors.shape)
 
 
-def _too_coarse(mesh: Mesh, lonely: float, radius: float, required: bool) -> str:
-    avoidance = ", or the initial map 'wks' with the preset 'paper', which do not use SHOT"
+def _too_coarse(mesh: Mesh, lonely: float, radius: float, cure: str) -> str:
     return (
         f"{mesh.name}: {lonely:.0%} of the vertices have fewer than {_FEWEST_NEIGHBORS} neighbours within "
-        f"the SHOT radius of {radius:.3g} sqrt(area), because the mesh is coarse there: use a finer mesh"
-        f"{'' if required else avoidance}."
+        f"the SHOT radius of {radius:.3g} sqrt(area), because the mesh is coarse there: {cure}."
     )
 
 

@@ -190,6 +190,8 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool | float = False) 
         suffix = _FREESURFER[0]
     with naming(path):
         polygons = _parse(data, suffix, path.parent)
+        if not len(polygons.vertices):
+            raise InputError("contains no vertices: export the mesh again.")
         is_strip = np.zeros(len(polygons.sizes), bool) if polygons.strips is None else polygons.strips
         at, polygon = triangles_of(polygons.sizes, is_strip)
         faces = polygons.corners[at]
@@ -205,7 +207,7 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool | float = False) 
     }
     if polygons.weld and weld is False:
         weld = 0.0
-    if len(faces) or not len(polygons.vertices):
+    if len(faces):
         mesh = make_mesh(polygons.vertices, faces, name=str(path), weld=weld, notes=notes)
     else:
         normals = polygons.vertex_data.get(NORMALS)

@@ -23,6 +23,14 @@ def advice(correspondence: Correspondence, *, partial: bool) -> Iterator[str]:
         yield _omission(correspondence)
 
 
+def verdict(correspondence: Correspondence) -> str:
+    """Say how probable it is that the map is wrong."""
+    return (
+        "the map is wrong as a whole with a probability of "
+        f"{percentage(correspondence.wrong_probability())}: turned, mirrored, or with exchanged limbs."
+    )
+
+
 def _recognition(correspondence: Correspondence) -> str:
     """Say that one shape was matched as a part of the other."""
     pair = correspondence.pair
@@ -32,8 +40,8 @@ def _recognition(correspondence: Correspondence) -> str:
         unit = f" (lengths on the source are multiplied by {pair.scale:.3g})"
         cure = ' and scale="unknown"'
     return (
-        f"{part} looks like a part of {whole}: they were matched with partial=True{unit}. Set partial=True"
-        f"{cure} to say so."
+        f"{part} looks like a part of {whole}: they were matched with partial=True{unit}. If this is right, "
+        f"match them again with partial=True{cure}, which often gives a better map."
     )
 
 
@@ -49,13 +57,13 @@ def _omission(correspondence: Correspondence) -> str:
 def _suspicion(correspondence: Correspondence) -> str:
     """Say that the map is probably wrong as a whole, and what could be done."""
     pair, others = correspondence.pair, correspondence.alternatives
-    text = (
-        f"{pair.name}: the map is wrong as a whole with a probability of "
-        f"{percentage(correspondence.wrong_probability())}: turned, mirrored, or with exchanged limbs."
-    )
+    text = f"{pair.name}: {verdict(correspondence)}"
     if others:
         listed = "; ".join(f"{other.difference} ({percentage(other.probability)})" for other in others)
-        text += f" Other maps could be right (see Correspondence.alternatives): {listed}."
+        none = percentage(correspondence.none_probability())
+        text += (
+            f" Other maps could be right (see Correspondence.alternatives): {listed}; none of them ({none})."
+        )
     cures = ["give a few landmarks as the initial map with init=landmarks"]
     if correspondence.origin == "landmarks":
         cures = ["give more landmarks with init=landmarks"]

@@ -160,7 +160,7 @@ class Correspondence:
     def __repr__(self) -> str:
         m, n = (len(mesh.vertices) for mesh in self.pair.meshes)
         flag = (", mirrored" if self.mirrored else "") + (", suspicious" if self.suspicious else "")
-        judged = f"distortion {self.distortion:.3f}{flag}"
+        judged = f"right with probability {self.probability:.2f}, distortion {self.distortion:.3f}{flag}"
         return f"Correspondence({self.pair.name}: {m} to {n} vertices, {judged})"
 
     @property
@@ -441,6 +441,10 @@ class Correspondence:
     def wrong_probability(self) -> float:
         """Return the probability, from 0 to 1, that the map is wrong as a whole: 1 - `probability`."""
         return 1 - self.probability
+
+    def none_probability(self) -> float:
+        """Return the probability, from 0 to 1, that neither the map nor an alternative is right."""
+        return max(0.0, 1 - self.probability - sum(other.probability for other in self.alternatives))
 
     @functools.cached_property
     def _expected_error(self) -> Float[np.ndarray, " m"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -41,6 +42,8 @@ from jaxsmw.matching.template import join, scales_to_template
 from jaxsmw.runtime.memory import release_freed_memory
 from jaxsmw.runtime.progress import Step, no_step, timed
 from jaxsmw.runtime.threads import one_blas_thread
+
+logger = logging.getLogger("jaxsmw")
 
 
 def match(
@@ -140,7 +143,10 @@ def match(
         backend=backend,
     )
     if template is None:
-        correspondence = matched(Pair.make(mesh_x, mesh_y, partial=partial, scale=scale), init=init)
+        pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
+        if pair.scale != scale:
+            logger.info("scale: lengths on %s are multiplied by %.4g", pair.mesh_x.name, pair.scale)
+        correspondence = matched(pair, init=init)
     elif not isinstance(init, str):
         raise InputError(
             "an initial map from X to Y cannot be used with a template: leave out the one or the other."

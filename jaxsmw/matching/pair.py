@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from dataclasses import dataclass, replace
 
@@ -15,8 +14,6 @@ from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh
 from jaxsmw.geometry.scale import estimate_scale, relative_boundary
 from jaxsmw.geometry.shortcuts import cut_shortcuts
 from jaxsmw.transfer.small_components import match_small_components
-
-logger = logging.getLogger("jaxsmw")
 
 # A preset uses at most one eigenvector per two vertices. With fewer vertices, a preset would use fewer than
 # two eigenvectors.
@@ -178,7 +175,6 @@ def _known_scale(mesh_x: Mesh, mesh_y: Mesh, partial: bool, scale: float | Scale
     if isinstance(scale, str):
         check_choice(scale, Scale, "a scale")
         estimate = estimate_scale(mesh_x, mesh_y)
-        logger.info("scale: lengths on %s are multiplied by %.4g", mesh_x.name, estimate.scale)
         if estimate.uncertain:
             warnings.warn(
                 f"{mesh_x.name} to {mesh_y.name}: the estimated scale {estimate.scale:.3g} is uncertain, "

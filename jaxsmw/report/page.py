@@ -96,6 +96,7 @@ def write_page(
     maps: Mapping[str, ShownMap],
     *,
     title: str,
+    notes: Sequence[str] = (),
     spectra: tuple[Spectrum, Spectrum] | None = None,
     refiner: WaveletPreservation = WaveletPreservation(),  # noqa: B008 (immutable)
     statistics: Mapping[str, str] = MappingProxyType({}),
@@ -128,6 +129,7 @@ def write_page(
     - `mesh_x`, `mesh_y`: source (m vertices) and target (n vertices), each a `Mesh` in any unit of length.
     - `maps`: a dictionary from the name of each map to a `ShownMap`. The page opens with the first map.
     - `title`: the heading of the page.
+    - `notes`: sentences below the heading.
     - `spectra`: a pair with the `Spectrum` of X and of Y; None (the default) for a page without wavelets.
       `jaxsmw.report.page_data.eigenvectors_on_page` limits the number of eigenvectors on the page.
     - `refiner`: a `WaveletPreservation` refiner, whose filter bank defines the wavelets.
@@ -179,6 +181,7 @@ def write_page(
     modes = _modes(maps, error_names, has_spectra=filters > 0)
     fragments = {
         "title": escape(title),
+        "notes": "".join(f'<p class="fault">{escape(note)}</p>' for note in notes),
         "source": escape(f"{name_x} · {len(mesh_x.vertices)} vertices"),
         "target": escape(f"{name_y} · {len(mesh_y.vertices)} vertices"),
         "last_vertex": str(len(mesh_x.vertices) - 1),

@@ -27,6 +27,7 @@ from jaxsmw.evaluation.metrics import LARGEST_THRESHOLD, GeodesicError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_points import check_pointwise_map
 from jaxsmw.io.landmarks import Landmarks
+from jaxsmw.matching.advice import verdict
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import paired_spectra
@@ -138,6 +139,7 @@ def write_report(
         correspondence.mesh_y,
         shown,
         title=_title(correspondence.mesh_x, correspondence.mesh_y),
+        notes=_notes(correspondence),
         spectra=(correspondence.spectrum_x, correspondence.spectrum_y),
         refiner=WaveletPreservation() if wavelets is None else wavelets[0],
         statistics=summarize(correspondence, others, steps),
@@ -171,6 +173,19 @@ def write_report(
     with atomic_write(directory / "summary.json") as temporary:
         temporary.write_text(json.dumps(summary, indent=2) + "\n", "utf-8")
     return [directory / "report.html", *pictures, directory / "summary.json"]
+
+
+def _notes(correspondence: Correspondence) -> list[str]:
+    """Return what must be known before the bodies are compared."""
+    notes = []
+    if correspondence.suspicious:
+        notes.append(f"Be careful: {verdict(correspondence)}")
+    if correspondence.mirrored:
+        notes.append(
+            "The source was matched as its mirror image, so colours that run from left to right on the "
+            "target run from right to left on the source."
+        )
+    return notes
 
 
 def _shown_maps(correspondence: Correspondence, errors: Mapping[str, GeodesicError]) -> dict[str, ShownMap]:
@@ -371,6 +386,7 @@ def summarize(
     `errors` and `seconds` are those of `write_report`.
     """
     facts = {
+        "probability of a wrong map": percentage(correspondence.wrong_probability()),
         "vertices": f"{len(correspondence.mesh_x.vertices)} to {len(correspondence.mesh_y.vertices)}",
         "functional map": "{} x {}".format(*correspondence.functional_map.shape),
         "iterations": str(correspondence.iterations),
@@ -387,7 +403,6 @@ def summarize(
     facts["distortion (1 is none)"] = f"{correspondence.distortion:.2f}"
     expected = correspondence.mesh_x.average(correspondence.expected_error())
     facts["expected error, mean"] = f"{expected:.4f} √area"
-    facts["probability of a wrong map"] = percentage(correspondence.wrong_probability())
     if correspondence.left_out:
         facts["small components without counterpart"] = f"{correspondence.left_out:.1%} of the source's area"
     steps = correspondence.seconds if seconds is None else seconds
