@@ -44,7 +44,7 @@ from jaxsmw.matching.executor import run
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import race
 from jaxsmw.matching.search.reading import Reading
-from jaxsmw.matching.search.search import other_hand, readings_of
+from jaxsmw.matching.search.search import readings_of
 from jaxsmw.report.figures import new_figure, save_figure, style_axes
 from jaxsmw.runtime.provenance import made_with
 
@@ -83,9 +83,11 @@ def found_by_kinds(known: KnownPair) -> dict[str, Any]:
     """Return whether the first map, and the race of each kind of hypothesis, are right."""
     with prepared(known) as (shapes, start, preset):
         outcome = run(preset.before_final, shapes.spectra, start)
-        first = Reading.of(shapes).with_first(outcome.pointwise_map)
-        other = other_hand(first, preset, start) if first.is_asymmetric() else None
-        readings = readings_of(first, other)
+        reading = Reading.of(shapes)
+        both_hands = reading.is_asymmetric()
+        if not both_hands:
+            reading = reading.with_first(outcome.pointwise_map)
+        readings = readings_of(reading, both_hands=both_hands)
         row: dict[str, Any] = {FIRST: int(is_right(*known.errors(outcome.pointwise_map)))}
         for kind in HYPOTHESES:
             maps = [one.reading.extended(one.matches) for one in race(readings, [], [kind])]

@@ -27,7 +27,7 @@ from jaxsmw.matching.search.evidence import Evidence, deformation, discontinuity
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, race
 from jaxsmw.matching.search.reading import Reading
-from jaxsmw.matching.search.search import Judged, other_hand, search
+from jaxsmw.matching.search.search import Judged, search
 from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.stages import Preset, Sizes, Stage
 
@@ -304,14 +304,6 @@ def test_a_mostly_reversed_map_is_tried_for_the_other_hand(lump):
     reading = read(lump, image)
     (best, *_) = race([reading, reading.mirror()], [known_map(reading, order_of(lump))], hypotheses=())
     assert best.reading.x.mirrored and best.evidence.deformation < 1e-3
-
-
-def test_the_other_hand_has_a_first_map_of_its_own(lump):
-    reading = read(lump, turned(lump.mirrored()))
-    right = reading.reduced(order_of(lump))
-    other = other_hand(reading, SEARCH, Start(order_of(lump), "shot"))
-    assert other.agreement(right) > 0.9
-    assert reading.mirror().agreement(right) == 0
 
 
 def test_twins_are_merged_and_the_better_one_is_kept(pair):

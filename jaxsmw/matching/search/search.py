@@ -29,7 +29,6 @@ from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset
-from jaxsmw.matching.starts import INITIAL_MAPS, make_start
 
 logger = logging.getLogger("jaxsmw")
 
@@ -115,18 +114,18 @@ def search(
     **Returns:** Maps that differ from each other, the most probable first.
     """
     outcome = outcome or run(preset.before_final, prepared.spectra, start)
-    reading = Reading.of(prepared).with_first(outcome.pointwise_map)
+    reading, settings = Reading.of(prepared), preset.search
+    # Of asymmetric shapes, the wrong hand can have a good map, so both hands are compared. A shape that is
+    # nearly its own mirror image, such as a person, needs no second hand: its left stays its left.
+    both_hands = settings is not None and hypotheses and mirror == "auto" and reading.is_asymmetric()
+    if not both_hands:  # the first map belongs to one hand, which agreement with it would prefer
+        reading = reading.with_first(outcome.pointwise_map)
     first = Judged.of(reading, outcome)
-    settings = preset.search
     if settings is None:
         return [first]
     judged = [first]
-    # Of asymmetric shapes, the wrong hand can have a good map, so both hands are compared. A shape that is
-    # nearly its own mirror image, such as a person, needs no second hand: its left stays its left.
-    both_hands = hypotheses and mirror == "auto" and reading.is_asymmetric()
     certain = _ends_the_search(first, settings) and not both_hands
-    other = other_hand(reading, preset, start) if both_hands else None
-    readings = readings_of(reading, other) if hypotheses and not certain else [reading]
+    readings = readings_of(reading, both_hands=both_hands) if hypotheses and not certain else [reading]
     for number in range(_ROUNDS):
         if certain:
             break
@@ -192,23 +191,10 @@ def _probable(parts: Float[np.ndarray, " c"], settings: SearchSettings) -> Bool[
     return parts >= settings.likely * parts.max(initial=0.0)
 
 
-def readings_of(reading: Reading, other: Reading | None = None) -> list[Reading]:
-    """Return a reading and those with a shape as a part of the other, perhaps also with the other hand."""
+def readings_of(reading: Reading, *, both_hands: bool) -> list[Reading]:
+    """Return a reading and those with a shape as a part of the other, perhaps with both hands of X."""
     readings = [reading, *_as_parts(reading)]
-    if other is None:
-        return readings
-    return [*readings, other, *(replace(one.mirror(), first=other.first) for one in readings[1:])]
-
-
-def other_hand(reading: Reading, preset: Preset, start: Start) -> Reading:
-    """Return the reading in which X has the other hand, with the map of its own first start."""
-    if start.origin not in INITIAL_MAPS:
-        return reading.mirror()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # they repeat those of the first start
-        mirrored = reading.mirror().described(preset)
-        again = make_start(mirrored.prepared, start.origin)
-    return mirrored.with_first(run(preset.before_final, mirrored.prepared.spectra, again).pointwise_map)
+    return [*readings, *(one.mirror() for one in readings)] if both_hands else readings
 
 
 def _as_parts(reading: Reading) -> Iterator[Reading]:
