@@ -83,6 +83,8 @@ def race(
         new = [best for best in islice(different(found), _MENDED) if best not in moved]
         found += _refined([move for best in new for move in _moves(best, readings)])
         moved += new
+    if all(reading.prepared.pair.partial for reading in readings):
+        return list(different(found))  # registration moves a part away from its place on a different body
     best = islice(different(found), _REGISTERED)
     return list(different(_refined([_Task.of(one) for one in best], _LAST_STAGES)))
 
