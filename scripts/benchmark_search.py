@@ -43,8 +43,7 @@ from jaxsmw.benchmark.tables import markdown
 from jaxsmw.matching.executor import run
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import race
-from jaxsmw.matching.search.reading import Reading
-from jaxsmw.matching.search.search import readings_of
+from jaxsmw.matching.search.search import read_pair, readings_of
 from jaxsmw.report.figures import new_figure, save_figure, style_axes
 from jaxsmw.runtime.provenance import made_with
 
@@ -83,10 +82,7 @@ def found_by_kinds(known: KnownPair) -> dict[str, Any]:
     """Return whether the first map, and the race of each kind of hypothesis, are right."""
     with prepared(known) as (shapes, start, preset):
         outcome = run(preset.before_final, shapes.spectra, start)
-        reading = Reading.of(shapes)
-        both_hands = reading.is_asymmetric()
-        if not both_hands:
-            reading = reading.with_first(outcome.pointwise_map)
+        reading, both_hands = read_pair(shapes, outcome.pointwise_map, mirrors=True)
         readings = readings_of(reading, both_hands=both_hands)
         row: dict[str, Any] = {FIRST: int(is_right(*known.errors(outcome.pointwise_map)))}
         for kind in HYPOTHESES:

@@ -126,7 +126,7 @@ def _nearest_of_all(*problems: _Problem) -> list[Int32[np.ndarray, " m"]]:
 
 
 @contextmanager
-def _threads(comparisons: int) -> Iterator[_Map]:
+def _threads(comparisons: int = _THREADS_FROM) -> Iterator[_Map]:
     """Provide a `map` that uses all cores of the process, if there is enough to compare."""
     cores = _cores()
     if cores == 1 or comparisons < _THREADS_FROM:
@@ -153,7 +153,7 @@ def _prepare(problem: _Problem) -> tuple[Sequence[_Block], _Search]:
         # Squared distances between very large numbers are infinite and exclude nothing.
         if np.isfinite(np.vdot(points, points) + np.vdot(queries, queries)):
             if len(points) >= _CLUSTERED_FROM and len(queries) * _POINTS_PER_QUERY >= len(points):
-                with _threads(len(queries) * len(points)) as run:
+                with _threads() as run:
                     sizes = _CLUSTER, _CLUSTERED_BLOCK
                     members, near_queries = run(_halved, (points, queries), sizes)
                 clusters = _Clusters.of(points, rows, center.astype(points.dtype), members)
@@ -273,7 +273,7 @@ class _Boxes(NamedTuple):
         """Compute the boxes of groups of s points."""
         few = -(-_CHUNK // groups.shape[1])
         starts = range(0, len(groups), few)
-        with _threads(groups.shape[0] * groups.shape[1] ** 2) as run:
+        with _threads() as run:
             parts = list(run(lambda start: _Boxes._of_few(groups[start : start + few], precision), starts))
         centers, axes, *others = zip(*parts, strict=True)
         return _Boxes(

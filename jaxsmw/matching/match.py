@@ -143,10 +143,7 @@ def match(
         backend=backend,
     )
     if template is None:
-        pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
-        if pair.scale != scale:
-            logger.info("scale: lengths on %s are multiplied by %.4g", pair.mesh_x.name, pair.scale)
-        correspondence = matched(pair, init=init)
+        correspondence = matched(_pair(mesh_x, mesh_y, partial, scale), init=init)
     elif not isinstance(init, str):
         raise InputError(
             "an initial map from X to Y cannot be used with a template: leave out the one or the other."
@@ -154,9 +151,7 @@ def match(
     else:
         parts = as_mesh(mesh_x, "source mesh"), as_mesh(mesh_y, "target mesh")
         whole, *scales = scales_to_template(*parts, template, scale)
-        pairs = [
-            Pair.make(part, whole, partial=True, scale=unit) for part, unit in zip(parts, scales, strict=True)
-        ]
+        pairs = [_pair(part, whole, True, unit) for part, unit in zip(parts, scales, strict=True)]
         seconds: dict[str, float] = {}
         with timed("source to template", seconds):
             x_to_template = matched(pairs[0], init=init, history=False)
@@ -176,6 +171,14 @@ def match(
     for text in advice(correspondence, partial=partial or template is not None):
         warnings.warn(text, stacklevel=2)
     return correspondence
+
+
+def _pair(mesh_x: Mesh | MeshLike, mesh_y: Mesh | MeshLike, partial: bool, scale: float | Scale) -> Pair:
+    """Make a pair, and report the scale if it was estimated."""
+    pair = Pair.make(mesh_x, mesh_y, partial=partial, scale=scale)
+    if pair.scale != scale:
+        logger.info("scale: lengths on %s are multiplied by %.4g", pair.mesh_x.name, pair.scale)
+    return pair
 
 
 def _matched(

@@ -23,7 +23,7 @@ from jaxtyping import Int64
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, unique_name, width_of
-from jaxsmw.io.formats.text import damaged, export_again
+from jaxsmw.io.formats.text import damaged, export_again, refuse_entities
 from jaxsmw.io.mesh_data import COLORS, NORMALS, LabelTable, MeshData, Overlay
 from jaxsmw.runtime.files import largest_contents
 from jaxsmw.wording import count_of
@@ -150,8 +150,7 @@ def _check_gifti(data: bytes) -> None:
     """Refuse files that refer to other files, and arrays that unpack to more memory than is permitted."""
     budget = largest_contents(len(data))
     try:
-        if b"<!ENTITY" in data:
-            raise ValueError  # entities can expand without limit
+        refuse_entities(data)
         for array in ElementTree.fromstring(data).iter("DataArray"):
             encoding = array.get("Encoding", "")
             if encoding in ("ExternalFileBinary", "GIFTI_ENCODING_EXTBIN"):

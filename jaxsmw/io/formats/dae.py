@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.polygons import Polygons, joined
-from jaxsmw.io.formats.text import export_again
+from jaxsmw.io.formats.polygons import Part, Polygons, joined, placed
+from jaxsmw.io.formats.text import export_again, refuse_entities
 
 
 def parse_dae(data: bytes) -> Polygons:
@@ -25,8 +25,7 @@ def parse_dae(data: bytes) -> Polygons:
         ) from None
     unimportant = [DaeUnsupportedError, DaeBrokenRefError]  # pictures and materials
     try:
-        if b"<!ENTITY" in data:
-            raise ValueError  # entities can expand without limit
+        refuse_entities(data)
         scene = Collada(io.BytesIO(data), ignore=unimportant).scene
         skins = (skin.geometry for skin in scene.objects("controller") if hasattr(skin, "geometry"))
         return joined(part for geometry in (*scene.objects("geometry"), *skins) for part in _part(geometry))
@@ -36,7 +35,7 @@ def parse_dae(data: bytes) -> Polygons:
         raise export_again("is not a complete COLLADA file") from None
 
 
-def _part(geometry: Any) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+def _part(geometry: Any) -> Iterator[Part]:
     """Yield the parts of a geometry of the scene: the primitives that use the same list of vertices."""
     matrix, original = np.asarray(geometry.matrix, float), geometry.original
     parts: dict[int, list[Any]] = {}
@@ -46,7 +45,5 @@ def _part(geometry: Any) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
             parts.setdefault(id(triangles.vertex), []).append(triangles)
     for primitives in parts.values():
         faces = np.concatenate([one.vertex_index for one in primitives]).astype(np.int64)
-        if np.linalg.det(matrix[:3, :3]) < 0:
-            faces = faces[:, ::-1]
-        vertices = np.asarray(primitives[0].vertex, float) @ matrix[:3, :3].T + matrix[:3, 3]
-        yield str(original.name or original.id), vertices, faces
+        vertices = np.asarray(primitives[0].vertex, float)
+        yield str(original.name or original.id), *placed(vertices, faces, matrix)

@@ -17,7 +17,13 @@ import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.arrays import first_equal_rows
-from jaxsmw.io.formats.polygons import MOST_VERTICES, Polygons, face_groups, unique_name, unique_names
+from jaxsmw.io.formats.polygons import (
+    Polygons,
+    check_number_of_vertices,
+    face_groups,
+    unique_name,
+    unique_names,
+)
 from jaxsmw.io.formats.text import damaged, excerpt, export_again
 from jaxsmw.io.mesh_data import COLORS, Skin
 from jaxsmw.runtime.files import read_bytes
@@ -162,8 +168,7 @@ class _Scene:
         vertices = document.floats(attributes.get("POSITION"), 3)
         n = len(vertices)
         self.vertices += n
-        if self.vertices > MOST_VERTICES:
-            raise InputError(f"describes more than {MOST_VERTICES} vertices: decimate the mesh.")
+        check_number_of_vertices(self.vertices)
         data = self._vertex_data(attributes, n)
         coordinates = None
         if "TEXCOORD_0" in attributes:

@@ -22,6 +22,10 @@ Formatted: TypeAlias = tuple[bytes, tuple[str, ...]]
 """The bytes of a file, and sentences about the data that it does not contain."""
 
 
+Part: TypeAlias = tuple[str, np.ndarray, np.ndarray]
+"""A named part of a scene: its vertices (n, 3), and its faces (f, 3) as indices of them."""
+
+
 class Polygons(NamedTuple):
     """The polygons of a file, and the data on them.
 
@@ -75,11 +79,23 @@ def triangles_of(
 
 
 # The largest number of vertices of a scene, in which a small file can repeat its meshes.
-MOST_VERTICES = 10**7
+_MOST_VERTICES = 10**7
 
 
-def joined(parts: Iterable[tuple[str, np.ndarray, np.ndarray]], notes: tuple[str, ...] = ()) -> Polygons:
-    """Join the named parts of a scene. The faces (f, 3) of a part are indices of its own vertices (n, 3)."""
+def check_number_of_vertices(number: int) -> None:
+    """Refuse a scene with too many vertices."""
+    if number > _MOST_VERTICES:
+        raise InputError(f"describes more than {_MOST_VERTICES} vertices: decimate the mesh.")
+
+
+def placed(vertices: np.ndarray, faces: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Apply a transform (4, 4) to vertices (n, 3), and keep the orientation of their faces (f, 3)."""
+    moved = vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    return moved, faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else faces
+
+
+def joined(parts: Iterable[Part]) -> Polygons:
+    """Join the parts of a scene."""
     names, vertices, faces, number = [], [], [], 0
     for name, of_part, corners in parts:
         if len(corners) and not are_vertices(corners, len(of_part)):
@@ -88,8 +104,7 @@ def joined(parts: Iterable[tuple[str, np.ndarray, np.ndarray]], notes: tuple[str
         vertices.append(of_part)
         faces.append(corners + number)
         number += len(of_part)
-        if number > MOST_VERTICES:
-            raise InputError(f"describes more than {MOST_VERTICES} vertices: decimate the mesh.")
+        check_number_of_vertices(number)
     if not names:
         raise InputError("contains no triangles: export the mesh again as triangles.")
     sizes = [len(of_part) for of_part in faces]
@@ -99,7 +114,6 @@ def joined(parts: Iterable[tuple[str, np.ndarray, np.ndarray]], notes: tuple[str
         np.concatenate(vertices),
         corners,
         np.full(sum(sizes), 3),
-        notes,
         face_data=face_data,
         label_names=label_names,
     )

@@ -25,6 +25,12 @@ def damaged(fault: str) -> InputError:
     return export_again(f"{fault}, so the file is damaged")
 
 
+def refuse_entities(xml: bytes) -> None:
+    """Raise a `ValueError` for XML that declares entities, which can expand without limit."""
+    if b"<!ENTITY" in xml:
+        raise ValueError
+
+
 def is_number(word: str, *, finite: bool = True) -> bool:
     """Return whether a word is a decimal number in the usual notation, such as `-1.5e3`.
 

@@ -16,8 +16,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jaxsmw.errors import InputError
-from jaxsmw.io.formats.polygons import Polygons, joined
-from jaxsmw.io.formats.text import damaged, excerpt, export_again
+from jaxsmw.io.formats.polygons import Part, Polygons, joined, placed
+from jaxsmw.io.formats.text import damaged, excerpt, export_again, refuse_entities
 from jaxsmw.runtime.files import largest_contents
 
 # The part of a package that lists its other parts, and the end of the type of the part with the model.
@@ -26,8 +26,6 @@ _RELATIONSHIPS, _MODEL = "_rels/.rels", "/3dmodel"
 _PATH = "{http://schemas.microsoft.com/3dmanufacturing/production/2015/06}path"
 # Objects of objects may be nested this deeply.
 _DEPTH = 32
-
-Part = tuple[str, np.ndarray, np.ndarray]
 
 
 def parse_3mf(data: bytes) -> Polygons:
@@ -68,8 +66,7 @@ class _Package:
         with _readable():
             content = self.archive.read(path)
         try:
-            if b"<!ENTITY" in content:
-                raise ValueError  # entities can expand without limit
+            refuse_entities(content)
             return ElementTree.fromstring(content)
         except (ElementTree.ParseError, ValueError, LookupError):
             raise damaged(f"the part {excerpt(path)} is not valid XML") from None
@@ -95,10 +92,7 @@ class _Package:
         vertices = _numbers(_children(shown, "mesh", "vertices", "vertex"), "xyz", float)
         faces = _numbers(_children(shown, "mesh", "triangles", "triangle"), ("v1", "v2", "v3"), int)
         if len(faces):
-            if np.linalg.det(matrix[:3, :3]) < 0:
-                faces = faces[:, ::-1]
-            placed = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-            yield shown.get("name") or f"object {number}", placed, faces
+            yield shown.get("name") or f"object {number}", *placed(vertices, faces, matrix)
 
 
 @contextmanager
@@ -110,13 +104,8 @@ def _readable() -> Iterator[None]:
 
 
 def _children(element: ElementTree.Element, *names: str) -> Iterator[ElementTree.Element]:
-    """Yield the elements below an element at a path of names, in any namespace."""
-    first, *others = names
-    for child in element.iterfind(f"{{*}}{first}"):
-        if others:
-            yield from _children(child, *others)
-        else:
-            yield child
+    """Return the elements below an element at a path of names, in any namespace."""
+    return element.iterfind("/".join(f"{{*}}{name}" for name in names))
 
 
 def _numbers(elements: Iterator[ElementTree.Element], names: tuple[str, ...] | str, kind: type) -> np.ndarray:

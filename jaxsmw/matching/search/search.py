@@ -114,12 +114,9 @@ def search(
     **Returns:** Maps that differ from each other, the most probable first.
     """
     outcome = outcome or run(preset.before_final, prepared.spectra, start)
-    reading, settings = Reading.of(prepared), preset.search
-    # Of asymmetric shapes, the wrong hand can have a good map, so both hands are compared. A shape that is
-    # nearly its own mirror image, such as a person, needs no second hand: its left stays its left.
-    both_hands = settings is not None and hypotheses and mirror == "auto" and reading.is_asymmetric()
-    if not both_hands:  # the first map belongs to one hand, which agreement with it would prefer
-        reading = reading.with_first(outcome.pointwise_map)
+    settings = preset.search
+    mirrors = settings is not None and hypotheses and mirror == "auto"
+    reading, both_hands = read_pair(prepared, outcome.pointwise_map, mirrors=mirrors)
     first = Judged.of(reading, outcome)
     if settings is None:
         return [first]
@@ -189,6 +186,21 @@ def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
 def _probable(parts: Float[np.ndarray, " c"], settings: SearchSettings) -> Bool[np.ndarray, " c"]:
     """Return which maps are not much less probable than the best one, given the share of each (c,)."""
     return parts >= settings.likely * parts.max(initial=0.0)
+
+
+def read_pair(
+    prepared: PreparedPair, first: Int64[np.ndarray, " m"], *, mirrors: bool
+) -> tuple[Reading, bool]:
+    """Return the reading of a pair with its first map (m,), and whether both hands must be compared.
+
+    Of asymmetric shapes, the wrong hand can have a good map, so both hands are compared if `mirrors` permits
+    it. The reading then has no first map, because agreement with this map would prefer its hand. A shape that
+    is nearly its own mirror image, such as a person, needs no second hand: its left stays its left.
+    """
+    reading = Reading.of(prepared)
+    if mirrors and reading.is_asymmetric():
+        return reading, True
+    return reading.with_first(first), False
 
 
 def readings_of(reading: Reading, *, both_hands: bool) -> list[Reading]:
