@@ -9,7 +9,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching.search.hypotheses import extremities, plausible_pairings
+from jaxsmw.matching.search.hypotheses import extremities, orientations, plausible_pairings
 from jaxsmw.matching.search.proxies import Proxy
 from jaxsmw.matching.shape import PreparedShape
 
@@ -82,6 +82,20 @@ def test_pairings_are_one_to_one_and_symmetric_in_both_bodies(creature):
         assert (pairing >= 0).all() and (pairing < [len(x.samples), len(y.samples)]).all()
     for one, other in zip(forward, backward, strict=True):
         assert set(map(tuple, one)) == set(map(tuple, other[:, ::-1]))
+
+
+def test_orientations_tell_the_belly_from_the_back(creature):
+    """The true counterpart has a similar orientation, and the mirror image the opposite one."""
+    pair, (x, vertices_x), _ = creature
+    proxies = reduced(pair.source), reduced(pair.target)
+    truth = pair.truth.nearest_corners(pair.target)
+    counterparts = proxies[1].samples.nearest[truth[proxies[0].samples.vertices]]
+    of_x = orientations(proxies[0], x.samples)
+    of_y = orientations(proxies[1], proxies[1].samples.nearest[truth[vertices_x]])[counterparts]
+    assert np.corrcoef(of_x.ravel(), of_y.ravel())[0, 1] > 0.8
+    assert np.abs(of_x).max() > 0.8 and np.abs(of_x).max() <= 1 + 1e-12
+    np.testing.assert_allclose(of_x, -of_x.transpose(0, 2, 1), atol=1e-12)
+    np.testing.assert_allclose(orientations(proxies[0].mirror(), x.samples), -of_x, atol=1e-9)
 
 
 def test_every_connected_component_has_extremities():

@@ -7,7 +7,7 @@ new kind is one more function.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import permutations
+from itertools import combinations, permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -24,9 +24,9 @@ Hypothesis = Callable[[Reading], Iterator[SampleMap]]
 
 # The sets of radii of SHOT, in units of 0.06, that give one hypothesis each.
 _SHOT_RADII = ((1,), (1, 2, 4), (2, 4), (4, 8))
-# The weights of positions after an alignment, of positions along principal axes, and of the relative
-# distances to extremities. SHOT has the weight 1.
-_ALIGNED, _ALONG_AXES, _TO_EXTREMITIES = 9.0, 10.0, 2.25
+# The weights of positions after an alignment, of positions along principal axes, of the relative distances to
+# extremities, and of the orientations with respect to extremities. SHOT has the weight 1.
+_ALIGNED, _ALONG_AXES, _TO_EXTREMITIES, _ORIENTED = 9.0, 10.0, 2.25, 0.3
 # The number of alignments that differ from each other, and of pairings of extremities: of the most plausible
 # ones, those with the most similar features.
 _ALIGNMENTS, _PLAUSIBLE, _PAIRINGS = 4, 64, 12
@@ -70,7 +70,8 @@ def by_principal_axes(reading: Reading) -> Iterator[SampleMap]:
 def by_extremities(reading: Reading) -> Iterator[SampleMap]:
     """Match samples at similar distances from paired extremities, for several pairings.
 
-    Pairings with the most similar features come first.
+    The belly and the back have the same distances, so orientations count as well. Pairings with the most
+    similar features come first.
     """
     if reading.prepared.pair.partial:
         return
@@ -81,10 +82,14 @@ def by_extremities(reading: Reading) -> Iterator[SampleMap]:
         side.distances[:, of_side.samples] / (side.areas @ side.distances[:, of_side.samples])
         for side, of_side in zip(both, ends, strict=True)
     ]
+    oriented = [orientations(side, of_side.samples) for side, of_side in zip(both, ends, strict=True)]
 
     def costs(pairing: Int64[np.ndarray, "l 2"], weight: float, rows: slice) -> Float[np.ndarray, "a b"]:
-        of_x, of_y = (distances[rows, side] for distances, side in zip(to_ends, pairing.T, strict=True))
-        return weight * shot[rows, rows] + _TO_EXTREMITIES * _squares(of_x, of_y)
+        first, second = pairing[list(combinations(range(len(pairing)), 2))].transpose(1, 2, 0)
+        distances = (of_side[rows, paired] for of_side, paired in zip(to_ends, pairing.T, strict=True))
+        turns = (of_side[rows, a, b] for of_side, a, b in zip(oriented, first, second, strict=True))
+        cost = weight * shot[rows, rows] + _TO_EXTREMITIES * _squares(*distances)
+        return cost + _ORIENTED * _squares(*turns)
 
     def residual(pairing: Int64[np.ndarray, "l 2"]) -> float:
         rows = slice(None, None, 3)  # a third of the samples is enough for a comparison
@@ -176,6 +181,34 @@ def extremities(proxy: Proxy) -> Extremities:
     ends = ends[np.argsort(-remoteness[ends], kind="stable")][:_MOST]
     unit = max(remoteness[ends].mean(), np.finfo(np.float64).tiny)
     return Extremities(ends, distances[np.ix_(ends, ends)] / unit, remoteness[ends] / unit)
+
+
+def orientations(proxy: Proxy, ends: Int64[np.ndarray, " e"]) -> Float[np.ndarray, "s e e"]:
+    """Return on which side of a body each sample is, with respect to each two of e extremities.
+
+    The directions away from two extremities and the normal span a volume, which is positive on one side of
+    the body, such as the belly, and negative on the other. The direction away from an extremity is the
+    gradient of the distance from it, by linear regression on the patch around the sample. The measure is the
+    orientation of Ren et al. (2018), "Continuous and orientation-preserving correspondences via functional
+    maps".
+
+    **Returns:** The signed volumes (s, e, e) for unit vectors, from -1 to 1. The volumes of the mirror image
+    have the opposite signs.
+    """
+    values = np.hstack([proxy.positions, proxy.distances[:, ends]])
+    means, products = proxy.patches @ values, np.einsum("sa,sv->sav", proxy.positions, values)
+    covariances = (proxy.patches @ products.reshape(len(values), -1)).reshape(products.shape)
+    covariances -= np.einsum("sa,sv->sav", means[:, :3], means)
+    moments, slopes = covariances[..., :3], covariances[..., 3:]
+    sizes = np.maximum(np.trace(moments, axis1=1, axis2=2), np.finfo(float).tiny)
+    # A flat patch does not tell how distances change along its normal.
+    gradients = np.linalg.solve(moments + _FLAT * sizes[:, None, None] * np.eye(3), slopes).transpose(0, 2, 1)
+    gradients /= np.maximum(np.linalg.norm(gradients, axis=2, keepdims=True), np.finfo(float).tiny)
+    return np.einsum("sia,sja->sij", np.cross(proxy.normals[:, None], gradients), gradients)
+
+
+# The regularisation of the regression, as a share of the variance of a patch.
+_FLAT = 0.02
 
 
 def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:

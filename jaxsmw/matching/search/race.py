@@ -85,8 +85,9 @@ def race(
         moved += new
     if all(reading.prepared.pair.partial for reading in readings):
         return list(different(found))  # registration moves a part away from its place on a different body
-    best = islice(different(found), _REGISTERED)
-    return list(different(_refined([_Task.of(one) for one in best], _LAST_STAGES)))
+    best = list(islice(different(found), _REGISTERED))
+    # Registration improves most maps. It makes a limb of others collapse, so they stay as they were as well.
+    return list(different([*best, *_refined([_Task.of(one) for one in best], _LAST_STAGES)]))
 
 
 def hand_evidence(reading: Reading) -> float:
