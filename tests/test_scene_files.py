@@ -70,7 +70,13 @@ def test_an_object_of_another_part_of_a_package_is_found(tmp_path):
 
 ITEM = '<item objectid="1"/>'
 ONE = f'<object id="1">{mesh_of()}</object>'
+TWICE = "".join(
+    f'<object id="{i}"><components>' + 2 * f'<component objectid="{i - 1}"/>' + "</components></object>"
+    for i in range(2, 31)
+)
 HOSTILE = {
+    "nothing many times": (('<object id="1"/>' + TWICE, '<item objectid="30"/>'), {}, "contains no triangles"),
+    "much many times": ((ONE + TWICE, '<item objectid="30"/>'), {}, "unpacks to more bytes than any mesh needs"),
     "no objects": (("", ""), {}, "contains no triangles"),
     "no such object": (("", ITEM), {}, "the object '1' does not exist"),
     "no model": ((ONE, ITEM), {"relationships": "<a/>"}, "does not name its 3D model"),

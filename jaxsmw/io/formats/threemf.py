@@ -26,6 +26,8 @@ _RELATIONSHIPS, _MODEL = "_rels/.rels", "/3dmodel"
 _PATH = "{http://schemas.microsoft.com/3dmanufacturing/production/2015/06}path"
 # Objects of objects may be nested this deeply.
 _DEPTH = 32
+# What each use of a mesh counts beside its bytes, so that no file can nest small objects nearly without end.
+_OVERHEAD = 100_000
 
 
 def parse_3mf(data: bytes) -> Polygons:
@@ -41,12 +43,13 @@ class _Package:
             self.archive = zipfile.ZipFile(io.BytesIO(data))
         self.budget = largest_contents(len(data))
         self.models: dict[str, ElementTree.Element] = {}
+        self.objects: dict[tuple[str, str | None], list[Part]] = {}
 
     def build(self) -> Iterator[Part]:
         """Yield the meshes of all objects of the build."""
         root = self.root()
         for item in _children(self.model(root), "build", "item"):
-            yield from self.meshes(root, item, np.eye(4), 0)
+            yield from self.used(root, item, 0)
 
     def root(self) -> str:
         """Return the path of the part with the model."""
@@ -58,11 +61,9 @@ class _Package:
     def xml(self, path: str) -> ElementTree.Element:
         """Return the XML of a part."""
         try:
-            self.budget -= self.archive.getinfo(path).file_size
+            self.spend(self.archive.getinfo(path).file_size)
         except KeyError:
             raise damaged(f"the package has no part {excerpt(path)}") from None
-        if self.budget < 0:
-            raise InputError("unpacks to more bytes than any mesh needs: export the mesh again.")
         with _readable():
             content = self.archive.read(path)
         try:
@@ -76,23 +77,36 @@ class _Package:
             self.models[path] = self.xml(path)
         return self.models[path]
 
-    def meshes(self, path: str, use: ElementTree.Element, above: np.ndarray, depth: int) -> Iterator[Part]:
-        """Yield the name, the vertices (n, 3) and the faces (f, 3) of the meshes that an element uses."""
+    def spend(self, number_of_bytes: int) -> None:
+        self.budget -= number_of_bytes
+        if self.budget < 0:
+            raise InputError("unpacks to more bytes than any mesh needs: export the mesh again.")
+
+    def used(self, path: str, use: ElementTree.Element, depth: int) -> list[Part]:
+        """Return the name, the vertices (n, 3) and the faces (f, 3) of the meshes that an element uses."""
+        path = normpath(join("/", use.get(_PATH, path))).lstrip("/")
+        meshes, matrix = self.meshes(path, use.get("objectid"), depth), _matrix(use.get("transform"))
+        self.spend(sum(_OVERHEAD + vertices.nbytes + faces.nbytes for _, vertices, faces in meshes))
+        return [(name, *placed(vertices, faces, matrix)) for name, vertices, faces in meshes]
+
+    def meshes(self, path: str, number: str | None, depth: int) -> list[Part]:
+        """Return the meshes of an object, which is read once even if it is used many times."""
         if depth > _DEPTH:
             raise damaged("objects contain themselves")
-        path = normpath(join("/", use.get(_PATH, path))).lstrip("/")
-        matrix, number = above @ _matrix(use.get("transform")), use.get("objectid")
-        for shown in _children(self.model(path), "resources", "object"):
-            if shown.get("id") == number:
-                break
-        else:
-            raise damaged(f"the object {excerpt(str(number))} does not exist")
-        for component in _children(shown, "components", "component"):
-            yield from self.meshes(path, component, matrix, depth + 1)
-        vertices = _numbers(_children(shown, "mesh", "vertices", "vertex"), "xyz", float)
-        faces = _numbers(_children(shown, "mesh", "triangles", "triangle"), ("v1", "v2", "v3"), int)
-        if len(faces):
-            yield shown.get("name") or f"object {number}", *placed(vertices, faces, matrix)
+        if (path, number) not in self.objects:
+            for shown in _children(self.model(path), "resources", "object"):
+                if shown.get("id") == number:
+                    break
+            else:
+                raise damaged(f"the object {excerpt(str(number))} does not exist")
+            components = _children(shown, "components", "component")
+            found = [mesh for component in components for mesh in self.used(path, component, depth + 1)]
+            vertices = _numbers(_children(shown, "mesh", "vertices", "vertex"), "xyz", float)
+            faces = _numbers(_children(shown, "mesh", "triangles", "triangle"), ("v1", "v2", "v3"), int)
+            if len(faces):
+                found.append((shown.get("name") or f"object {number}", vertices, faces))
+            self.objects[path, number] = found
+        return self.objects[path, number]
 
 
 @contextmanager
