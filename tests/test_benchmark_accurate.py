@@ -85,7 +85,7 @@ CASES = (whole, given, part, mirrored, other_init, coarse, fused)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", first_always(CASES, always=3), ids=lambda case: case.__name__)
+@pytest.mark.parametrize("case", first_always(CASES, always=2), ids=lambda case: case.__name__)
 def test_the_method_accurate_gives_the_map_of_match(case, tmp_path):
     source, target, shows, partial, init = case()
     files = tmp_path / "x.off", tmp_path / "y.off"

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.io
 from messages import refused
+from sampled_cases import first_always
 from synthetic import bumpy_mesh, grid_mesh
 
 from jaxsmw import InputError, read_mesh
@@ -403,7 +404,7 @@ TRAINING = {"faust_r"}
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.* are vertices that no face")
-@pytest.mark.parametrize("name", REAL)
+@pytest.mark.parametrize("name", first_always(reversed(REAL)))
 def test_real_data_sets_are_recognised(shared, name):
     layout, pairs = REAL[name]
     data_set = open_data_set(shared / "data" / name)

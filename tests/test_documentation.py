@@ -175,7 +175,7 @@ def test_example_table_1(pair, tmp_path):
         assert comparison.errors("mwp").mean() < comparison.errors("initial").mean()
 
 
-@pytest.mark.slow
+@pytest.mark.sampled
 def test_example_table_1_on_real_shapes(shared, tmp_path):
     (tmp_path / "data").symlink_to(shared / "data")
     table = run_example("table_1", tmp_path, NUMBER_OF_PAIRS=1)["table"]
