@@ -6,7 +6,7 @@
 `DATA_DIRECTORY` contains the data sets of `docs/datasets.md`. The script draws N pairs of each kind of
 `scripts/judged_pairs.py`. `search` always runs all hypotheses, and returns maps that differ from each other.
 
-The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence.probabilities`, and the
+The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence`, and the
 script maximises their likelihood. It prints the weights of all kinds together. For the tables of results, the
 maps of each kind are judged by the weights of all other kinds. With `--maps`, the evidence is kept in a file,
 and a later run continues there.
@@ -27,7 +27,7 @@ from judged_pairs import Judged, KnownPair, count_table, is_right, known_pairs, 
 from scipy.optimize import minimize
 
 from jaxsmw.benchmark.tables import markdown
-from jaxsmw.matching.search.evidence import probabilities
+from jaxsmw.matching.search.evidence import probability, shares
 from jaxsmw.matching.search.search import search
 from jaxsmw.runtime.provenance import made_with
 
@@ -71,7 +71,8 @@ def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
 
 def shares_of(pair: JudgedPair, weights: Float[np.ndarray, " f"]) -> Float[np.ndarray, " c"]:
     """Return the probability of each map of a pair to be right."""
-    return probabilities((features(pair.evidence) @ weights).tolist())
+    log_odds = (features(pair.evidence) @ weights).tolist()
+    return shares(log_odds) * probability(max(log_odds))
 
 
 def fitted(pairs: Sequence[JudgedPair]) -> Float[np.ndarray, " f"]:

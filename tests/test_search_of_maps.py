@@ -23,7 +23,7 @@ from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.alternatives import alternatives
-from jaxsmw.matching.search.evidence import Evidence, deformation, discontinuity, probabilities, shares
+from jaxsmw.matching.search.evidence import Evidence, deformation, discontinuity, probability, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, race
 from jaxsmw.matching.search.reading import Reading
@@ -195,13 +195,13 @@ def test_the_true_map_has_better_evidence_than_wrong_maps(pair):
     assert right.log_odds > 0 > other.log_odds
 
 
-def test_different_maps_share_the_probability_of_the_best_one():
-    assert probabilities([0.0]) == pytest.approx(0.5)
-    assert probabilities([-np.inf]) == 0
-    np.testing.assert_allclose(probabilities([0.0, 0.0]), 1 / 4)
-    np.testing.assert_allclose(probabilities([2000.0, 1990.0, -np.inf]), [1, 0, 0], atol=1e-9)
-    assert probabilities([1.0, 0.9]).sum() == pytest.approx(probabilities([1.0])[0])
-    assert len(probabilities([])) == 0
+def test_different_maps_share_the_probability():
+    assert probability(0.0) == 0.5 and probability(-np.inf) == 0 and probability(40.0) == pytest.approx(1)
+    np.testing.assert_allclose(shares([1.0, 1.0]), 1 / 2)
+    np.testing.assert_allclose(shares([2000.0, 1990.0, -np.inf]), [1, 0, 0], atol=1e-9)
+    assert shares([1.0, 0.9])[0] / shares([1.0, 0.9])[1] == pytest.approx(np.exp(0.5))
+    np.testing.assert_allclose(shares([-np.inf, -np.inf]), 0)
+    assert len(shares([])) == 0
 
 
 def test_of_equal_maps_the_more_consistent_one_is_preferred():

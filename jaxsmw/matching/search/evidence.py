@@ -125,16 +125,11 @@ def shares(
 
 
 def probability(log_odds: float) -> float:
-    """Return the probability with the given log-odds."""
-    return float(1 / (1 + np.exp(-log_odds)))
+    """Return the probability with the given log-odds.
 
-
-def probabilities(log_odds: Sequence[float]) -> Float[np.ndarray, " c"]:
-    """Return the probability of each of several different maps to be right, given the log-odds of each (c,).
-
-    The log-odds of the best map say how probable it is that one of the maps is right.
+    The log-odds of the best map of a pair say how probable it is that one of its maps is right.
     """
-    return shares(log_odds) * probability(max(log_odds, default=0.0))
+    return float(1 / (1 + np.exp(-log_odds)))
 
 
 def discontinuity(source: Proxy, target: Proxy, matches: SampleMap, areas: Float[np.ndarray, " s"]) -> float:
