@@ -22,7 +22,7 @@ from jaxsmw.matching.judge import area_shape_difference, detours, distortion, st
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probability, shares
+from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probabilities, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import Candidate, Kind, different, race
 from jaxsmw.matching.search.reading import Reading
@@ -35,6 +35,8 @@ logger = logging.getLogger("jaxsmw")
 # One mesh can be a part of the other if its boundary is so long, relative to the square root of its area, and
 # longer than that of the other by this factor.
 _LONG, _LONGER = 0.4, 1.5
+# The largest number of races. The maps of the first race, refined at all vertices, are mended by the second.
+_ROUNDS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,15 +121,24 @@ def search(
     if settings is None:
         return [first]
     judged = [first]
-    if both_hands or not _ends_the_search(first, settings):
+    certain = _ends_the_search(first, settings) and not both_hands
+    readings = readings_of(reading, both_hands=both_hands) if hypotheses and not certain else [reading]
+    for number in range(_ROUNDS):
+        if certain:
+            break
         logger.info("the map is uncertain, so other maps are tried ...")
-        readings = readings_of(reading, both_hands=both_hands) if hypotheses else [reading]
-        candidates = race(readings, judged, HYPOTHESES if hypotheses else ())
+        candidates = race(readings, judged, HYPOTHESES if hypotheses and number == 0 else ())
         # A twin can be better if it reads the pair in another way.
-        rivals = _likely([one for one in different([first, *candidates]) if one is not first], settings)
-        # The rivals have passed the race as well, so the first map passes the stages once more.
-        again = [_refined(one, preset) for one in (first, *rivals)] if rivals else []
-        judged = list(different([one for one in again if one.outcome.successful] or judged))
+        new = [one for one in different([*judged, *candidates]) if one not in judged]
+        likely = _likely(new, settings)
+        if not likely:
+            break
+        if number == 0:  # The rivals have passed the race as well.
+            again = _refined(first, preset)
+            judged = [again] if again.outcome.successful else judged
+        refined = [_refined(one, preset) for one in likely]
+        judged = list(different([*judged, *refined]))
+        certain = _certain(judged, settings)
     # Further passes make some wrong maps nearly as good as the right one, so the evidence before them counts.
     before = _shares_of(judged)
     probable = _probable(before, settings)
@@ -152,12 +163,17 @@ def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
     The probability alone does not suffice, because a map that exchanges two limbs of an animal can be as good
     on most patches as a right map of other animals. Such a map is not nearly isometric.
     """
-    if probability(first.log_odds) < settings.certain:
+    if not _certain([first], settings):
         return False
     if settings.certain == 0:
         return True
     prepared = first.reading.prepared
     return distortion(prepared.pair, first.pointwise_map, prepared.x.spectrum) <= settings.certain_distortion
+
+
+def _certain(judged: Sequence[Judged], settings: SearchSettings) -> bool:
+    """Return whether the best map is right with a large enough probability."""
+    return bool(probabilities([one.log_odds for one in judged]).max() >= settings.certain)
 
 
 def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
