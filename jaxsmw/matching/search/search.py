@@ -22,7 +22,7 @@ from jaxsmw.matching.judge import area_shape_difference, detours, distortion, st
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probabilities, shares
+from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probability, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import Candidate, Kind, different, race
 from jaxsmw.matching.search.reading import Reading
@@ -173,7 +173,8 @@ def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
 
 def _certain(judged: Sequence[Judged], settings: SearchSettings) -> bool:
     """Return whether the best map is right with a large enough probability."""
-    return bool(probabilities([one.log_odds for one in judged]).max() >= settings.certain)
+    log_odds = [one.log_odds for one in judged]
+    return bool(shares(log_odds).max() * probability(max(log_odds)) >= settings.certain)
 
 
 def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
