@@ -199,8 +199,8 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
-    outputs = options.registered, options.landmarks_output, options.attributes, options.overlay_output
-    outputs += options.volume_output, options.map_output, options.blend_shapes_output, options.report
+    outputs = [options.registered, options.landmarks_output, options.attributes, options.overlay_output]
+    outputs += [options.volume_output, options.map_output, options.blend_shapes_output, options.report]
     if not any(outputs):
         raise InputError(
             "nothing to write: give --registered FILE, --attributes FILE, --map-output FILE, --report DIR, "

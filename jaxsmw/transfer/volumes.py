@@ -75,7 +75,7 @@ def transfer_volume(volume: Volume, registered: RegisteredMesh) -> TransferredVo
     mesh_x, mesh_y = registered.mesh_x, registered.mesh_y
     points, distances = nearest_surface_points(vertices, mesh_x)
     # The vertices of the boundary, and those of no tetrahedron.
-    outer = np.ones(len(vertices), bool)
+    outer = np.ones(len(vertices), dtype=bool)
     outer[tets] = False
     outer[igl.boundary_facets(tets)[0]] = True
     near = outer & (distances <= _NEAR * bounding_box_diagonal(mesh_x))
@@ -138,7 +138,7 @@ def _without_inversions(
     The content of a tetrahedron with edges D and original edges E is the square root of the determinant of
     DᵀD + α EᵀE. It is smooth, and larger for an inverted tetrahedron than for the space that it covers.
     """
-    near = np.zeros(len(vertices), bool)
+    near = np.zeros(len(vertices), dtype=bool)
     near[tets[hand * signed_volumes(positions, tets) <= 0]] = True
     for _ in range(_RINGS):
         near[tets[near[tets].any(axis=1)]] = True
