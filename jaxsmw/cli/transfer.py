@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from jaxsmw.io.landmarks import Landmarks
     from jaxsmw.io.mesh_data import MeshData, Overlay
+    from jaxsmw.io.volumes import Volume
     from jaxsmw.matching.correspondence import Correspondence
     from jaxsmw.transfer.landmarks import TransferredLandmarks
     from jaxsmw.transfer.registered_mesh import RegisteredMesh
@@ -55,6 +56,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "name and a position per line",
             "--landmarks-output FILE": "write the landmarks on the target to this file, in one of these "
             "formats except .mps",
+            "--volume FILE": "tetrahedral mesh inside the source, such as a finite-element model, whose "
+            "boundary lies at the surface: .vtu, .vtk, .msh of Gmsh, .mesh of Medit, or .inp of Abaqus",
+            "--volume-output FILE": "write the volume inside the target to this file, in one of these "
+            "formats",
             "--blend-shapes DIR": "blend shapes of the source: a folder of OBJ files with its vertices in "
             "the same order. They are part of the attributes",
             "--blend-shapes-output DIR": "write the target in each blend shape of the source to this folder, "
@@ -126,6 +131,7 @@ def run(options: argparse.Namespace) -> None:
         _check(options)
     from jaxsmw.io.blend_shapes import read_blend_shapes
     from jaxsmw.io.meshes import read_mesh_data
+    from jaxsmw.io.volumes import read_volume
 
     with stopwatch.step("reading"):
         source, target = (
@@ -147,6 +153,7 @@ def run(options: argparse.Namespace) -> None:
                 "skin or other data) for --attributes: leave the option out, or give a source that has some."
             )
         landmarks = _read_landmarks(options, source) if options.landmarks else None
+        volume = read_volume(options.volume) if options.volume else None
     correspondence, registered = _register(options, source, target, stopwatch)
     if correspondence is not None:
         show_quality(correspondence)
@@ -165,6 +172,8 @@ def run(options: argparse.Namespace) -> None:
     if options.registered or options.attributes or options.blend_shapes_output:
         _write_meshes(options, source, target, registered, stopwatch)
     _write_overlays(options, bare, overlays, registered, stopwatch)
+    if volume:
+        _transfer_volume(options.volume_output, volume, registered, stopwatch)
     transferred = None
     if landmarks:
         expected = None if correspondence is None else correspondence.expected_error()
@@ -190,12 +199,16 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace) -> None:
     """Check the options and outputs before the long computation, and import the libraries."""
-    outputs = options.registered, options.landmarks_output, options.attributes, options.overlay_output
-    if not (any(outputs) or options.map_output or options.blend_shapes_output or options.report):
+    outputs = [options.registered, options.landmarks_output, options.attributes, options.overlay_output]
+    outputs += [options.volume_output, options.map_output, options.blend_shapes_output, options.report]
+    if not any(outputs):
         raise InputError(
             "nothing to write: give --registered FILE, --attributes FILE, --map-output FILE, --report DIR, "
-            "--landmarks FILE with --landmarks-output FILE, or --overlay FILE with --overlay-output FILE."
+            "--landmarks FILE with --landmarks-output FILE, --overlay FILE with --overlay-output FILE, or "
+            "--volume FILE with --volume-output FILE."
         )
+    refuse_without(options, "--volume", bool(options.volume), "volume_output")
+    refuse_without(options, "--volume-output", bool(options.volume_output), "volume")
     if options.overlay_output and len(options.overlay_output) != len(options.overlay):
         raise InputError(
             f"--overlay-output is given {len(options.overlay_output)} times and --overlay "
@@ -225,6 +238,7 @@ def _check(options: argparse.Namespace) -> None:
     from jaxsmw.io.maps import check_map_name
     from jaxsmw.io.meshes import check_attribute_suffix, check_mesh_suffix
     from jaxsmw.io.overlays import check_overlay_name
+    from jaxsmw.io.volumes import check_volume_suffix
 
     if options.registered:
         check_mesh_suffix(options.registered)
@@ -238,15 +252,17 @@ def _check(options: argparse.Namespace) -> None:
         check_map_name(options.map_output)
     for file in options.overlay_output:
         check_overlay_name(file)
+    for file in filter(None, (options.volume, options.volume_output)):
+        check_volume_suffix(file)
     inputs = [options.source, options.target, options.map, options.landmarks, *options.init.files]
-    inputs += options.overlay
+    inputs += [*options.overlay, options.volume]
     check_inputs(*inputs)
     check_outputs(
         [*inputs, options.blend_shapes],
         directories=[(options.blend_shapes_output, [])] if options.blend_shapes_output else [],
         files=[
             *(options.registered, options.attributes, options.landmarks_output, options.map_output),
-            *options.overlay_output,
+            *(*options.overlay_output, options.volume_output),
         ],
         report=options.report,
     )
@@ -348,6 +364,23 @@ def _register(
         scale = pair.scale if pair.partial else None
         points = points_of_map(*meshes, pointwise_map, scale=scale)
         return None, register_mesh(*meshes, points, stiffness=stiffness, scale=scale)
+
+
+def _transfer_volume(file: str, volume: Volume, registered: RegisteredMesh, stopwatch: Stopwatch) -> None:
+    """Transfer a volume, write it, and warn about inverted tetrahedra."""
+    from jaxsmw.io.volumes import write_volume
+    from jaxsmw.transfer.volumes import transfer_volume
+
+    with stopwatch.step("volume", announced=True):
+        transferred = transfer_volume(volume, registered)
+        notes = write_volume(file, transferred.volume)
+    for sentence in transferred.sentences():
+        show(sentence)
+    if transferred.inverted.any():
+        say("warning: inverted tetrahedra remain: refine the volume there, or repair it with a mesher.")
+    for note in notes:
+        say(f"note: {file}: {note}")
+    report_written(file)
 
 
 def _transfer_landmarks(

@@ -7,6 +7,7 @@ from .mesh_data import LabelTable, MeshData, Overlay, Skin, Texture
 from .meshes import read_mesh, read_mesh_data, write_mesh, write_mesh_data
 from .overlays import read_overlay, write_overlay
 from .spectra import make_spectrum, read_functional_map, read_spectrum, write_functional_map, write_spectrum
+from .volumes import Volume, read_volume, write_volume
 
 __all__ = [
     "FrameDistances",
@@ -18,6 +19,7 @@ __all__ = [
     "Overlay",
     "Skin",
     "Texture",
+    "Volume",
     "check_frame",
     "find_frame",
     "make_functional_map",
@@ -32,6 +34,7 @@ __all__ = [
     "read_overlay",
     "read_pointwise_map",
     "read_spectrum",
+    "read_volume",
     "to_geomfum",
     "to_pyfm",
     "to_torch",
@@ -43,4 +46,5 @@ __all__ = [
     "write_overlay",
     "write_pointwise_map",
     "write_spectrum",
+    "write_volume",
 ]

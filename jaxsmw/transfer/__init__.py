@@ -1,4 +1,4 @@
-"""Transfer of positions, landmarks and attributes from one mesh to another by a map."""
+"""Transfer of positions, landmarks, volumes and attributes from one mesh to another by a map."""
 
 import lazy_loader
 
