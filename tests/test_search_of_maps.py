@@ -24,7 +24,7 @@ from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import prepare
 from jaxsmw.matching.search.alternatives import alternatives
 from jaxsmw.matching.search.evidence import Evidence, deformation, discontinuity, probability, shares
-from jaxsmw.matching.search.hypotheses import HYPOTHESES
+from jaxsmw.matching.search.hypotheses import HYPOTHESES, by_extremities
 from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, race
 from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.search.search import Judged, search
@@ -279,6 +279,13 @@ def test_the_best_map_of_the_race_is_the_same_in_any_position(pair, winner_elsew
     found = winner(read(mesh_x, mesh_y))
     assert mean_error(mesh_y, found, truth) < 0.08
     assert mean_error(mesh_y, found, winner_elsewhere) < 0.02
+
+
+def test_one_extremity_has_no_orientation(pair, monkeypatch):
+    monkeypatch.setattr("jaxsmw.matching.search.hypotheses._MOST", 1)
+    reading = read(*pair[:2])
+    (matches,) = by_extremities(reading)
+    assert matches.shape == reading.x.areas.shape and matches.max() < len(reading.y.areas)
 
 
 def test_known_maps_take_part_in_the_race(pair):

@@ -7,7 +7,7 @@ new kind is one more function.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import combinations, permutations
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -85,7 +85,7 @@ def by_extremities(reading: Reading) -> Iterator[SampleMap]:
     oriented = [orientations(side, of_side.samples) for side, of_side in zip(both, ends, strict=True)]
 
     def costs(pairing: Int64[np.ndarray, "l 2"], weight: float, rows: slice) -> Float[np.ndarray, "a b"]:
-        first, second = pairing[list(combinations(range(len(pairing)), 2))].transpose(1, 2, 0)
+        first, second = (pairing[numbers].T for numbers in np.triu_indices(len(pairing), 1))
         distances = (of_side[rows, paired] for of_side, paired in zip(to_ends, pairing.T, strict=True))
         turns = (of_side[rows, a, b] for of_side, a, b in zip(oriented, first, second, strict=True))
         cost = weight * shot[rows, rows] + _TO_EXTREMITIES * _squares(*distances)
