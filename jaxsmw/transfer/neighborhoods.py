@@ -42,6 +42,11 @@ class Similarities(NamedTuple):
     rotations: Float64[np.ndarray, "n 3 3"]
     scales: Float64[np.ndarray, " n"]
 
+    @property
+    def hand(self) -> float:
+        """-1 if the transformations include a reflection, otherwise 1."""
+        return float(np.sign(np.linalg.det(self.rotations[0])))
+
     def of_vectors(self, vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
         """Return the vector at each vertex (n, 3), rotated and scaled."""
         return self.scales[:, None] * np.einsum("nij,nj->ni", self.rotations, vectors)

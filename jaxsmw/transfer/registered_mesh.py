@@ -113,12 +113,7 @@ class RegisteredMesh:
     @cached_property
     def _normals(self) -> Float64[np.ndarray, "m 3"]:
         """The vertex normals of the registered mesh, oriented like the normals of Y."""
-        return self._hand * self.mesh.vertex_normals
-
-    @property
-    def _hand(self) -> float:
-        """-1 if the similarity transformations include a reflection, otherwise 1."""
-        return float(np.sign(np.linalg.det(self.similarities.rotations[0])))
+        return self.similarities.hand * self.mesh.vertex_normals
 
     @cached_property
     def distances(self) -> Float64[np.ndarray, " m"]:
@@ -184,13 +179,13 @@ class RegisteredMesh:
         """
         positions = check_surface_points(points, self.mesh_y, "points").positions(self.mesh_y)
         nearest, _ = nearest_surface_points(positions, self.mesh)
-        normals = self._hand * points.interpolate(self.mesh_y.vertex_normals, self.mesh_y)
+        normals = self.similarities.hand * points.interpolate(self.mesh_y.vertex_normals, self.mesh_y)
         return nearest_facing_points(positions, normals, nearest, self.mesh)
 
     @cached_property
     def points_of_target(self) -> SurfacePoints:
         """The point of X for each vertex of Y, as by `project_back`: n `SurfacePoints`."""
-        normals = self._hand * self.mesh_y.vertex_normals
+        normals = self.similarities.hand * self.mesh_y.vertex_normals
         return nearest_facing_points(self.mesh_y.vertices, normals, self._nearest_of_target[0], self.mesh)
 
     @cached_property
@@ -461,10 +456,9 @@ def _flipped_faces(
 ) -> Bool[np.ndarray, " f"]:
     """Return the mask `RegisteredMesh.flipped_faces`, given the normals of the source's faces."""
     rotations = similarities.rotations
-    hand = np.sign(np.linalg.det(rotations[0]))
     first, second, third = mesh_x.faces.T
     sums = rotations[first] + rotations[second] + rotations[third]
-    return hand * np.einsum("fi,fij,fj->f", _normals(positions, mesh_x), sums, normals) < 0
+    return similarities.hand * np.einsum("fi,fij,fj->f", _normals(positions, mesh_x), sums, normals) < 0
 
 
 def _normals(vertices: Float64[np.ndarray, "n 3"], mesh: Mesh) -> Float64[np.ndarray, "f 3"]:

@@ -76,7 +76,7 @@ def follow_surroundings(
     parts, others = _Components(mesh_x), _Components(mesh_y)
     rows, of_row = parts.rows, parts.of_row
     scales = parts.mean(similarities.scales[rows])
-    hand = np.sign(np.linalg.det(similarities.rotations[0]))
+    hand = similarities.hand
     rotations = hand * nearest_rotations(hand * parts.mean(similarities.rotations[rows]))[0]
     centers, radii = parts.mean(positions[rows]), scales * parts.radii
     counterparts = _counterparts(

@@ -91,14 +91,13 @@ def transfer_volume(volume: Volume, registered: RegisteredMesh) -> TransferredVo
     _, part = connected_components(edges, len(vertices))
     fixed = near | (outer & ~np.isin(part, part[near]))
     images = _images(vertices[fixed], SurfacePoints(points.faces[fixed], points.weights[fixed]), registered)
-    rotation = registered.similarities.rotations[0]
-    hand = np.sign(np.linalg.det(rotation) * signed_volumes(vertices, tets[:1])[0])
+    hand = registered.similarities.hand * np.sign(signed_volumes(vertices, tets[:1])[0])
     with one_blas_thread():
         positions = _harmonic(vertices, tets, fixed, images)
         positions = _without_inversions(vertices, positions, tets, fixed, hand)
     inverted = hand * signed_volumes(positions, tets) <= 0
-    name, mirrored = f"{volume.name} on {mesh_y.name}", bool(np.linalg.det(rotation) < 0)
-    return TransferredVolume(volume.at(positions, name, mirrored=mirrored), near, inverted)
+    moved = volume.at(positions, f"{volume.name} on {mesh_y.name}", mirrored=registered.similarities.hand < 0)
+    return TransferredVolume(moved, near, inverted)
 
 
 def _images(
