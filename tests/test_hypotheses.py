@@ -9,7 +9,7 @@ from jaxsmw.geometry.eigenbasis import compute_spectrum
 from jaxsmw.geometry.geodesics import geodesic_distances
 from jaxsmw.geometry.mesh import make_mesh
 from jaxsmw.geometry.surface_points import SurfacePoints
-from jaxsmw.matching.search.hypotheses import extremities, orientations, plausible_pairings
+from jaxsmw.matching.search.hypotheses import plausible_pairings
 from jaxsmw.matching.search.proxies import Proxy
 from jaxsmw.matching.shape import PreparedShape
 
@@ -21,8 +21,7 @@ def reduced(mesh, unit=None):
 def ends_of(mesh):
     """The extremities of a mesh, and their vertices."""
     proxy = reduced(mesh)
-    found = extremities(proxy)
-    return found, proxy.samples.vertices[found.samples]
+    return proxy.extremities, proxy.samples.vertices[proxy.extremities.samples]
 
 
 @pytest.fixture(scope="module")
@@ -90,12 +89,12 @@ def test_orientations_tell_the_belly_from_the_back(creature):
     proxies = reduced(pair.source), reduced(pair.target)
     truth = pair.truth.nearest_corners(pair.target)
     counterparts = proxies[1].samples.nearest[truth[proxies[0].samples.vertices]]
-    of_x = orientations(proxies[0], x.samples)
-    of_y = orientations(proxies[1], proxies[1].samples.nearest[truth[vertices_x]])[counterparts]
+    of_x = proxies[0].orientations(x.samples)
+    of_y = proxies[1].orientations(proxies[1].samples.nearest[truth[vertices_x]])[counterparts]
     assert np.corrcoef(of_x.ravel(), of_y.ravel())[0, 1] > 0.8
     assert np.abs(of_x).max() > 0.8 and np.abs(of_x).max() <= 1 + 1e-12
     np.testing.assert_allclose(of_x, -of_x.transpose(0, 2, 1), atol=1e-12)
-    np.testing.assert_allclose(orientations(proxies[0].mirror(), x.samples), -of_x, atol=1e-9)
+    np.testing.assert_allclose(proxies[0].mirror().orientations(x.samples), -of_x, atol=1e-9)
 
 
 def test_every_connected_component_has_extremities():

@@ -180,26 +180,6 @@ def edge_lengths(
     return before, after
 
 
-# The largest change in length of an edge that counts, in the same units. The two ends of an edge that a map
-# tears can be any distance apart.
-_MOST_CHANGE = 0.1
-
-
-def stretch(pair: Pair, pointwise_map: Int64[np.ndarray, " m"]) -> float:
-    """Measure how much a map changes the lengths of edges of X.
-
-    A map that exchanges two limbs stretches the surface between them. The right map between two poses of a
-    body stretches little, even if it bends patches more. (Entry R49 of docs/research_log.md)
-
-    **Returns:** The root mean square of the changes in length, in the units of `edge_lengths`. An edge counts
-    by its share of the area, and a large change counts as 0.1.
-    """
-    edges, _ = coarse_edges(pair.mesh_x)
-    change = np.abs(np.subtract(*edge_lengths(pair, edges, pointwise_map)))
-    areas = pair.mesh_x.vertex_areas[edges].sum(axis=1)
-    return float(np.sqrt(np.average(np.minimum(change, _MOST_CHANGE) ** 2, weights=areas)))
-
-
 # A vertex with this detour, in `Pair.units_of_length`, is in the overlap with a probability of one half. The
 # odds fall with this power of the detour. (Entry R39 of docs/research_log.md)
 _EVEN_DETOUR, _POWER = 0.03, 2

@@ -13,24 +13,13 @@ from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _IN_PLACE, _DISCONTINUITY = -6.6, -3.5, 1.4, -6.7
-_UNCOVERED, _AGREEMENT = -3.1, 1.3
-# The weight of the logarithm of the inconsistency, which only counts between maps of the same pair.
-_INCONSISTENCY = -5.0
-# Smaller inconsistencies are equal. Exact maps have none, but neither has the identity from the mirror image
-# of a body to the body, which is wrong.
-_CONSISTENT = 0.003
+_INTERCEPT, _DEFORMATION, _UNCOVERED, _ORIENTATION_CHANGE, _AGREEMENT = -4.1, -1.2, -3.9, -2.1, 2.0
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
-# This number is added to the deformation, because even right maps of samples have such a deformation.
-_LEAST = 0.01
-# A map is in place if the mean distance between the given positions of samples and of their matches is below
-# this number of units of Y.
-_NEAR = 0.1
-# The matches of two neighbours are far apart if their distance along the surface is larger, in units of the
-# square root of the area.
-_FAR = 0.3
-# A sample of Y is uncovered if no match is nearer, in the same units.
+# These numbers are added to the deformation and to the change of orientations, because even right maps of
+# samples have as much.
+_LEAST_DEFORMATION, _LEAST_CHANGE = 0.01, 0.1
+# A sample of Y is uncovered if no match is nearer, in units of the square root of the area.
 _COVERED = 0.1
 
 
@@ -38,27 +27,26 @@ class Evidence(NamedTuple):
     """What shows whether a map is right, measured on the samples.
 
     A map that is right has a right reverse map, in which each sample of Y has the sample of X whose match is
-    nearest. The deformation is the mean over the map and its reverse map. The discontinuity is that of the
-    map that tears less: the right map tears a surface that is fused with itself, but its reverse map does
-    not. If one shape is a part of the other, both are those of the map. If X is the whole, they are measured
-    on the samples of X to which the reverse map takes the part.
+    nearest. The deformation and the change of orientations are means over the map and its reverse map. If one
+    shape is a part of the other, the reverse map is not defined everywhere. The deformation is then that of
+    the map, on the samples of the part, or on the samples of X to which the reverse map takes the part. The
+    change of orientations is that of the map from the part.
 
     **Attributes:**
 
     - `deformation`: how far the map is from a rigid motion around each sample, from 0 to 1; see
       `deformation`.
-    - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
-    - `discontinuity`: the share of neighbouring samples whose matches are far apart; see `discontinuity`.
     - `uncovered`: the share of Y's area, from 0 to 1, that is far from all matches, less the share that has
       no counterpart on a partial X.
+    - `orientation_change`: how often the map exchanges the sides of the body, such as belly and back, from 0
+      to 2; see `orientation_change`.
     - `agreement`: the share of X's area, from 0 to 1, on which the map agrees with the map of the first
       start. It is 0 for maps of the other hand.
     """
 
     deformation: float
-    in_place: bool
-    discontinuity: float
     uncovered: float
+    orientation_change: float
     agreement: float
 
     @classmethod
@@ -72,17 +60,16 @@ class Evidence(NamedTuple):
         elif pair.partial:
             lacking = 1 - pair.areas[0] / pair.areas[1]
         deformed = [areas_x @ deformation(x, y, matches)]
-        torn = [discontinuity(x, y, matches, areas_x)]
-        if not pair.partial:
+        turned = [orientation_change(x, y, matches), orientation_change(y, x, reverse)]
+        if pair.partial:
+            turned = [turned[pair.source_is_whole]]
+        else:
             deformed.append(y.areas @ deformation(y, x, reverse))
-            torn.append(discontinuity(y, x, reverse, y.areas))
         uncovered = float(y.areas @ (to_matches.min(axis=1) > _COVERED))
-        offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         return cls(
             deformation=float(np.mean(deformed)),
-            in_place=bool(areas_x @ offsets < _NEAR * y.unit) and not x.mirrored,
-            discontinuity=min(torn),
             uncovered=max(0.0, uncovered - lacking),
+            orientation_change=float(np.mean(turned)),
             agreement=reading.agreement(matches),
         )
 
@@ -91,35 +78,26 @@ class Evidence(NamedTuple):
         """The logarithm of the odds that the map is right, rather than none."""
         return float(
             _INTERCEPT
-            + _DEFORMATION * np.log(self.deformation + _LEAST)
-            + _IN_PLACE * self.in_place
-            + _DISCONTINUITY * np.sqrt(self.discontinuity)
+            + _DEFORMATION * np.log(self.deformation + _LEAST_DEFORMATION)
             + _UNCOVERED * np.sqrt(self.uncovered)
+            + _ORIENTATION_CHANGE * np.log(self.orientation_change + _LEAST_CHANGE)
             + _AGREEMENT * self.agreement
         )
 
 
-NO_EVIDENCE = Evidence(np.inf, in_place=False, discontinuity=1.0, uncovered=1.0, agreement=0.0)
+NO_EVIDENCE = Evidence(np.inf, uncovered=1.0, orientation_change=2.0, agreement=0.0)
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 
-def shares(
-    log_odds: Sequence[float], inconsistencies: Sequence[float] | None = None
-) -> Float[np.ndarray, " c"]:
+def shares(log_odds: Sequence[float]) -> Float[np.ndarray, " c"]:
     """Return the probability of each of several different maps (c,) to be right, if one of them is.
 
     The maps are compared by a multinomial logistic model, in which differences of the log-odds (c,) count
     `_CONTRAST` times, because maps of the same pair are easier to compare than maps of different pairs.
-
-    If the inconsistencies of the maps are given (c,), more consistent maps are preferred. A map that
-    exchanges two legs in opposite poses can deform patches less than the right map, but it stretches the
-    surface between the legs.
     """
     preferences = np.asarray(log_odds, float)
     if not np.isfinite(preferences).any():
         return np.zeros(len(preferences))
-    if inconsistencies is not None:
-        preferences = preferences + _INCONSISTENCY * np.log(np.maximum(inconsistencies, _CONSISTENT))
     exponentials = np.exp(_CONTRAST * (preferences - preferences.max()))
     return exponentials / exponentials.sum()
 
@@ -130,18 +108,6 @@ def probability(log_odds: float) -> float:
     The log-odds of the best map of a pair say how probable it is that one of its maps is right.
     """
     return float(1 / (1 + np.exp(-log_odds)))
-
-
-def discontinuity(source: Proxy, target: Proxy, matches: SampleMap, areas: Float[np.ndarray, " s"]) -> float:
-    """Measure how much a map tears neighbouring samples apart, as where exchanged limbs begin.
-
-    **Returns:** The share of the neighbouring pairs of source samples whose matches are far apart along the
-    surface of the target, from 0 to 1. A pair counts by the product of the `areas` of its samples (s,).
-    """
-    first, second = source.neighbours
-    weights = areas[first] * areas[second]
-    torn = target.distances[matches[first], matches[second]] > _FAR
-    return float(weights @ torn / max(weights.sum(), np.finfo(float).tiny))
 
 
 def deformation(source: Proxy, target: Proxy, matches: SampleMap) -> Float[np.ndarray, " s"]:
@@ -156,3 +122,23 @@ def deformation(source: Proxy, target: Proxy, matches: SampleMap) -> Float[np.nd
     """
     goals = target.positions[matches], target.normals[matches]
     return patch_motions(source.patches, source.positions, source.normals, *goals).deformations
+
+
+def orientation_change(source: Proxy, target: Proxy, matches: SampleMap) -> float:
+    """Measure how often a map exchanges the sides of a body, such as belly and back, or left and right.
+
+    The side of a sample is its orientation with respect to each two extremities of the source
+    (`Proxy.orientations`). The side of its match is that with respect to the matches of these extremities. A
+    map that exchanges two limbs, or that turns a head, exchanges sides although it deforms few patches.
+
+    **Returns:** One minus the correlation of the orientations of samples and matches, from 0 to 2.
+    """
+    ends = source.extremities.samples
+    first, second = np.triu_indices(len(ends), 1)
+    ours = source.orientations(ends)[:, first, second]
+    theirs = target.orientations(matches[ends])[matches][:, first, second]
+    between, of_ours, of_theirs = (
+        float(source.areas @ (one * other).sum(axis=1))
+        for one, other in ((ours, theirs), (ours, ours), (theirs, theirs))
+    )
+    return 1 - between / max(np.sqrt(of_ours * of_theirs), np.finfo(float).tiny)

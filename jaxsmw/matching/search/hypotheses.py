@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from itertools import permutations
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -16,7 +15,7 @@ from scipy.spatial import KDTree
 
 from jaxsmw.geometry.alignment import alignments, oriented_points
 from jaxsmw.matching.search.fitting import fits
-from jaxsmw.matching.search.proxies import Proxy, SampleMap
+from jaxsmw.matching.search.proxies import Extremities, Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 Hypothesis = Callable[[Reading], Iterator[SampleMap]]
@@ -76,13 +75,13 @@ def by_extremities(reading: Reading) -> Iterator[SampleMap]:
     if reading.prepared.pair.partial:
         return
     both = reading.x, reading.y
-    shot, ends = _shot_squares(reading), (extremities(reading.x), extremities(reading.y))
+    shot, ends = _shot_squares(reading), (reading.x.extremities, reading.y.extremities)
     # Limbs of different animals differ in length, so distances are divided by their mean.
     to_ends = [
         side.distances[:, of_side.samples] / (side.areas @ side.distances[:, of_side.samples])
         for side, of_side in zip(both, ends, strict=True)
     ]
-    oriented = [orientations(side, of_side.samples) for side, of_side in zip(both, ends, strict=True)]
+    oriented = [side.orientations(of_side.samples) for side, of_side in zip(both, ends, strict=True)]
 
     def costs(pairing: Int64[np.ndarray, "l 2"], weight: float, rows: slice) -> Float[np.ndarray, "a b"]:
         first, second = (pairing[numbers].T for numbers in np.triu_indices(len(pairing), 1))
@@ -142,73 +141,6 @@ def _principal_frame(proxy: Proxy) -> Float[np.ndarray, "s 3"]:
     variances, axes = np.linalg.eigh((proxy.areas * centered.T) @ centered)
     axes = axes[:, ::-1] * [1, 1, np.sign(np.linalg.det(axes[:, ::-1]))]
     return centered @ axes / np.sqrt(variances.sum())
-
-
-class Extremities(NamedTuple):
-    """The extremities of a body, in descending order of their remoteness.
-
-    The remoteness of a sample is the root mean square of its distances to all points of the surface.
-
-    **Attributes:**
-
-    - `samples`: the samples at the extremities (e,), as 0-based indices of the samples of a `Proxy`.
-    - `distances`: the distances between extremities (e, e) along the surface, divided by the mean remoteness
-      of all e extremities.
-    - `remoteness`: the remoteness of each extremity (e,), divided by the same mean.
-    """
-
-    samples: Int64[np.ndarray, " e"]
-    distances: Float[np.ndarray, "e e"]
-    remoteness: Float[np.ndarray, " e"]
-
-
-# The smallest distance between two extremities, in units of the square root of the area.
-_DISTANCE = 0.35
-# The largest number of extremities. The number of pairings grows very fast with it.
-_MOST = 6
-
-
-def extremities(proxy: Proxy) -> Extremities:
-    """Find the extremities of a body, such as the ends of its limbs, at most six.
-
-    Extremities are the local maxima of the mean squared distance to the whole surface (Hilaga et al. 2001,
-    "Topology matching for fully automatic similarity estimation of 3D shapes").
-    """
-    distances = proxy.distances
-    remoteness = np.sqrt(proxy.areas @ distances**2)
-    around = np.where(distances < _DISTANCE, remoteness, 0).max(axis=1)
-    ends = np.flatnonzero(remoteness >= around)
-    ends = ends[np.argsort(-remoteness[ends], kind="stable")][:_MOST]
-    unit = max(remoteness[ends].mean(), np.finfo(np.float64).tiny)
-    return Extremities(ends, distances[np.ix_(ends, ends)] / unit, remoteness[ends] / unit)
-
-
-def orientations(proxy: Proxy, ends: Int64[np.ndarray, " e"]) -> Float[np.ndarray, "s e e"]:
-    """Return on which side of a body each sample is, with respect to each two of e extremities.
-
-    The directions away from two extremities and the normal span a volume, which is positive on one side of
-    the body, such as the belly, and negative on the other. The direction away from an extremity is the
-    gradient of the distance from it, by linear regression on the patch around the sample. The measure is the
-    orientation of Ren et al. (2018), "Continuous and orientation-preserving correspondences via functional
-    maps".
-
-    **Returns:** The signed volumes (s, e, e) for unit vectors, from -1 to 1. The volumes of the mirror image
-    have the opposite signs.
-    """
-    values = np.hstack([proxy.positions, proxy.distances[:, ends]])
-    means, products = proxy.patches @ values, np.einsum("sa,sv->sav", proxy.positions, values)
-    covariances = (proxy.patches @ products.reshape(len(values), -1)).reshape(products.shape)
-    covariances -= np.einsum("sa,sv->sav", means[:, :3], means)
-    moments, slopes = covariances[..., :3], covariances[..., 3:]
-    sizes = np.maximum(np.trace(moments, axis1=1, axis2=2), np.finfo(float).tiny)
-    # A flat patch does not tell how distances change along its normal.
-    gradients = np.linalg.solve(moments + _FLAT * sizes[:, None, None] * np.eye(3), slopes).transpose(0, 2, 1)
-    gradients /= np.maximum(np.linalg.norm(gradients, axis=2, keepdims=True), np.finfo(float).tiny)
-    return np.einsum("sia,sja->sij", np.cross(proxy.normals[:, None], gradients), gradients)
-
-
-# The regularisation of the regression, as a share of the variance of a patch.
-_FLAT = 0.02
 
 
 def plausible_pairings(x: Extremities, y: Extremities, number: int) -> list[Int64[np.ndarray, "l 2"]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -25,8 +26,29 @@ SAMPLES = 1000
 # The radius of the patches that a right map moves nearly rigidly, in units of the square root of the area,
 # and the least number of samples in a patch. Smaller patches would fit any matches.
 _PATCH, _FEWEST = 0.2, 8
-# Two samples are neighbours if their distance along the surface is smaller, in the same units.
-_NEIGHBOURS = 0.12
+# The smallest distance between two extremities, in the same units, and the largest number of extremities. The
+# number of pairings grows very fast with it.
+_APART, _MOST_EXTREMITIES = 0.35, 6
+# The regularisation of the regression of slopes, as a share of the variance of a patch.
+_FLAT = 0.02
+
+
+class Extremities(NamedTuple):
+    """The extremities of a body, in descending order of their remoteness.
+
+    The remoteness of a sample is the root mean square of its distances to all points of the surface.
+
+    **Attributes:**
+
+    - `samples`: the samples at the extremities (e,), as 0-based indices of the samples of a `Proxy`.
+    - `distances`: the distances between extremities (e, e) along the surface, divided by the mean remoteness
+      of all e extremities.
+    - `remoteness`: the remoteness of each extremity (e,), divided by the same mean.
+    """
+
+    samples: Int64[np.ndarray, " e"]
+    distances: Float[np.ndarray, "e e"]
+    remoteness: Float[np.ndarray, " e"]
 
 
 class Proxy:
@@ -68,7 +90,7 @@ class Proxy:
     def mirror(self) -> Proxy:
         """Return the proxy of the mirror image, which shares the distances and SHOT of this proxy."""
         self.distances  # noqa: B018 (computed once, for both)
-        mirrored = copy.copy(self)
+        mirrored = self._without("slopes")
         mirrored.positions, mirrored.normals = (rows * [-1, 1, 1] for rows in (self.positions, self.normals))
         mirrored.mirrored = not self.mirrored
         return mirrored
@@ -76,12 +98,16 @@ class Proxy:
     def in_unit(self, unit: float) -> Proxy:
         """Return the proxy in another unit of length."""
         factor = self.unit / unit
-        other = copy.copy(self)
+        other = self._without("patches", "extremities", "slopes")
         other.unit, other.positions, other._shot = unit, factor * self.positions, {}
-        # Everything that depends on distances is computed again.
-        for name in ("patches", "neighbours"):
-            vars(other).pop(name, None)
         vars(other)["distances"] = factor * self.distances
+        return other
+
+    def _without(self, *names: str) -> Proxy:
+        """Return a copy that computes the properties of these names again."""
+        other = copy.copy(self)
+        for name in names:
+            vars(other).pop(name, None)
         return other
 
     def shot(self, radius: int) -> Float[np.ndarray, "s 352"]:
@@ -144,6 +170,46 @@ class Proxy:
         return weights / weights.sum(axis=1, keepdims=True)
 
     @functools.cached_property
-    def neighbours(self) -> Int64[np.ndarray, "2 p"]:
-        """The pairs of neighbouring samples, one in each column."""
-        return np.array(np.nonzero(np.triu(self.distances < _NEIGHBOURS, 1)))
+    def extremities(self) -> Extremities:
+        """The extremities of the body, such as the ends of its limbs, at most six.
+
+        Extremities are the local maxima of the mean squared distance to the whole surface (Hilaga et al.
+        2001, "Topology matching for fully automatic similarity estimation of 3D shapes").
+        """
+        distances = self.distances
+        remoteness = np.sqrt(self.areas @ distances**2)
+        around = np.where(distances < _APART, remoteness, 0).max(axis=1)
+        ends = np.flatnonzero(remoteness >= around)
+        ends = ends[np.argsort(-remoteness[ends], kind="stable")][:_MOST_EXTREMITIES]
+        unit = max(remoteness[ends].mean(), np.finfo(np.float64).tiny)
+        return Extremities(ends, distances[np.ix_(ends, ends)] / unit, remoteness[ends] / unit)
+
+    @functools.cached_property
+    def slopes(self) -> Float[np.ndarray, "3 s s"]:
+        """The operators that take a function (s,) to its slopes along the three axes.
+
+        The slopes are those of a linear regression on the patch around each sample.
+        """
+        means = self.patches @ self.positions
+        offsets = self.positions - means[:, None]
+        weighted = self.patches[:, :, None] * offsets
+        moments = weighted.transpose(0, 2, 1) @ offsets
+        # A flat patch does not tell how functions change along its normal.
+        sizes = np.maximum(np.trace(moments, axis1=1, axis2=2), np.finfo(float).tiny)
+        inverses = np.linalg.inv(moments + _FLAT * sizes[:, None, None] * np.eye(3))
+        return np.ascontiguousarray((weighted @ inverses).transpose(2, 0, 1))
+
+    def orientations(self, ends: Int64[np.ndarray, " e"]) -> Float[np.ndarray, "s e e"]:
+        """Return on which side of a body each sample is, with respect to each two of e samples.
+
+        The directions away from the two samples and the normal span a volume, which is positive on one side
+        of the body, such as the belly, and negative on the other. The direction away from a sample is the
+        gradient of the distance from it. The measure is the orientation of Ren et al. (2018), "Continuous
+        and orientation-preserving correspondences via functional maps".
+
+        **Returns:** The signed volumes (s, e, e) for unit vectors, from -1 to 1. The volumes of the mirror
+        image have the opposite signs.
+        """
+        gradients = np.stack([slope @ self.distances[:, ends] for slope in self.slopes], axis=2)
+        gradients /= np.maximum(np.linalg.norm(gradients, axis=2, keepdims=True), np.finfo(float).tiny)
+        return np.einsum("sia,sja->sij", np.cross(self.normals[:, None], gradients), gradients)

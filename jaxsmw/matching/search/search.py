@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import warnings
 from collections.abc import Iterator, Sequence
@@ -15,10 +14,9 @@ from jaxsmw.choices import Mirror
 from jaxsmw.core.arrays import namespace
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.geometry.scale import relative_boundary
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import area_shape_difference, detours, distortion, stretch
+from jaxsmw.matching.judge import area_shape_difference, distortion
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
@@ -59,29 +57,6 @@ class Judged(Candidate):
         if not outcome.successful:
             return cls(reading, matches, NO_EVIDENCE, outcome)
         return cls(reading, matches, Evidence.of(reading, matches), outcome)
-
-    @functools.cached_property
-    def inconsistency(self) -> float:
-        """The sum of the `stretch` and the mean detour, averaged over the map and its reverse map.
-
-        If one shape is a part of the other, only the map of the part counts. The inconsistency is infinite
-        after a failure. It is 1 for all maps of a pair if no stage has run, because there is no reverse map.
-        """
-        if not self.outcome.successful:
-            return np.inf
-        if not self.outcome.runs:
-            return 1.0
-        pair = self.reading.prepared.pair
-        forward = extend_to_unreferenced(pair.mesh_x, self.pointwise_map)
-        reverse = extend_to_unreferenced(pair.mesh_y, self.outcome.last.reverse_map())
-        directions = [(pair, forward, reverse), (pair.reversed(), reverse, forward)]
-        if pair.partial:
-            directions = [directions[pair.source_is_whole]]
-        lengths = [
-            stretch(sides, there) + sides.mesh_x.average(detours(sides, there, back))
-            for sides, there, back in directions
-        ]
-        return float(np.mean(lengths))
 
     @property
     def pointwise_map(self) -> Int64[np.ndarray, " m"]:
@@ -151,10 +126,9 @@ def search(
     return [replace(best, share=1.0 - sum(one.share for one in others)), *others]
 
 
-def _shares_of(judged: Sequence[Judged]) -> Float[np.ndarray, " c"]:
+def _shares_of(maps: Sequence[Candidate]) -> Float[np.ndarray, " c"]:
     """Return the probability of each of several different maps (c,) to be right, if one of them is."""
-    inconsistencies = [one.inconsistency for one in judged] if len(judged) > 1 else None
-    return shares([one.log_odds for one in judged], inconsistencies)
+    return shares([one.log_odds for one in maps])
 
 
 def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
@@ -173,13 +147,13 @@ def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
 
 def _certain(judged: Sequence[Judged], settings: SearchSettings) -> bool:
     """Return whether the best map is right with a large enough probability."""
-    log_odds = [one.log_odds for one in judged]
-    return bool(shares(log_odds).max() * probability(max(log_odds)) >= settings.certain)
+    best = max(one.log_odds for one in judged)
+    return bool(_shares_of(judged).max() * probability(best) >= settings.certain)
 
 
 def _likely(maps: Sequence[Kind], settings: SearchSettings) -> list[Kind]:
     """Return the most probable maps, the best first."""
-    parts = shares([one.log_odds for one in maps])
+    parts = _shares_of(maps)
     order = np.argsort(-parts, kind="stable")[: settings.finalists]
     return [maps[number] for number in order[_probable(parts[order], settings)]]
 
