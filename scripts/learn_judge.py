@@ -6,10 +6,11 @@
 `DATA_DIRECTORY` contains the data sets of `docs/datasets.md`. The script draws N pairs of each kind of
 `scripts/judged_pairs.py`. `search` always runs all hypotheses, and returns maps that differ from each other.
 
-The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence`, and the
-script maximises their likelihood. It prints the weights of all kinds together. For the tables of results, the
-maps of each kind are judged by the weights of all other kinds. With `--maps`, the evidence is kept in a file,
-and a later run continues there.
+The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence`, and the script
+maximises their likelihood. Each pair with right and wrong maps counts once more, with a small weight, as if
+no right map had been found. The script prints the weights of all kinds together. For the tables of results,
+the maps of each kind are judged by the weights of all other kinds. With `--maps`, the evidence is kept in a
+file, and a later run continues there.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ from jaxsmw.runtime.provenance import made_with
 # The penalty of large weights, which keeps them finite.
 PENALTY = 0.1
 # The weights from which the fit begins, with the intercept first.
-FIRST = np.array([-6.0, -3.0, 0.5, -3.0, -3.0, 1.0])
+FIRST = np.array([-6.0, -1.0, -3.0, -2.0, 2.0])
+# How much a pair counts without its right maps. Few pairs have no right map, and without such pairs nearly
+# every map would be called right.
+WITHOUT_RIGHT = 0.2
 
 
 class JudgedPair(NamedTuple):
@@ -48,6 +52,13 @@ class JudgedPair(NamedTuple):
     def right(self) -> Bool[np.ndarray, " c"]:
         """Whether each map is right as a whole."""
         return np.array([is_right(*errors) for errors in self.errors], bool)
+
+    def without_right(self) -> JudgedPair | None:
+        """Return the pair as if no right map had been found, or None if it has no right map or no other."""
+        wrong = ~self.right
+        if wrong.all() or not wrong.any():
+            return None
+        return self._replace(evidence=self.evidence[wrong], errors=self.errors[wrong])
 
 
 def judged_pair(known: KnownPair) -> JudgedPair:
@@ -63,10 +74,9 @@ def judged_pair(known: KnownPair) -> JudgedPair:
 
 def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
     """Return what the log-odds depend on linearly, in the order of `Evidence`, with the intercept first."""
-    deformation, in_place, discontinuity, uncovered, agreement = evidence.T
-    torn, missing = np.sqrt(discontinuity), np.sqrt(uncovered)
-    columns = np.ones(len(evidence)), np.log(deformation + 0.01), in_place, torn, missing, agreement
-    return np.stack(columns, axis=1)
+    deformation, uncovered, orientation_change, agreement = evidence.T
+    missing, turned = np.sqrt(uncovered), np.log(orientation_change + 0.05)
+    return np.stack([np.ones(len(evidence)), np.log(deformation + 0.01), missing, turned, agreement], axis=1)
 
 
 def shares_of(pair: JudgedPair, weights: Float[np.ndarray, " f"]) -> Float[np.ndarray, " c"]:
@@ -78,11 +88,14 @@ def shares_of(pair: JudgedPair, weights: Float[np.ndarray, " f"]) -> Float[np.nd
 def fitted(pairs: Sequence[JudgedPair]) -> Float[np.ndarray, " f"]:
     """Return the weights of the largest likelihood: that one of the right maps is right, or none."""
 
+    weighted = [(pair, 1.0) for pair in pairs]
+    weighted += [(wrong, WITHOUT_RIGHT) for pair in pairs if (wrong := pair.without_right()) is not None]
+
     def loss(weights: Float[np.ndarray, " f"]) -> float:
         total = 0.0
-        for pair in pairs:
+        for pair, weight in weighted:
             shares, right = shares_of(pair, weights), pair.right
-            total -= np.log(max(shares[right].sum() if right.any() else 1 - shares.sum(), 1e-9))
+            total -= weight * np.log(max(shares[right].sum() if right.any() else 1 - shares.sum(), 1e-9))
         return float(total + PENALTY * weights[1:] @ weights[1:])
 
     return minimize(loss, FIRST).x

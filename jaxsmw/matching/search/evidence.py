@@ -13,12 +13,12 @@ from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
 # The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _UNCOVERED, _ORIENTATION_CHANGE, _AGREEMENT = -4.1, -1.2, -3.9, -2.1, 2.0
+_INTERCEPT, _DEFORMATION, _UNCOVERED, _ORIENTATION_CHANGE, _AGREEMENT = -5.8, -1.3, -3.9, -2.1, 2.0
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
 # samples have as much.
-_LEAST_DEFORMATION, _LEAST_CHANGE = 0.01, 0.1
+_LEAST_DEFORMATION, _LEAST_CHANGE = 0.01, 0.05
 # A sample of Y is uncovered if no match is nearer, in units of the square root of the area.
 _COVERED = 0.1
 
@@ -39,7 +39,7 @@ class Evidence(NamedTuple):
     - `uncovered`: the share of Y's area, from 0 to 1, that is far from all matches, less the share that has
       no counterpart on a partial X.
     - `orientation_change`: how often the map exchanges the sides of the body, such as belly and back, from 0
-      to 2; see `orientation_change`.
+      to 1; see `orientation_change`.
     - `agreement`: the share of X's area, from 0 to 1, on which the map agrees with the map of the first
       start. It is 0 for maps of the other hand.
     """
@@ -85,7 +85,7 @@ class Evidence(NamedTuple):
         )
 
 
-NO_EVIDENCE = Evidence(np.inf, uncovered=1.0, orientation_change=2.0, agreement=0.0)
+NO_EVIDENCE = Evidence(np.inf, uncovered=1.0, orientation_change=1.0, agreement=0.0)
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 
@@ -131,14 +131,13 @@ def orientation_change(source: Proxy, target: Proxy, matches: SampleMap) -> floa
     (`Proxy.orientations`). The side of its match is that with respect to the matches of these extremities. A
     map that exchanges two limbs, or that turns a head, exchanges sides although it deforms few patches.
 
-    **Returns:** One minus the correlation of the orientations of samples and matches, from 0 to 2.
+    **Returns:** The share of the extremity pairs for which a sample and its match are on opposite sides,
+    averaged over the area, from 0 to 1. A pair counts by the product of both volumes, because sides are
+    uncertain where a volume is small. If there are no two extremities, the share is one half.
     """
     ends = source.extremities.samples
     first, second = np.triu_indices(len(ends), 1)
     ours = source.orientations(ends)[:, first, second]
     theirs = target.orientations(matches[ends])[matches][:, first, second]
-    between, of_ours, of_theirs = (
-        float(source.areas @ (one * other).sum(axis=1))
-        for one, other in ((ours, theirs), (ours, ours), (theirs, theirs))
-    )
-    return 1 - between / max(np.sqrt(of_ours * of_theirs), np.finfo(float).tiny)
+    same, either = (ours * theirs).sum(axis=1), np.abs(ours * theirs).sum(axis=1)
+    return float(source.areas @ (1 - same / np.maximum(either, np.finfo(float).tiny))) / 2
