@@ -137,7 +137,7 @@ def orientation_change(source: Proxy, target: Proxy, matches: SampleMap) -> floa
     """
     ends = source.extremities.samples
     first, second = np.triu_indices(len(ends), 1)
-    ours = source.orientations(ends)[:, first, second]
+    ours = source.sides[:, first, second]
     theirs = target.orientations(matches[ends])[matches][:, first, second]
     same, either = (ours * theirs).sum(axis=1), np.abs(ours * theirs).sum(axis=1)
     return float(source.areas @ (1 - same / np.maximum(either, np.finfo(float).tiny))) / 2

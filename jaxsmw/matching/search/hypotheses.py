@@ -81,7 +81,7 @@ def by_extremities(reading: Reading) -> Iterator[SampleMap]:
         side.distances[:, of_side.samples] / (side.areas @ side.distances[:, of_side.samples])
         for side, of_side in zip(both, ends, strict=True)
     ]
-    oriented = [side.orientations(of_side.samples) for side, of_side in zip(both, ends, strict=True)]
+    oriented = [side.sides for side in both]
 
     def costs(pairing: Int64[np.ndarray, "l 2"], weight: float, rows: slice) -> Float[np.ndarray, "a b"]:
         first, second = (pairing[numbers].T for numbers in np.triu_indices(len(pairing), 1))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
-from scipy.sparse import coo_array, csgraph
+from scipy.sparse import coo_array, csgraph, csr_array, vstack
 from scipy.spatial.distance import cdist
 
 from jaxsmw.core.arrays import namespace
@@ -90,7 +90,7 @@ class Proxy:
     def mirror(self) -> Proxy:
         """Return the proxy of the mirror image, which shares the distances and SHOT of this proxy."""
         self.distances  # noqa: B018 (computed once, for both)
-        mirrored = self._without("slopes")
+        mirrored = self._without("slopes", "sides")
         mirrored.positions, mirrored.normals = (rows * [-1, 1, 1] for rows in (self.positions, self.normals))
         mirrored.mirrored = not self.mirrored
         return mirrored
@@ -98,7 +98,7 @@ class Proxy:
     def in_unit(self, unit: float) -> Proxy:
         """Return the proxy in another unit of length."""
         factor = self.unit / unit
-        other = self._without("patches", "extremities", "slopes")
+        other = self._without("patches", "extremities", "slopes", "sides")
         other.unit, other.positions, other._shot = unit, factor * self.positions, {}
         vars(other)["distances"] = factor * self.distances
         return other
@@ -185,19 +185,27 @@ class Proxy:
         return Extremities(ends, distances[np.ix_(ends, ends)] / unit, remoteness[ends] / unit)
 
     @functools.cached_property
-    def slopes(self) -> Float[np.ndarray, "3 s s"]:
-        """The operators that take a function (s,) to its slopes along the three axes.
+    def slopes(self) -> csr_array:
+        """The operator that takes a function (s,) to its slopes along the first axis, the second, and so on.
 
-        The slopes are those of a linear regression on the patch around each sample.
+        The slopes (3 s,) are those of a linear regression on the patch around each sample.
         """
-        means = self.patches @ self.positions
-        offsets = self.positions - means[:, None]
-        weighted = self.patches[:, :, None] * offsets
-        moments = weighted.transpose(0, 2, 1) @ offsets
+        rows, columns = np.nonzero(self.patches)
+        offsets = self.positions[columns] - (self.patches @ self.positions)[rows]
+        weighted = self.patches[rows, columns, None] * offsets
+        starts = np.searchsorted(rows, np.arange(len(self.areas)))
+        moments = np.add.reduceat(weighted[:, :, None] * offsets[:, None], starts)
         # A flat patch does not tell how functions change along its normal.
         sizes = np.maximum(np.trace(moments, axis1=1, axis2=2), np.finfo(float).tiny)
         inverses = np.linalg.inv(moments + _FLAT * sizes[:, None, None] * np.eye(3))
-        return np.ascontiguousarray((weighted @ inverses).transpose(2, 0, 1))
+        values = np.einsum("pa,pab->bp", weighted, inverses[rows])
+        shape = (len(self.areas),) * 2
+        return vstack([csr_array((along_axis, (rows, columns)), shape) for along_axis in values], "csr")
+
+    @functools.cached_property
+    def sides(self) -> Float[np.ndarray, "s e e"]:
+        """The orientations with respect to the extremities of the body."""
+        return self.orientations(self.extremities.samples)
 
     def orientations(self, ends: Int64[np.ndarray, " e"]) -> Float[np.ndarray, "s e e"]:
         """Return on which side of a body each sample is, with respect to each two of e samples.
@@ -210,6 +218,9 @@ class Proxy:
         **Returns:** The signed volumes (s, e, e) for unit vectors, from -1 to 1. The volumes of the mirror
         image have the opposite signs.
         """
-        gradients = np.stack([slope @ self.distances[:, ends] for slope in self.slopes], axis=2)
-        gradients /= np.maximum(np.linalg.norm(gradients, axis=2, keepdims=True), np.finfo(float).tiny)
-        return np.einsum("sia,sja->sij", np.cross(self.normals[:, None], gradients), gradients)
+        slopes = self.slopes @ self.distances[:, ends]
+        gradients = np.moveaxis(slopes.reshape(3, len(self.areas), len(ends)), 0, 2)
+        gradients = gradients / np.maximum(
+            np.linalg.norm(gradients, axis=2, keepdims=True), np.finfo(float).tiny
+        )
+        return np.cross(self.normals[:, None], gradients) @ gradients.transpose(0, 2, 1)
