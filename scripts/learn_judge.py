@@ -9,8 +9,8 @@
 The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence`, and the script
 maximises their likelihood. Each pair with right and wrong maps counts once more, with a small weight, as if
 no right map had been found. The script prints the weights of all kinds together. For the tables of results,
-the maps of each kind are judged by the weights of all other kinds. With `--maps`, the evidence is kept in a
-file, and a later run continues there.
+the maps of each kind are judged by the weights of all other kinds. With `--maps`, the features of the
+maps are kept in a file, and a later run with the same options continues there.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ WITHOUT_RIGHT = 0.2
 
 
 class JudgedPair(NamedTuple):
-    """The evidence of the maps of a pair, their mean errors and their shares of gross errors, by maps."""
+    """The features of the maps of a pair, their mean errors and their shares of gross errors, by maps."""
 
     kind: str
-    evidence: Float[np.ndarray, "c e"]
+    features: Float[np.ndarray, "c f"]
     errors: Float[np.ndarray, "c 2"]
 
     @property
@@ -58,7 +58,7 @@ class JudgedPair(NamedTuple):
         wrong = ~self.right
         if wrong.all() or not wrong.any():
             return None
-        return self._replace(evidence=self.evidence[wrong], errors=self.errors[wrong])
+        return self._replace(features=self.features[wrong], errors=self.errors[wrong])
 
 
 def judged_pair(known: KnownPair) -> JudgedPair:
@@ -67,21 +67,14 @@ def judged_pair(known: KnownPair) -> JudgedPair:
         assert preset.search is not None
         preset = replace(preset, search=replace(preset.search, certain=1.0))
         maps = search(shapes, start, preset, mirror="auto")
-    rows = [(list(one.evidence), known.errors(one.pointwise_map)) for one in maps if one.evidence is not None]
-    evidence, errors = zip(*rows, strict=True)
-    return JudgedPair(known.kind, np.array(evidence, float), np.array(errors))
-
-
-def features(evidence: Float[np.ndarray, "c e"]) -> Float[np.ndarray, "c f"]:
-    """Return what the log-odds depend on linearly, in the order of `Evidence`, with the intercept first."""
-    deformation, uncovered, orientation_change, agreement = evidence.T
-    missing, turned = np.sqrt(uncovered), np.log(orientation_change + 0.05)
-    return np.stack([np.ones(len(evidence)), np.log(deformation + 0.01), missing, turned, agreement], axis=1)
+    maps = [one for one in maps if np.isfinite(one.log_odds)]
+    errors = [known.errors(one.pointwise_map) for one in maps]
+    return JudgedPair(known.kind, np.array([one.evidence.features for one in maps]), np.array(errors))
 
 
 def shares_of(pair: JudgedPair, weights: Float[np.ndarray, " f"]) -> Float[np.ndarray, " c"]:
     """Return the probability of each map of a pair to be right."""
-    log_odds = (features(pair.evidence) @ weights).tolist()
+    log_odds = (pair.features @ weights).tolist()
     return shares(log_odds) * probability(max(log_odds))
 
 
@@ -122,7 +115,7 @@ def tables(pairs: Sequence[JudgedPair]) -> Iterator[str]:
 
 def main() -> None:
     parser = make_parser(__doc__, data="DATA_DIRECTORY", pairs=8, seed=True)
-    parser.add_argument("--maps", metavar="FILE.json", type=Path, help="file in which the evidence is kept")
+    parser.add_argument("--maps", metavar="FILE.json", type=Path, help="file in which the features are kept")
     parser.add_argument("--output", metavar="FILE.md", type=Path, help="also write the tables to this file")
     options = parser.parse_args()
     data, number, seed = options.data, options.pairs, options.seed
@@ -133,11 +126,11 @@ def main() -> None:
         if position < len(stored):
             continue
         pair = judged_pair(known)
-        stored.append({"kind": pair.kind, "evidence": pair.evidence.tolist(), "errors": pair.errors.tolist()})
+        stored.append({"kind": pair.kind, "features": pair.features.tolist(), "errors": pair.errors.tolist()})
         print(known.kind, known.x.name, known.y.name, *pair.right, flush=True)
         if options.maps:
             write_text(options.maps, json.dumps(stored))
-    pairs = [JudgedPair(row["kind"], np.array(row["evidence"]), np.array(row["errors"])) for row in stored]
+    pairs = [JudgedPair(row["kind"], np.array(row["features"]), np.array(row["errors"])) for row in stored]
     page = "\n\n".join((*tables(pairs), made_with() + "\n"))
     print(page)
     if options.output:

@@ -31,7 +31,7 @@ from jaxsmw.matching.search.evidence import (
 from jaxsmw.matching.search.hypotheses import HYPOTHESES, by_extremities
 from jaxsmw.matching.search.race import DIFFERENT_AREA, Candidate, different, hand_evidence, race
 from jaxsmw.matching.search.reading import Reading
-from jaxsmw.matching.search.search import Judged, search
+from jaxsmw.matching.search.search import Judged, distinct, search
 from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.stages import Preset, Sizes, Stage
 
@@ -359,6 +359,27 @@ def test_only_probable_maps_are_refined_by_further_passes(pair, monkeypatch):
     assert others and best.share > 0.9 and not np.array_equal(best.pointwise_map, same.pointwise_map)
     for one, other in zip(others, unchanged, strict=True):
         np.testing.assert_array_equal(one.pointwise_map, other.pointwise_map)
+
+
+def test_maps_that_become_equal_are_one_map(pair):
+    """Further passes can lead different maps to the same one, which then has all of their probability."""
+    mesh_x, mesh_y, truth = pair
+    reading = read(mesh_x, mesh_y)
+    wrong = upside_down(mesh_x, truth)
+    shared = [(truth, 0.5), (wrong, 0.3), (truth, 0.1), (wrong, 0.1)]
+    first, second = distinct(replace(known_map(reading, one), share=share) for one, share in shared)
+    np.testing.assert_array_equal(first.pointwise_map, truth)
+    np.testing.assert_array_equal(second.pointwise_map, wrong)
+    assert (first.share, second.share) == (pytest.approx(0.6), pytest.approx(0.4))
+
+
+def test_the_first_map_is_taken_if_any_map_is_certain(lump):
+    """Both hands are possible, but nothing is compared."""
+    prepared = prepare(Pair.make(lump, turned(lump)), Sizes(40)).describe(30)
+    preset = replace(SEARCH, search=replace(SEARCH.search, certain=0.0))
+    start = Start(np.zeros(len(lump.vertices), int))
+    (found,) = search(prepared, start, preset, mirror="auto", outcome=Outcome(start.pointwise_map))
+    np.testing.assert_array_equal(found.pointwise_map, start.pointwise_map)
 
 
 @pytest.mark.filterwarnings("ignore:.*neighbours within the SHOT radius:UserWarning")

@@ -12,8 +12,9 @@ from jaxsmw.geometry.alignment import patch_motions
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
-# The weights of the evidence in the log-odds, from a regression of right maps (scripts/learn_judge.py).
-_INTERCEPT, _DEFORMATION, _UNCOVERED, _ORIENTATION_CHANGE, _AGREEMENT = -5.8, -1.3, -3.9, -2.1, 2.0
+# The weights of `Evidence.features` in the log-odds, from a regression (scripts/learn_judge.py, entry R49 of
+# docs/research_log.md).
+_WEIGHTS = (-5.8, -1.3, -3.9, -2.1, 2.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
@@ -41,7 +42,7 @@ class Evidence(NamedTuple):
     - `orientation_change`: how often the map exchanges the sides of the body, such as belly and back, from 0
       to 1; see `orientation_change`.
     - `agreement`: the share of X's area, from 0 to 1, on which the map agrees with the map of the first
-      start. It is 0 for maps of the other hand.
+      start. It is 0 for all maps if both hands are compared.
     """
 
     deformation: float
@@ -74,15 +75,16 @@ class Evidence(NamedTuple):
         )
 
     @property
+    def features(self) -> Float[np.ndarray, " f"]:
+        """What the log-odds depend on linearly, with 1 for the intercept first."""
+        deformation = np.log(self.deformation + _LEAST_DEFORMATION)
+        orientation_change = np.log(self.orientation_change + _LEAST_CHANGE)
+        return np.array([1.0, deformation, np.sqrt(self.uncovered), orientation_change, self.agreement])
+
+    @property
     def log_odds(self) -> float:
         """The logarithm of the odds that the map is right, rather than none."""
-        return float(
-            _INTERCEPT
-            + _DEFORMATION * np.log(self.deformation + _LEAST_DEFORMATION)
-            + _UNCOVERED * np.sqrt(self.uncovered)
-            + _ORIENTATION_CHANGE * np.log(self.orientation_change + _LEAST_CHANGE)
-            + _AGREEMENT * self.agreement
-        )
+        return float(_WEIGHTS @ self.features)
 
 
 NO_EVIDENCE = Evidence(np.inf, uncovered=1.0, orientation_change=1.0, agreement=0.0)

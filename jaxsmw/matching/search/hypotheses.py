@@ -52,7 +52,7 @@ def by_alignment(reading: Reading) -> Iterator[SampleMap]:
 
 def by_given_positions(reading: Reading) -> Iterator[SampleMap]:
     """Match samples at the nearest given positions, in case the meshes were aligned by their owner."""
-    if not reading.x.mirrored:
+    if not reading.prepared.mirrored:
         placed = [side.positions * side.unit for side in (reading.x, reading.y)]
         yield KDTree(placed[1]).query(placed[0])[1]
 

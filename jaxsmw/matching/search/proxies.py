@@ -26,8 +26,8 @@ SAMPLES = 1000
 # The radius of the patches that a right map moves nearly rigidly, in units of the square root of the area,
 # and the least number of samples in a patch. Smaller patches would fit any matches.
 _PATCH, _FEWEST = 0.2, 8
-# The smallest distance between two extremities, in the same units, and the largest number of extremities. The
-# number of pairings grows very fast with it.
+# The smallest distance between two extremities, in units of the square root of the shape's own area, and the
+# largest number of extremities. The number of pairings grows very fast with it.
 _APART, _MOST_EXTREMITIES = 0.35, 6
 # The regularisation of the regression of slopes, as a share of the variance of a patch.
 _FLAT = 0.02
@@ -178,7 +178,8 @@ class Proxy:
         """
         distances = self.distances
         remoteness = np.sqrt(self.areas @ distances**2)
-        around = np.where(distances < _APART, remoteness, 0).max(axis=1)
+        apart = _APART * self.mesh.area**0.5 / self.unit
+        around = np.where(distances < apart, remoteness, 0).max(axis=1)
         ends = np.flatnonzero(remoteness >= around)
         ends = ends[np.argsort(-remoteness[ends], kind="stable")][:_MOST_EXTREMITIES]
         unit = max(remoteness[ends].mean(), np.finfo(np.float64).tiny)

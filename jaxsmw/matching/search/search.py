@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,11 +92,13 @@ def search(
     settings = preset.search
     mirrors = settings is not None and hypotheses and mirror == "auto"
     reading, both_hands = read_pair(prepared, outcome.pointwise_map, mirrors=mirrors)
+    if not outcome.successful:
+        reading = replace(reading, first=None)
     first = Judged.of(reading, outcome)
     if settings is None:
         return [first]
     judged = [first]
-    certain = _ends_the_search(first, settings) and not both_hands
+    certain = settings.certain == 0 or (_ends_the_search(first, settings) and not both_hands)
     readings = readings_of(reading, both_hands=both_hands) if hypotheses and not certain else [reading]
     for number in range(_ROUNDS):
         if certain:
@@ -120,10 +122,24 @@ def search(
     judged = [_finished(one, preset) if again else one for one, again in zip(judged, probable, strict=True)]
     parts = np.sqrt(before * _shares_of(judged))
     parts /= parts.sum() or 1.0
-    order = np.argsort(-parts, kind="stable")
-    best, *others = (replace(judged[number], share=float(parts[number])) for number in order)
-    others = [one for one in others if not one.is_twin(best)]
-    return [replace(best, share=1.0 - sum(one.share for one in others)), *others]
+    return distinct(
+        replace(judged[number], share=float(parts[number])) for number in np.argsort(-parts, kind="stable")
+    )
+
+
+def distinct(judged: Iterable[Judged]) -> list[Judged]:
+    """Return the maps that differ from all better ones, with the shares of their twins as well.
+
+    Maps whose refinement failed are left out, unless it is the best one.
+    """
+    found: list[Judged] = []
+    for one in judged:
+        twin = next((number for number, other in enumerate(found) if one.is_twin(other)), None)
+        if twin is not None:
+            found[twin] = replace(found[twin], share=found[twin].share + one.share)
+        elif not found or one.outcome.successful:
+            found.append(one)
+    return found
 
 
 def _shares_of(maps: Sequence[Candidate]) -> Float[np.ndarray, " c"]:
@@ -139,8 +155,6 @@ def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
     """
     if not _certain([first], settings):
         return False
-    if settings.certain == 0:
-        return True
     prepared = first.reading.prepared
     return distortion(prepared.pair, first.pointwise_map, prepared.x.spectrum) <= settings.certain_distortion
 
