@@ -8,7 +8,7 @@ import pytest
 from sampled_cases import first_always
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from synthetic import body_with_arms, bumpy_mesh, mean_error
+from synthetic import body_with_arms, bumpy_mesh, mean_error, sphere_mesh
 
 import jaxsmw
 from jaxsmw import Mesh, creature_pair, make_mesh, match
@@ -66,6 +66,15 @@ def order_of(mesh: Mesh, seed: int = 0) -> np.ndarray:
 
 def read(mesh_x: Mesh, mesh_y: Mesh, **options) -> Reading:
     return Reading.of(prepare(Pair.make(mesh_x, mesh_y, **options), Sizes(40)))
+
+
+def test_vertices_at_one_position_have_one_sample():
+    mesh = sphere_mesh(2)
+    upper = (mesh.vertices[mesh.faces].mean(axis=1) @ [0, 0, 1]) > 0
+    faces = np.where(upper[:, None], mesh.faces + len(mesh.vertices), mesh.faces)
+    halves = make_mesh(np.tile(mesh.vertices, (2, 1)), faces)
+    proxy = read(halves, mesh).x
+    assert len(proxy.areas) == len(mesh.vertices) < len(halves.referenced_indices) and proxy.areas.min() > 0
 
 
 def known_map(reading: Reading, pointwise_map: np.ndarray) -> Judged:

@@ -74,6 +74,8 @@ class Proxy:
         mesh, compared = shape.mesh, shape.compared
         self.mesh, self.spectrum, self.unit, self.mirrored = mesh, shape.spectrum, unit, False
         among = mesh.referenced_indices if compared is None else compared.vertices
+        # Of several vertices at one position, such as those of a seam, all but one would have no area.
+        among = among[np.sort(np.unique(mesh.vertices[among], axis=0, return_index=True)[1])]
         number = min(SAMPLES, len(among))
         vertices = farthest_point_samples(mesh, number, among)
         self.samples = SurfaceSamples.along_surface(mesh, vertices, compared)
