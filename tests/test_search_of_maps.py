@@ -69,7 +69,7 @@ def read(mesh_x: Mesh, mesh_y: Mesh, **options) -> Reading:
 
 
 def test_vertices_at_one_position_have_one_sample():
-    mesh = sphere_mesh(2)
+    mesh = make_mesh(*sphere_mesh(2))
     upper = (mesh.vertices[mesh.faces].mean(axis=1) @ [0, 0, 1]) > 0
     faces = np.where(upper[:, None], mesh.faces + len(mesh.vertices), mesh.faces)
     halves = make_mesh(np.tile(mesh.vertices, (2, 1)), faces)
