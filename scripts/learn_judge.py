@@ -35,7 +35,7 @@ from jaxsmw.runtime.provenance import made_with
 # The penalty of large weights, which keeps them finite.
 PENALTY = 0.1
 # The weights from which the fit begins, with the intercept first.
-FIRST = np.array([-6.0, -1.0, -3.0, -2.0, 2.0])
+FIRST = np.array([-6.0, -1.0, -3.0, -2.0, 2.0, 2.0])
 # How much a pair counts without its right maps. Few pairs have no right map, and without such pairs nearly
 # every map would be called right.
 WITHOUT_RIGHT = 0.2

@@ -33,7 +33,7 @@ def test_tables_count_right_silent_and_flagged_maps():
 
 def test_the_judge_is_fitted_to_the_evidence_of_other_kinds():
     """The map of a pair is the more probable one, which is the less deformed one."""
-    features = np.array([[1, np.log(0.02), 0, np.log(0.06), 1], [1, 0, 0.5, -1, 0.1]])
+    features = np.array([[1, np.log(0.02), 0, np.log(0.06), 1, 0], [1, 0, 0.5, -1, 0.1, 0]])
     pair, wrong = np.array([[0.01, 0], [0.3, 0.5]]), np.array([[0.2, 0.3], [0.3, 0.5]])
     pairs = [JudgedPair(kind, features, pair) for kind in ("people", "people", "teeth", "jaws")]
     weights, counts, reliability = learn_judge.tables([*pairs, JudgedPair("jaws", features, wrong)])

@@ -169,6 +169,20 @@ def test_a_one_to_one_map_and_its_reverse_map_have_the_same_evidence(pair):
         assert getattr(first, name) == pytest.approx(getattr(second, name))
 
 
+def test_maps_between_aligned_meshes_are_in_place(pair):
+    """A map to the same positions is in place, unless the meshes are apart or the source is mirrored."""
+    mesh, _, _ = pair
+    identity = np.arange(len(mesh.vertices))
+    moved = make_mesh(mesh.vertices + 0.1 * mesh.area**0.5, mesh.faces)
+    for target, expected in ((mesh, True), (moved, False)):
+        reading = read(mesh, target)
+        evidence = Evidence.of(reading, reading.reduced(identity))
+        assert evidence.in_place == expected
+        mirrored = reading.mirror()
+        assert not Evidence.of(mirrored, mirrored.reduced(identity)).in_place
+    assert evidence.log_odds == pytest.approx(evidence._replace(in_place=True).log_odds - 2)
+
+
 def test_a_map_to_a_part_is_measured_where_the_part_lies(pair):
     """What the map does with the rest of the whole shape is hardly any evidence."""
     mesh, _, _ = pair
@@ -313,7 +327,7 @@ def test_twins_are_merged_and_the_better_one_is_kept(pair):
     slightly[few] = wrong[few]
 
     def candidate(matches, score):
-        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, 0.0, 0.0))
+        return Candidate(reading, matches, Evidence(np.exp(-score), 0.0, 0.0, 0.0, False))
 
     candidates = [candidate(matches, 1.0), candidate(slightly, 2.0), candidate(wrong, 0.5)]
     assert list(different(candidates)) == [candidates[1], candidates[2]]

@@ -14,12 +14,15 @@ from jaxsmw.matching.search.reading import Reading
 
 # The weights of `Evidence.features` in the log-odds, from a regression (scripts/learn_judge.py, entry R49 of
 # docs/research_log.md).
-_WEIGHTS = (-5.8, -1.3, -3.9, -2.1, 2.0)
+_WEIGHTS = (-5.8, -1.3, -3.9, -2.1, 2.0, 2.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
 # samples have as much.
 _LEAST_DEFORMATION, _LEAST_CHANGE = 0.01, 0.05
+# A map is in place if the mean distance between the given positions of samples and of their matches is below
+# this number of units of Y.
+_NEAR = 0.06
 # A sample of Y is uncovered if no match is nearer, in units of the square root of the area.
 _COVERED = 0.1
 
@@ -43,12 +46,14 @@ class Evidence(NamedTuple):
       to 1; see `orientation_change`.
     - `agreement`: the share of X's area, from 0 to 1, on which the map agrees with the map of the first
       start. It is 0 for all maps if both hands are compared.
+    - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
     """
 
     deformation: float
     uncovered: float
     orientation_change: float
     agreement: float
+    in_place: bool
 
     @classmethod
     def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
@@ -67,11 +72,13 @@ class Evidence(NamedTuple):
         else:
             deformed.append(y.areas @ deformation(y, x, reverse))
         uncovered = float(y.areas @ (to_matches.min(axis=1) > _COVERED))
+        offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         return cls(
             deformation=float(np.mean(deformed)),
             uncovered=max(0.0, uncovered - lacking),
             orientation_change=float(np.mean(turned)),
             agreement=reading.agreement(matches),
+            in_place=bool(areas_x @ offsets < _NEAR * y.unit) and not reading.prepared.mirrored,
         )
 
     @property
@@ -79,7 +86,8 @@ class Evidence(NamedTuple):
         """What the log-odds depend on linearly, with 1 for the intercept first."""
         deformation = np.log(self.deformation + _LEAST_DEFORMATION)
         orientation_change = np.log(self.orientation_change + _LEAST_CHANGE)
-        return np.array([1.0, deformation, np.sqrt(self.uncovered), orientation_change, self.agreement])
+        uncovered = np.sqrt(self.uncovered)
+        return np.array([1.0, deformation, uncovered, orientation_change, self.agreement, self.in_place])
 
     @property
     def log_odds(self) -> float:
@@ -87,7 +95,7 @@ class Evidence(NamedTuple):
         return float(_WEIGHTS @ self.features)
 
 
-NO_EVIDENCE = Evidence(np.inf, uncovered=1.0, orientation_change=1.0, agreement=0.0)
+NO_EVIDENCE = Evidence(np.inf, uncovered=1.0, orientation_change=1.0, agreement=0.0, in_place=False)
 """What there is for a map whose refinement failed. Its log-odds are minus infinity."""
 
 
