@@ -14,7 +14,7 @@ from jaxsmw.matching.search.reading import Reading
 
 # The weights of `Evidence.features` in the log-odds, from a regression (scripts/learn_judge.py, entry R49 of
 # docs/research_log.md).
-_WEIGHTS = (-5.8, -1.3, -3.9, -2.1, 2.0, 2.0)
+_WEIGHTS = (-6.6, -2.5, -3.5, -1.7, 1.0, 2.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
