@@ -285,10 +285,11 @@ def test_the_best_map_of_the_race_is_the_same_in_any_position(pair, winner_elsew
     assert mean_error(mesh_y, found, winner_elsewhere) < 0.02
 
 
-def test_one_extremity_has_no_orientation(pair, monkeypatch):
-    monkeypatch.setattr("jaxsmw.matching.search.proxies._MOST_EXTREMITIES", 1)
+@pytest.mark.parametrize("number", [1, 2])
+def test_few_extremities_have_no_orientation(pair, monkeypatch, number):
+    monkeypatch.setattr("jaxsmw.matching.search.proxies._MOST_EXTREMITIES", number)
     reading = read(*pair[:2])
-    (matches,) = by_extremities(reading)
+    matches, *_ = by_extremities(reading)
     assert matches.shape == reading.x.areas.shape and matches.max() < len(reading.y.areas)
     assert orientation_change(reading.x, reading.y, matches) == 0.5
 
