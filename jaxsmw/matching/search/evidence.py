@@ -25,8 +25,9 @@ _LEAST_DEFORMATION, _LEAST_CHANGE = 0.01, 0.05
 _NEAR = 0.06
 # A sample of Y is uncovered if no match is nearer, in units of the square root of the area.
 _COVERED = 0.1
-# The least number of extremities from which sides are seen.
-_FEWEST_ENDS = 3
+# The least number of extremities from which sides are seen, and the change of orientations of all maps if there
+# are fewer, which lies between those of right and of wrong maps.
+_FEWEST_ENDS, _UNKNOWN_CHANGE = 3, 0.2
 
 
 class Evidence(NamedTuple):
@@ -145,12 +146,12 @@ def orientation_change(source: Proxy, target: Proxy, matches: SampleMap) -> floa
 
     **Returns:** The share of the extremity pairs for which a sample and its match are on opposite sides,
     averaged over the area, from 0 to 1. A pair counts by the product of both volumes, because sides are
-    uncertain where a volume is small. With fewer than three extremities, the share is one half: the two ends
-    of a long body lie in opposite directions, so all volumes are small.
+    uncertain where a volume is small. With fewer than three extremities, the share is 0.2: the two ends of
+    a long body lie in opposite directions, so all volumes are small.
     """
     ends = source.extremities.samples
     if len(ends) < _FEWEST_ENDS:
-        return 0.5
+        return _UNKNOWN_CHANGE
     first, second = np.triu_indices(len(ends), 1)
     ours = source.sides[:, first, second]
     theirs = target.orientations(matches[ends])[matches][:, first, second]
