@@ -25,8 +25,8 @@ _LEAST_DEFORMATION, _LEAST_CHANGE = 0.01, 0.05
 _NEAR = 0.06
 # A sample of Y is uncovered if no match is nearer, in units of the square root of the area.
 _COVERED = 0.1
-# The least number of extremities from which sides are seen, and the change of orientations of all maps if there
-# are fewer, which lies between those of right and of wrong maps.
+# The least number of extremities from which sides are seen. With fewer of them, all maps have this change of
+# orientations, which lies between those of right and of wrong maps.
 _FEWEST_ENDS, _UNKNOWN_CHANGE = 3, 0.2
 
 
