@@ -69,9 +69,9 @@ class Evidence(NamedTuple):
         elif pair.partial:
             lacking = 1 - pair.areas[0] / pair.areas[1]
         deformed = [areas_x @ deformation(x, y, matches)]
-        turned = [orientation_change(x, y, matches), orientation_change(y, x, reverse)]
+        ways = [(x, y, matches), (y, x, reverse)]
         if pair.partial:
-            turned = [turned[pair.source_is_whole]]
+            ways = [ways[pair.source_is_whole]]
         else:
             deformed.append(y.areas @ deformation(y, x, reverse))
         uncovered = float(y.areas @ (to_matches.min(axis=1) > _COVERED))
@@ -79,7 +79,7 @@ class Evidence(NamedTuple):
         return cls(
             deformation=float(np.mean(deformed)),
             uncovered=max(0.0, uncovered - lacking),
-            orientation_change=float(np.mean(turned)),
+            orientation_change=float(np.mean([orientation_change(*way) for way in ways])),
             agreement=reading.agreement(matches),
             in_place=bool(areas_x @ offsets < _NEAR * y.unit) and not reading.prepared.mirrored,
         )
