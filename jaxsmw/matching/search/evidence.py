@@ -20,9 +20,9 @@ _CONTRAST = 5.0
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
 # samples have as much.
 _LEAST_DEFORMATION, _LEAST_CHANGE = 0.01, 0.05
-# A map is in place if the mean distance between the given positions of samples and of their matches is below
-# this number of units of Y.
-_NEAR = 0.06
+# A map is in place if the mean distance between the given positions of samples and of their matches exceeds
+# that of the nearest samples by less than this number of units of Y.
+_NEAR = 0.03
 # A sample of Y is uncovered if no match is nearer, in units of the square root of the area.
 _COVERED = 0.1
 # The least number of extremities from which sides are seen. With fewer of them, all maps have this change of
@@ -49,7 +49,8 @@ class Evidence(NamedTuple):
       to 1; see `orientation_change`.
     - `agreement`: the share of X's area, from 0 to 1, on which the map agrees with the map of the first
       start. It is 0 for all maps if both hands are compared.
-    - `in_place`: whether matches have nearly the same given positions, because the meshes were aligned.
+    - `in_place`: whether matches are hardly farther away than the nearest samples, in the given positions,
+      because the meshes were aligned.
     """
 
     deformation: float
@@ -75,13 +76,12 @@ class Evidence(NamedTuple):
         else:
             deformed.append(y.areas @ deformation(y, x, reverse))
         uncovered = float(y.areas @ (to_matches.min(axis=1) > _COVERED))
-        offsets = np.linalg.norm(x.positions * x.unit - y.positions[matches] * y.unit, axis=1)
         return cls(
             deformation=float(np.mean(deformed)),
             uncovered=max(0.0, uncovered - lacking),
             orientation_change=float(np.mean([orientation_change(*way) for way in ways])),
             agreement=reading.agreement(matches),
-            in_place=bool(areas_x @ offsets < _NEAR * y.unit) and not reading.prepared.mirrored,
+            in_place=not reading.prepared.mirrored and bool(areas_x @ reading.excess(matches) < _NEAR),
         )
 
     @property

@@ -53,8 +53,7 @@ def by_alignment(reading: Reading) -> Iterator[SampleMap]:
 def by_given_positions(reading: Reading) -> Iterator[SampleMap]:
     """Match samples at the nearest given positions, in case the meshes were aligned by their owner."""
     if not reading.prepared.mirrored:
-        placed = [side.positions * side.unit for side in (reading.x, reading.y)]
-        yield KDTree(placed[1]).query(placed[0])[1]
+        yield reading.nearest
 
 
 def by_principal_axes(reading: Reading) -> Iterator[SampleMap]:

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int64
+from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import extend_to_unreferenced
@@ -127,6 +128,20 @@ class Reading:
         Without a first map, the share is 0.
         """
         return 0.0 if self.first is None else 1 - self.difference(self.first, matches)
+
+    @cached_property
+    def nearest(self) -> SampleMap:
+        """The map to the samples of Y at the nearest given positions (s,)."""
+        placed_x, placed_y = (side.positions * side.unit for side in (self.x, self.y))
+        return KDTree(placed_y).query(placed_x)[1]
+
+    def excess(self, matches: SampleMap) -> Float[np.ndarray, " s"]:
+        """Return how much farther matches (s,) lie than the nearest samples, as given, in units of Y."""
+        placed = self.x.positions * self.x.unit / self.y.unit
+        matched, nearest = (
+            np.linalg.norm(placed - self.y.positions[samples], axis=1) for samples in (matches, self.nearest)
+        )
+        return matched - nearest
 
 
 # The radii of SHOT, in units of 0.06, and the least mean asymmetry of asymmetric shapes. (Entry R23)
