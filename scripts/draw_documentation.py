@@ -231,6 +231,33 @@ def draw_transfers() -> None:
     draw_side_by_side("attributes", {"Source": (mesh_x, stripes), "Target": (mesh_y, moved)})
 
 
+def draw_completion() -> None:
+    """Draw a part, the completed mesh with its standard deviations, and the true shape."""
+    body = creature("biped", vertices=1500)
+    random = np.random.default_rng(0)
+    waves = np.sin(3 * body.vertices @ random.normal(size=(3, 8)))
+    shapes = [
+        body.vertices * random.uniform(0.9, 1.1, 3) + 0.02 * waves @ random.normal(size=(8, 3))
+        for _ in range(13)
+    ]
+    shown = body.vertices[:, 0] < np.quantile(body.vertices[:, 0], 0.75)
+    whole = jaxsmw.make_mesh(shapes[-1], body.faces)
+    part = jaxsmw.make_mesh(shapes[-1], body.faces[shown[body.faces].all(axis=1)])
+    model = jaxsmw.collection.shape_model(shapes[:-1], weights=body.vertex_areas)
+    completed = jaxsmw.collection.complete_mesh(part, model, body.faces)
+    deviation = completed.standard_deviation
+    share = ((deviation - deviation.min()) / np.ptp(deviation))[:, None]
+    grey = np.full((len(body.vertices), 3), 0.8)
+    draw_side_by_side(
+        "completed",
+        {
+            "Part": (part, grey),
+            "Completed": (completed.mesh, (1 - share) * grey + share * np.array([0.8, 0.2, 0.1])),
+            "True shape": (whole, grey),
+        },
+    )
+
+
 def draw_another_kind() -> None:
     """Draw a collection of quadrupeds and one biped, each with the colours of the template."""
     kinds = [
@@ -322,7 +349,7 @@ def main() -> None:
         "--only",
         nargs="+",
         metavar="NAME",
-        help="draw only these: `tutorial`, `transfers`, `another_kind`, `collection`, "
+        help="draw only these: `tutorial`, `transfers`, `completion`, `another_kind`, `collection`, "
         "`asymmetry`, or names of cases",
     )
     options = parser.parse_args()
@@ -330,6 +357,7 @@ def main() -> None:
     for name, draw in (
         ("tutorial", draw_tutorial),
         ("transfers", draw_transfers),
+        ("completion", draw_completion),
         ("another_kind", draw_another_kind),
         ("collection", draw_without_search),
         ("asymmetry", draw_asymmetry),

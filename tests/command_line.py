@@ -17,6 +17,7 @@ COMMANDS = (
     "match",
     "transfer",
     "collection",
+    "complete",
     "evaluate",
     "benchmark",
     "spectrum",

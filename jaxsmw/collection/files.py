@@ -17,20 +17,24 @@ import numpy as np
 
 from jaxsmw.collection.result import Collection
 from jaxsmw.collection.semilandmarks import TITLES, Semilandmarks, Sliders
-from jaxsmw.collection.shape_models import ShapeModel
-from jaxsmw.errors import InputError
-from jaxsmw.geometry.mesh import Mesh
+from jaxsmw.collection.shape_models import ProcrustesAlignment, ShapeModel, modes_of
+from jaxsmw.errors import InputError, naming
+from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.io.formats.morphometrics import format_specimens
+from jaxsmw.io.formats.npz import read_arrays
 from jaxsmw.io.landmark_files import write_landmark_file
 from jaxsmw.io.landmarks import Landmarks
 from jaxsmw.io.maps import write_pointwise_map
 from jaxsmw.io.mesh_data import MeshData
-from jaxsmw.io.meshes import write_mesh_data
-from jaxsmw.runtime.files import atomic_write, check_writable, make_directory, write_csv
+from jaxsmw.io.meshes import read_mesh, write_mesh_data
+from jaxsmw.runtime.files import atomic_write, check_writable, make_directory, read_bytes, write_csv
 from jaxsmw.transfer.attributes import registered_data, transfer_attributes
 from jaxsmw.transfer.landmarks import transfer_landmarks
 
 logger = logging.getLogger("jaxsmw")
+
+# Factors of size that differ from 1 by less are rounding errors.
+_ROUNDING = 1e-9
 
 # The files and directories that contain results. The mean shape is not listed, because users choose its
 # suffix.
@@ -156,6 +160,59 @@ def write_model(collection: Collection, model: ShapeModel, directory: Path, suff
     rows += [[name, *scores] for name, scores in zip(collection.names, model.scores.tolist(), strict=True)]
     write_csv(directory / "scores.csv", rows)
     return [directory / f"mean{suffix}", directory / "modes.npz", directory / "scores.csv"]
+
+
+def read_shape_model(directory: str | os.PathLike[str]) -> tuple[ShapeModel, Mesh]:
+    """Read the shape model that `jaxsmw collection` wrote to a directory.
+
+    The model has all modes of the registered meshes, even if `--modes` left some out of the files.
+
+    **Returns:** The `ShapeModel`, and the mean shape as a `Mesh` with the triangles of the template.
+
+    **Raises:** `InputError` if the directory does not contain the complete results of a collection.
+    """
+    folder = Path(directory)
+    with naming(folder / "modes.npz"):
+        stored = read_arrays(read_bytes(folder / "modes.npz", largest=None))
+        if missing := {"faces", "weights", "matrices", "translations"} - set(stored):
+            raise InputError(f"contains no array called {min(missing)}: run `jaxsmw collection` again.")
+    faces, weights, matrices, moves = (
+        stored[name] for name in ("faces", "weights", "matrices", "translations")
+    )
+    registered = [
+        file for file in _listed_files(folder / "collection.json") if file.startswith("registered/")
+    ]
+    by_name = {Path(file).stem: folder / file for file in registered}
+    names = [
+        str(shape.get("name")) for shape in _in_summary(folder / "collection.json", "shapes", list) or []
+    ]
+    if len(names) != len(matrices) or set(names) - set(by_name):
+        raise InputError(
+            f"{folder / 'collection.json'}: does not list the registered meshes of modes.npz: run `jaxsmw "
+            "collection` again."
+        )
+    aligned = []
+    for name, matrix, move in zip(names, matrices, moves, strict=True):
+        mesh = read_mesh(by_name[name])
+        if len(mesh.vertices) != len(weights):
+            raise InputError(
+                f"{by_name[name]}: has {len(mesh.vertices)} vertices, but modes.npz has {len(weights)}: run "
+                "`jaxsmw collection` with --suffix .ply, which keeps the vertices."
+            )
+        aligned.append(mesh.vertices @ matrix.T + move)
+    hands = np.sign(np.linalg.det(matrices))
+    scales = np.cbrt(np.abs(np.linalg.det(matrices)))
+    alignment = ProcrustesAlignment(
+        np.array(aligned),
+        np.mean(aligned, axis=0),
+        # The matrices include the reflection of shapes of the other hand.
+        matrices * np.where(hands[:, None] < 0, [-1.0, 1.0, 1.0], 1.0)[:, None] / scales[:, None, None],
+        moves,
+        scales,
+        weights,
+        bool(np.abs(scales - 1).max() > _ROUNDING),
+    )
+    return modes_of(alignment), make_mesh(alignment.mean, faces, name=str(folder / "mean"))
 
 
 def write_summary(

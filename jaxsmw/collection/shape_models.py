@@ -323,6 +323,11 @@ def shape_model(
     if number_of_modes is not None:
         number_of_modes = check_whole_number("number_of_modes", number_of_modes, 1)
     alignment = align(shapes, scale=scale, weights=weights, reference=reference)
+    return modes_of(alignment, number_of_modes)
+
+
+def modes_of(alignment: ProcrustesAlignment, number_of_modes: int | None = None) -> ShapeModel:
+    """Compute the modes of aligned shapes; see `shape_model`."""
     coordinates = _coordinates(alignment)
     squared = (coordinates**2).sum(axis=0)
     variances = squared / max(len(coordinates) - 1, 1)
