@@ -454,6 +454,8 @@ def test_a_part_given_as_a_whole_is_matched_as_a_part(share):
     used = part.referenced_indices
     error = mean_error(creatures.target, found.pointwise_map[used], creatures.true_map[used])
     assert found.pair.partial and error < 0.03
+    called_partial = match(part, creatures.target, partial=True)
+    assert mean_error(creatures.target, found.pointwise_map, called_partial.pointwise_map) < 0.01
 
 
 @pytest.mark.slow

@@ -47,8 +47,8 @@ class Evidence(NamedTuple):
       no counterpart on a partial X.
     - `orientation_change`: how often the map exchanges the sides of the body, such as belly and back, from 0
       to 1; see `orientation_change`.
-    - `agreement`: the share of X's area, from 0 to 1, on which the map agrees with the map of the first
-      start. It is 0 for all maps if both hands are compared.
+    - `agreement`: the share of X's area, from 0 to 1, on which the map agrees with the first map of its
+      reading. It is 0 for all maps if both hands are compared.
     - `in_place`: whether matches are hardly farther away than the nearest samples, in the given positions,
       because the meshes were aligned.
     """

@@ -32,7 +32,7 @@ class Reading:
 
     - `prepared`: the `PreparedPair`. Its attributes `mirrored` and `pair.partial` tell how the pair is read.
     - `x`, `y`: the proxies of X (s samples) and of Y (t samples), in `Pair.units_of_length`.
-    - `first`: the map of the first start on the samples (s,). None if there is no such map.
+    - `first`: the first map of the reading, from SHOT, on the samples (s,). None if there is no such map.
     """
 
     prepared: PreparedPair
@@ -58,7 +58,7 @@ class Reading:
         return Reading(self.prepared.mirror(), self.x.mirror(), self.y)
 
     def with_first(self, pointwise_map: Int64[np.ndarray, " m"]) -> Reading:
-        """Return the reading for which a map X -> Y (m,) is the map of the first start."""
+        """Return the reading whose first map is a map X -> Y (m,)."""
         return replace(self, first=self.reduced(pointwise_map))
 
     def is_asymmetric(self) -> bool:

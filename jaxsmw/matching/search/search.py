@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from jaxsmw.choices import Mirror
+from jaxsmw.choices import DEFAULT_INITIAL_MAP, Mirror
 from jaxsmw.core.arrays import namespace
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
@@ -27,6 +28,7 @@ from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
 from jaxsmw.matching.stages import Preset
+from jaxsmw.matching.starts import make_start
 
 logger = logging.getLogger("jaxsmw")
 
@@ -100,6 +102,11 @@ def search(
     judged = [first]
     certain = settings.certain == 0 or (_ends_the_search(first, settings) and not both_hands)
     readings = readings_of(reading, both_hands=both_hands) if hypotheses and not certain else [reading]
+    if not both_hands:
+        for part, other in enumerate(readings[1:], 1):
+            with suppress(InputError):  # in its unit of length, the part can be too coarse for SHOT
+                judged.append(_first(other, preset))
+                readings[part] = judged[-1].reading
     for number in range(_ROUNDS):
         if certain:
             break
@@ -111,8 +118,8 @@ def search(
         if not likely:
             break
         if number == 0:  # The rivals have passed the race as well.
-            again = _refined(first, preset)
-            judged = [again] if again.outcome.successful else judged
+            again = [_refined(one, preset) for one in judged]
+            judged = [one for one in again if one.outcome.successful] or judged
         refined = [_refined(one, preset) for one in likely]
         judged = list(different([*judged, *refined]))
         certain = _certain(judged, settings)
@@ -216,13 +223,23 @@ def _as_parts(reading: Reading) -> Iterator[Reading]:
                 part = Pair.make(*pair.meshes, partial=True, scale=scale)
             if all(abs(np.log(part.scale / other)) > _SAME_SCALE for other in known):
                 known.append(part.scale)
-                yield replace(Reading.of(prepared.as_part(part)), first=reading.first)
+                yield Reading.of(prepared.as_part(part))
         except InputError:  # no scale can be estimated, or the closed mesh is the smaller one
             continue
 
 
 # Two scales are the same if their logarithms differ by less.
 _SAME_SCALE = 0.05
+
+
+def _first(reading: Reading, preset: Preset) -> Judged:
+    """Match a reading from a first start of its own, as if it were the only one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the given meshes have already caused the same warnings
+        reading = reading.described(preset)
+        start = make_start(reading.prepared, DEFAULT_INITIAL_MAP)
+    outcome = run(preset.before_final, reading.prepared.spectra, start)
+    return Judged.of(reading.with_first(outcome.pointwise_map) if outcome.successful else reading, outcome)
 
 
 def _refined(candidate: Candidate, preset: Preset) -> Judged:
