@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import json
 import os
 import re
@@ -174,6 +175,24 @@ def measure_pairs(
 def scan_files(directory: Path) -> list[Path]:
     """Return all mesh files of a data set below a directory."""
     return sorted(file for file in directory.rglob("*") if file.suffix in (".off", ".ply", ".vtk"))
+
+
+def draw_scans(directory: Path, number: int) -> list[tuple[Path, Path]]:
+    """Return at most `number` pairs of meshes of a data set, in random order.
+
+    If there are fewer pairs, the same pairs in the reverse direction follow.
+    """
+    listing = directory / "test_pairs.txt"
+    if listing.exists():
+        by_name = {file.stem: file for file in directory.rglob("*.off")}
+        lines = (line.split() for line in listing.read_text("utf-8").splitlines())
+        pairs = [(by_name[Path(x).stem], by_name[Path(y).stem]) for x, y, *_ in lines]
+    else:
+        pairs = list(itertools.combinations(scan_files(directory), 2))
+    if not pairs:
+        raise InputError(f"{directory}: contains no meshes: give the directory of the data sets.")
+    drawn = [pairs[i] for i in np.random.default_rng(0).permutation(len(pairs))]
+    return [*drawn, *((y, x) for x, y in drawn)][:number]
 
 
 def side_of(scan: Path) -> str:

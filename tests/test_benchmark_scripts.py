@@ -9,15 +9,18 @@ from pathlib import Path
 
 import benchmark_batches
 import benchmark_collection
+import benchmark_landmarks
 import benchmark_speed
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from sampled_cases import first_always
+from scipy.spatial.transform import Rotation
 
+from jaxsmw import make_mesh
 from jaxsmw.creature import creature
-from jaxsmw.io import write_mesh
+from jaxsmw.io import Landmarks, write_mesh
 
 pytestmark = pytest.mark.study
 
@@ -50,6 +53,22 @@ def test_batches_of_methods_and_of_maps_of_descriptors_are_measured(monkeypatch,
     arguments = ["--quick", "--pairs", "2", "--vertices", "150", "--eigenvectors", "8", "--sizes", "6", "9"]
     rows = rows_of(monkeypatch, capsys, tmp_path, *arguments, "--only", "methods", "descriptors")
     assert {"LeastSquares", "FeatureRegression", "6", "9"} <= set(rows)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_opponents_carry_landmarks_to_a_turned_copy(mirrored):
+    """All settings of CPD find a copy that is turned by a right angle and twice as large."""
+    pytest.importorskip("rustcpd")
+    body = creature("quadruped", vertices=1000)
+    marks = Landmarks(("nose", "tail"), body.vertices[[3, 200]])
+    hand = np.array([-1.0 if mirrored else 1.0, 1.0, 1.0])
+    turn = Rotation.from_rotvec([0.0, np.pi / 2, 0.0])
+    faces = body.faces[:, ::-1] if mirrored else body.faces
+    copy = make_mesh(2 * turn.apply(body.vertices * hand), faces)
+    carried = benchmark_landmarks._opponents(body, copy, marks, mirrored)
+    assert len(carried) == 9
+    for positions, _ in carried.values():
+        np.testing.assert_allclose(positions, copy.vertices[[3, 200]], atol=0.05 * copy.area**0.5)
 
 
 @pytest.mark.sampled
