@@ -83,11 +83,11 @@ def race(
         new = [best for best in islice(different(found), _MENDED) if best not in moved]
         found += _refined([move for best in new for move in _moves(best, readings)])
         moved += new
+    if all(reading.prepared.pair.partial for reading in readings):
+        return list(different(found))  # registration moves a part away from its place on a different body
     best = list(islice(different(found), _REGISTERED))
     # Registration improves most maps. It makes a limb of others collapse, so they stay as they were as well.
-    # It moves a part away from its place on a different body.
-    whole = [_Task.of(one) for one in best if not one.reading.prepared.pair.partial]
-    return list(different([*best, *_refined(whole, _LAST_STAGES)]))
+    return list(different([*best, *_refined([_Task.of(one) for one in best], _LAST_STAGES)]))
 
 
 def hand_evidence(reading: Reading) -> float:
