@@ -415,8 +415,11 @@ def test_readings_are_tried_only_where_they_are_possible(pair, lump, monkeypatch
     )
     seen = []
 
-    def watched(readings, *_):
+    def watched(readings, known, *_):
         seen.extend((one.prepared.mirrored, one.prepared.pair.partial) for one in readings)
+        # A reading with a part has a first map of its own. The given start is one vertex.
+        own = [one for one in readings if one.prepared.pair.partial]
+        assert all(len(set(one.first)) > 10 and any(first.reading is one for first in known) for one in own)
         return []
 
     monkeypatch.setattr("jaxsmw.matching.search.search.race", watched)
@@ -454,8 +457,6 @@ def test_a_part_given_as_a_whole_is_matched_as_a_part(share):
     used = part.referenced_indices
     error = mean_error(creatures.target, found.pointwise_map[used], creatures.true_map[used])
     assert found.pair.partial and error < 0.03
-    called_partial = match(part, creatures.target, partial=True)
-    assert mean_error(creatures.target, found.pointwise_map, called_partial.pointwise_map) < 0.01
 
 
 @pytest.mark.slow
