@@ -43,7 +43,7 @@ html_math_renderer = "mathml"
 
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 180
+nb_execution_timeout = 600
 
 # Every name of this library in docstrings and pages must exist.
 nitpicky = True
