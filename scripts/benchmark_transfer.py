@@ -61,7 +61,7 @@ def _summary(journal: Journal) -> str:
     generator = np.random.default_rng(0)
     texts = []
     for column in journal.rows[0]:
-        if column not in ("source", "target", "mirrored"):
+        if column not in ("source", "target"):
             values = np.array([float(row[column]) for row in journal.rows])
             means = values[generator.integers(len(values), size=(1000, len(values)))].mean(axis=1)
             low, high = np.quantile(means, [0.025, 0.975])
