@@ -134,6 +134,14 @@ def bumpy_mesh(subdivisions: int = 4, *, number: int | None = None) -> Mesh:
     return make_mesh(vertices * (1 + waves)[:, None], faces)
 
 
+def vase_mesh(folds: int, *, number: int = 2000) -> Mesh:
+    """A round body with `folds` vertical ribs, which a turn by one rib brings onto itself."""
+    vertices, faces = spiral_sphere(number)
+    around, height = np.arctan2(vertices[:, 1], vertices[:, 0]), vertices[:, 2]
+    ribs = 0.3 * (1 - height**2) ** 1.5 * np.cos(folds * around)
+    return make_mesh(vertices * (1 + ribs + 0.2 * height - 0.3 * height**2)[:, None] * [1, 1, 1.5], faces)
+
+
 def body_with_arms(subdivisions: int = 4) -> Mesh:
     """The sphere of `bumpy_mesh` with an arm on the left and an arm on the right."""
     sphere = bumpy_mesh(subdivisions)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from synthetic import bumpy_mesh, sphere_mesh
+from synthetic import bumpy_mesh, sphere_mesh, vase_mesh
 
 from jaxsmw import Pair, initial_map, make_mesh, match, paired_spectra
-from jaxsmw.geometry.alignment import align_rigidly
+from jaxsmw.geometry.alignment import align_rigidly, symmetries
 
 LUMP = bumpy_mesh(3)
 
@@ -112,3 +112,18 @@ def test_tangent_planes_are_not_used_for_shapes_that_only_resemble_each_other():
     plain = align_rigidly(LUMP.vertices, other.vertices)
     with_normals = align_rigidly(LUMP.vertices, other.vertices, other.vertex_normals)
     np.testing.assert_array_equal(with_normals.rotation, plain.rotation)
+
+
+@pytest.mark.parametrize("folds", [2, 3, 4, 5])
+def test_a_vase_with_ribs_has_one_symmetry_fewer_than_ribs(folds):
+    mesh = make_mesh(Rotation.random(random_state=1).apply(vase_mesh(folds).vertices), vase_mesh(folds).faces)
+    surface = mesh.vertices[::2] / mesh.area**0.5, mesh.vertex_normals[::2]
+    turns = [Rotation.from_matrix(motion.rotation) for motion in symmetries(*surface)]
+    angles = sorted(round(turn.magnitude() / (2 * np.pi / folds), 1) for turn in turns)
+    assert angles == sorted(min(rib, folds - rib) for rib in range(1, folds))
+    assert symmetries(*surface, mirrored=True)
+
+
+def test_a_lump_has_no_symmetry():
+    surface = LUMP.vertices / LUMP.area**0.5, LUMP.vertex_normals
+    assert not symmetries(*surface) and not symmetries(*surface, mirrored=True)

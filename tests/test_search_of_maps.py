@@ -8,7 +8,7 @@ import pytest
 from sampled_cases import first_always
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from synthetic import body_with_arms, bumpy_mesh, mean_error, sphere_mesh
+from synthetic import body_with_arms, bumpy_mesh, mean_error, sphere_mesh, vase_mesh
 
 import jaxsmw
 from jaxsmw import Mesh, creature_pair, make_mesh, match
@@ -495,6 +495,36 @@ def test_the_given_hand_is_used(lump):
     alone = match(lump.mirrored(), target, preset="fast", mirror="no")
     assert (given.mirrored, alone.mirrored) == (True, False)
     np.testing.assert_array_equal(given.pointwise_map, alone.pointwise_map)
+
+
+@pytest.mark.filterwarnings("ignore:.*the map is wrong as a whole:UserWarning")
+def test_the_maps_of_a_symmetric_shape_are_equally_probable():
+    vase = vase_mesh(3)
+    target = turned(vase)
+    found = match(vase, target)
+    assert not found.mirrored and len(found.alternatives) == 2
+    assert [other.probability for other in found.alternatives] == pytest.approx([found.probability] * 2)
+    angles = [int(re.match(r"turned by (\d+)°", other.difference)[1]) for other in found.alternatives]
+    assert angles == pytest.approx([120, 120], abs=5)
+    maps = found.pointwise_map, *(other.pointwise_map for other in found.alternatives)
+    apart = [target.vertices[one] - target.vertices[order_of(vase)] for one in maps]
+    assert min(np.linalg.norm(one, axis=1).mean() for one in apart) < 0.03 * target.area**0.5
+
+
+def test_a_map_to_a_part_is_turned_on_the_whole_shape():
+    whole = vase_mesh(4)
+    part = make_mesh(whole.vertices, whole.faces[whole.vertices[whole.faces, 2].max(axis=1) < 0.8])
+    reading = read(whole, part, partial=True)
+    kept = part.referenced_indices
+    nearest = kept[KDTree(part.vertices[kept]).query(whole.vertices)[1]]
+    judged = replace(known_map(reading, nearest), share=0.8).with_turns()
+    # A map of aligned meshes is in place, but its turns are not.
+    assert [one.evidence.in_place for one in judged] == [True, False, False, False]
+    assert sum(one.share for one in judged) == pytest.approx(0.8) and judged[0].share > 0.7
+    around = np.arctan2(part.vertices[:, 1], part.vertices[:, 0])
+    for one in judged[1:]:
+        angles = around[one.pointwise_map] - around[nearest]
+        assert np.exp(4j * angles[kept]).real.mean() > 0.8 and np.exp(1j * angles[kept]).real.mean() < 0.1
 
 
 @pytest.mark.slow

@@ -24,6 +24,12 @@ _MOVED_FIRST = 500
 # Two alignments are different if the root mean square distance between the moved points exceeds this share of
 # the root mean square distance of y from its mean.
 _DIFFERENT = 0.25
+# Two principal axes are interchangeable if the smaller variance is at least this share of the larger one.
+_INTERCHANGEABLE = 0.85
+# A rotation is a symmetry if the root mean square distance of moved samples from the tangent planes at the
+# nearest samples is smaller, in units of length. That of people in nearly the same pose as their turned
+# image is at least 0.01.
+_ONTO_ITSELF = 0.005
 # The distance of the points on normals from the surface, in units of length.
 _THICKNESS = 0.1
 # The weight of unit normals beside positions in oriented points, in units of length.
@@ -48,7 +54,11 @@ class Alignment(NamedTuple):
 
     def apply(self, points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
         """Move points (p, 3)."""
-        return points @ self.rotation.T + self.offset
+        return self.turn(points) + self.offset
+
+    def turn(self, directions: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "p 3"]:
+        """Turn directions, such as normals (p, 3)."""
+        return directions @ self.rotation.T
 
 
 def align_rigidly(
@@ -77,7 +87,14 @@ def align_rigidly(
     first = _iterated(x, y, tree, [*_between_axes(x, y), *Rotation.create_group("I").as_matrix()])[:_BEST]
     further = [_closest_points(x, y, tree, motion, _FURTHER) for _, motion in first]
     best = min(further, key=lambda motion: _distance(x, y, tree, motion))
-    return best if normals is None else _slide(x, y, normals, tree, best)
+    if normals is None:
+        return best
+    slid = _slide(x, y, normals, tree, best)
+    offsets = (_to_tangent_planes(x, y, normals, tree, motion)[2] for motion in (best, slid))
+    before, after = (np.abs(offset).mean() for offset in offsets)
+    # If the shapes do not fit each other, the iterations slide x too far. The mean distance then decreases
+    # only slightly.
+    return slid if after < _MUCH_SMALLER * before else best
 
 
 def alignments(x: Float64[np.ndarray, "p 3"], y: Float64[np.ndarray, "q 3"], number: int) -> list[Alignment]:
@@ -115,6 +132,43 @@ def different_alignments(
         if len(kept) == number:
             break
     return [motion for motion, _ in kept]
+
+
+def symmetries(
+    points: Float64[np.ndarray, "p 3"], normals: Float64[np.ndarray, "p 3"], *, mirrored: bool = False
+) -> list[Alignment]:
+    """Return the rotations that bring a surface onto itself, the identity left out.
+
+    If `mirrored` is True, they bring the mirror image, whose points are `-points`, onto the surface instead.
+
+    The axis of a half turn is a principal axis of the surface. The axis of any other turn is one as well,
+    along which the variance differs from the two other ones, unless all three are equal. The iterations of
+    `align_rigidly` therefore run from few rotations. A surface of revolution gets turns by multiples of 30°.
+
+    **Arguments:**
+
+    - `points`: points (p, 3), evenly spread over the surface, in units in which its area is about 1.
+    - `normals`: the unit normals of the surface at the points (p, 3).
+    """
+    variances, axes = np.linalg.eigh(np.cov(points.T))
+    smaller, larger = variances[:2] >= _INTERCHANGEABLE * variances[1:]
+    if smaller and larger:
+        turns = Rotation.concatenate([Rotation.create_group(name) for name in "OI"])
+    else:
+        turns = Rotation.create_group("D12" if smaller or larger else "D2", axis="Z" if smaller else "X")
+    axes *= np.linalg.det(axes)
+    tree = KDTree(points)
+    moving = -points if mirrored else points
+    turned = _iterated(moving, points, tree, list(axes @ turns.as_matrix() @ axes.T))
+    motions = [_slide(moving, points, normals, tree, motion) for _, motion in turned]
+    offsets = (_to_tangent_planes(moving, points, normals, tree, motion)[2] for motion in motions)
+    distances = np.array([np.sqrt(np.mean(offset**2)) for offset in offsets])
+    closest = [motions[number] for number in np.argsort(distances)[: np.sum(distances < _ONTO_ITSELF)]]
+    least = _DIFFERENT**2 * variances.sum()
+    if mirrored:
+        return different_alignments(closest, moving, least, len(motions))
+    identity = Alignment(np.eye(3), np.zeros(3))
+    return different_alignments([identity, *closest], moving, least, len(motions))[1:]
 
 
 def _between_axes(
@@ -160,6 +214,19 @@ def _distance(
     return float(tree.query(moved)[0].mean() + KDTree(moved).query(y)[0].mean())
 
 
+def _to_tangent_planes(
+    x: Float64[np.ndarray, "p 3"],
+    y: Float64[np.ndarray, "q 3"],
+    normals: Float64[np.ndarray, "q 3"],
+    tree: KDTree,
+    motion: Alignment,
+) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
+    """Return the moved points x, the normals at the nearest points of y, and the distances to y's planes."""
+    moved = motion.apply(x)
+    nearest = tree.query(moved)[1]
+    return moved, normals[nearest], ((y[nearest] - moved) * normals[nearest]).sum(axis=1)
+
+
 def _slide(
     x: Float64[np.ndarray, "p 3"],
     y: Float64[np.ndarray, "q 3"],
@@ -168,25 +235,13 @@ def _slide(
     motion: Alignment,
 ) -> Alignment:
     """Minimise the distances of x to the tangent planes at the nearest points of y."""
-    # If the shapes do not fit each other, the iterations slide x too far. The mean distance then decreases
-    # only slightly, and the given motion is returned.
-
-    def to_planes(
-        motion: Alignment,
-    ) -> tuple[Float64[np.ndarray, "p 3"], Float64[np.ndarray, "p 3"], Float64[np.ndarray, " p"]]:
-        moved = motion.apply(x)
-        nearest = tree.query(moved)[1]
-        return moved, normals[nearest], ((y[nearest] - moved) * normals[nearest]).sum(axis=1)
-
-    first = motion
     for _ in range(_TO_PLANES):
-        moved, normal, distances = to_planes(motion)
+        moved, normal, distances = _to_tangent_planes(x, y, normals, tree, motion)
         # The first three unknowns are a small rotation vector, the last three a translation.
         step = np.linalg.lstsq(np.hstack([np.cross(moved, normal), normal]), distances, rcond=None)[0]
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         motion = Alignment(turn @ motion.rotation, turn @ motion.offset + step[3:])
-    before, after = (np.abs(to_planes(either)[2]).mean() for either in (first, motion))
-    return motion if after < _MUCH_SMALLER * before else first
+    return motion
 
 
 def _principal_axes(points: Float64[np.ndarray, "p 3"]) -> Float64[np.ndarray, "3 3"]:

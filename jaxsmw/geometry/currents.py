@@ -37,7 +37,7 @@ class Oriented(NamedTuple):
 
     def moved(self, motion: Alignment) -> Oriented:
         """Return the surface after a rigid motion."""
-        return Oriented(motion.apply(self.positions), self.normals @ motion.rotation.T, self.areas)
+        return Oriented(motion.apply(self.positions), motion.turn(self.normals), self.areas)
 
 
 def overlapping_alignments(x: Oriented, y: Oriented, number: int, *, dense: bool = True) -> list[Alignment]:

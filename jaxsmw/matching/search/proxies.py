@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 from scipy.sparse import coo_array, csgraph, csr_array, vstack
+from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from jaxsmw.core.arrays import namespace
 from jaxsmw.core.spectrum import Spectrum
+from jaxsmw.geometry.alignment import oriented_points, symmetries
 from jaxsmw.geometry.sampling import SurfaceSamples, farthest_point_samples
 from jaxsmw.geometry.shot import SHOT_RADIUS, mirrored_descriptors, sampled_shot_descriptors
 from jaxsmw.matching.shape import PreparedShape
@@ -186,6 +188,18 @@ class Proxy:
         ends = ends[np.argsort(-remoteness[ends], kind="stable")][:_MOST_EXTREMITIES]
         unit = max(remoteness[ends].mean(), np.finfo(np.float64).tiny)
         return Extremities(ends, distances[np.ix_(ends, ends)] / unit, remoteness[ends] / unit)
+
+    @functools.cached_property
+    def turns(self) -> list[Int64[np.ndarray, " n"]]:
+        """The maps of the vertices to themselves (n,) by the rotations that are symmetries of the shape."""
+        mesh, sampled = self.mesh, self.samples.vertices
+        among, placed, normals = mesh.referenced_indices, mesh.vertices / self.unit, mesh.vertex_normals
+        rotations = symmetries(placed[sampled], normals[sampled])
+        if not rotations:
+            return []
+        tree = KDTree(oriented_points(placed[among], normals[among]))
+        turned = (oriented_points(turn.apply(placed), turn.turn(normals)) for turn in rotations)
+        return [among[tree.query(points)[1]] for points in turned]
 
     @functools.cached_property
     def slopes(self) -> csr_array:

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int64
 from scipy.spatial import KDTree
 
 from jaxsmw.errors import InputError
+from jaxsmw.geometry.alignment import symmetries
 from jaxsmw.geometry.mesh import extend_to_unreferenced
 from jaxsmw.matching.descriptors import PrincipalAxes
 from jaxsmw.matching.preparation import PreparedPair
@@ -65,7 +66,8 @@ class Reading:
         """Return whether both shapes differ from their own mirror images, as teeth do, but people do not.
 
         Samples are matched to samples of the mirror image by SHOT. The asymmetry is the distance error of
-        this map, divided by that of a random map (seed 0). (Entry R23 of docs/research_log.md)
+        this map, divided by that of a random map (seed 0). (Entry R23 of docs/research_log.md) SHOT cannot
+        tell points of a smooth shape apart, such as a vase, so its mirror image is aligned with it as well.
         """
 
         def asymmetry(side: Proxy) -> float:
@@ -77,9 +79,11 @@ class Reading:
             return side.distance_error(matches) / max(side.distance_error(random), np.finfo(float).tiny)
 
         try:
-            return bool(np.mean(side_by_side(asymmetry, self.x, self.y)) >= _ASYMMETRIC)
+            if np.mean(side_by_side(asymmetry, self.x, self.y)) < _ASYMMETRIC:
+                return False
         except InputError:  # the samples are too sparse for SHOT
             return False
+        return not any(symmetries(side.positions, side.normals, mirrored=True) for side in (self.x, self.y))
 
     def described(self, preset: Preset) -> Reading:
         """Return the reading whose prepared pair has the descriptors that a preset uses."""

@@ -65,6 +65,23 @@ class Judged(Candidate):
         """The map of the last stage (m,), 0-based vertices of Y."""
         return self.outcome.pointwise_map
 
+    def with_turns(self) -> list[Judged]:
+        """Return this map, and this map with each turn of a symmetric shape, which share its probability.
+
+        The turns are those of Y or, if Y is a part of X, those of X. The maps have the same evidence, except
+        that not all maps of aligned meshes are in place.
+        """
+        reading, matches = self.reading, self.pointwise_map
+        if reading.prepared.pair.source_is_whole:
+            maps = [matches[turn] for turn in reading.x.turns]
+        else:
+            maps = [turn[matches] for turn in reading.y.turns]
+        turned = [Judged.of(reading, Outcome(one)) for one in maps]
+        evidence = [self.evidence._replace(in_place=one.evidence.in_place) for one in turned]
+        parts = self.share * shares([one.log_odds for one in (self.evidence, *evidence)])
+        judged = [self, *(replace(one, evidence=known) for one, known in zip(turned, evidence, strict=True))]
+        return [replace(one, share=float(part)) for one, part in zip(judged, parts, strict=True)]
+
 
 def search(
     prepared: PreparedPair,
@@ -98,7 +115,7 @@ def search(
         reading = replace(reading, first=None)
     first = Judged.of(reading, outcome)
     if settings is None:
-        return [first]
+        return distinct(_turned([first], hypotheses))
     judged = [first]
     certain = settings.certain == 0 or (_ends_the_search(first, settings) and not both_hands)
     readings = readings_of(reading, both_hands=both_hands) if hypotheses and not certain else [reading]
@@ -129,24 +146,30 @@ def search(
     judged = [_finished(one, preset) if again else one for one, again in zip(judged, probable, strict=True)]
     parts = np.sqrt(before * _shares_of(judged))
     parts /= parts.sum() or 1.0
-    return distinct(
-        replace(judged[number], share=float(parts[number])) for number in np.argsort(-parts, kind="stable")
-    )
+    judged = [replace(one, share=float(part)) for one, part in zip(judged, parts, strict=True)]
+    return distinct(_turned(judged, hypotheses))
+
+
+def _turned(judged: Sequence[Judged], hypotheses: bool) -> list[Judged]:
+    """Return maps with their turns. A start that the user gave tells one turn from the others."""
+    return [turn for one in judged for turn in one.with_turns()] if hypotheses else list(judged)
 
 
 def distinct(judged: Iterable[Judged]) -> list[Judged]:
-    """Return the maps that differ from all better ones, with the shares of their twins as well.
+    """Return the maps that differ from all more probable ones, the most probable first.
 
-    Maps whose refinement failed are left out, unless it is the best one.
+    A map has the shares of its twins as well. Maps whose refinement failed are left out, unless it is the
+    best one.
     """
     found: list[Judged] = []
-    for one in judged:
+    for one in sorted(judged, key=lambda one: -one.share):
         twin = next((number for number, other in enumerate(found) if one.is_twin(other)), None)
         if twin is not None:
             found[twin] = replace(found[twin], share=found[twin].share + one.share)
         elif not found or one.outcome.successful:
             found.append(one)
-    return found
+    best, *others = found  # its turns are as probable, up to rounding
+    return [best, *sorted(others, key=lambda one: -one.share)]
 
 
 def _shares_of(maps: Sequence[Candidate]) -> Float[np.ndarray, " c"]:
