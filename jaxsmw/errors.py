@@ -1,4 +1,4 @@
-"""The exception for input that cannot be used, and functions that check arguments."""
+"""The exception for input that cannot be used, a category of warnings, and functions that check arguments."""
 
 import math
 from collections.abc import Iterator
@@ -19,6 +19,10 @@ class InputError(ValueError):
     def lines(self) -> list[str]:
         """Return the message and the notes."""
         return [str(self), *getattr(self, "__notes__", ())]
+
+
+class WrongMapWarning(UserWarning):
+    """The category of warnings that a map is probably wrong as a whole."""
 
 
 @contextmanager

@@ -6,6 +6,9 @@ import unicodedata
 from collections.abc import Sequence
 from pathlib import PurePath
 
+MOST_LISTED = 3
+"""The largest number of other maps that a message lists."""
+
 
 def count_of(number: int, noun: str) -> str:
     """Return a number with its noun in the singular or the plural."""

@@ -400,7 +400,7 @@ def test_the_overlap_of_partial_shapes_is_written(run, pair, tmp_path):
     assert len(found) == len(mesh.vertices) == len(of_target)
     assert of_source.min() >= 0 and of_source.max() <= 1
     assert mesh.average(found == part.referenced_vertices) > 0.9
-    assert f"overlap:     {mesh.average(found):.0%} of the source's area and" in outcome.output
+    assert f"overlap:     predicted on {mesh.average(found):.0%} of the source's area and" in outcome.output
 
 
 @pytest.mark.filterwarnings("default:.*wrong as a whole")
@@ -611,7 +611,7 @@ def test_the_quality_of_the_map_is_printed(run, pair, tmp_path, monkeypatch):
         )
         assert next(lines) == "other maps:  1. mirrored, right with probability 20 %"
         assert next(lines) == "             2. mirrored, right with probability below 1 %"
-        assert next(lines) == "             none of these maps is right with probability 5 %"
+        assert next(lines) == "             all maps are wrong with probability 5 %"
 
 
 @pytest.mark.parametrize("name", ["map.txt", "map", "a.b.npy"])

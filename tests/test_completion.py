@@ -23,6 +23,7 @@ from jaxsmw.collection import (
 from jaxsmw.collection.conditioning import Family
 from jaxsmw.collection.files import write_model, write_registered, write_summary
 from jaxsmw.creature import creature
+from jaxsmw.errors import WrongMapWarning
 from jaxsmw.geometry.alignment import rigid_fit
 from jaxsmw.geometry.eigenbasis import eigenpairs
 from jaxsmw.geometry.mesh import Mesh, make_mesh
@@ -165,6 +166,29 @@ def test_a_part_is_completed_in_its_own_coordinates():
     np.testing.assert_array_equal(completed.mesh.faces, mean.faces)
 
 
+def with_lid(part: Mesh) -> Mesh:
+    """Close the boundary of a part whose cut is one loop, by triangles to the middle of the loop."""
+    edges = part.boundary_edges
+    middle = part.vertices[edges[:, 0]].mean(axis=0)
+    lid = np.column_stack([edges[:, ::-1], np.full(len(edges), len(part.vertices))])
+    return make_mesh(np.vstack([part.vertices, middle]), np.vstack([part.faces, lid]), name="part with lid")
+
+
+@pytest.mark.filterwarnings("ignore:.*the mesh is coarse there", "ignore:.*the map to the mean shape")
+def test_a_lid_and_a_wrong_map_are_reported():
+    model, mean, truth = family_of_creatures()
+    whole = make_mesh(truth, mean.faces)
+    shown = mean.vertices[:, 1] > np.quantile(mean.vertices[:, 1], 0.5)
+    part = cut(whole, shown)
+    with pytest.warns(UserWarning, match=r"part with lid: is a closed surface, but \d\d% .* remove the lid"):
+        complete_mesh(with_lid(part), model, mean.faces, preset="paper")
+    with pytest.warns(
+        WrongMapWarning, match=r"part with lid: the map .* the unit of length and the hand"
+    ) as caught:
+        completed = complete_mesh(with_lid(part), model, mean.faces, preset="paper")
+    assert completed.probability < 0.5 and not any("init=" in str(one.message) for one in caught)
+
+
 # ---- Files and the command
 
 
@@ -293,7 +317,7 @@ def damaged(directory: Path, place: Path, damage: str) -> None:
 @pytest.mark.parametrize(
     ("damage", "naming"),
     [
-        ("no modes", "modes.npz: does not exist"),
+        ("no modes", "contains no modes.npz: give the output directory"),
         ("cut modes", "modes.npz: "),
         ("an array is missing", "contains no array called matrices"),
         ("no summary", "does not list the registered meshes"),

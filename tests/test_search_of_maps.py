@@ -452,7 +452,7 @@ def test_a_part_given_as_a_whole_is_matched_as_a_part(share):
     whole, height = creatures.source, creatures.source.vertices[:, 1]
     kept = height > np.quantile(height, 1 - share)
     part = make_mesh(whole.vertices, whole.faces[kept[whole.faces].all(axis=1)], name="part")
-    with pytest.warns(UserWarning, match="part looks like a part of .* matched with partial=True"):
+    with pytest.warns(UserWarning, match="part looks like a part of .* matched as such"):
         found = match(part, creatures.target)
     used = part.referenced_indices
     error = mean_error(creatures.target, found.pointwise_map[used], creatures.true_map[used])
@@ -482,10 +482,10 @@ def test_a_wrong_map_is_reported_with_what_could_be_done(pair):
 def test_a_recognised_part_is_reported_with_all_settings_that_say_so(pair):
     mesh_x, mesh_y, truth = pair
     found = match(mesh_x, mesh_y, preset="paper", init=truth, mirror="no")
-    for scale, cure in ((1.0, "with partial=True, which"), (2.0, 'partial=True and scale="unknown", which')):
+    for scale, cure in ((1.0, "set partial=True, which"), (2.0, 'partial=True and scale="unknown", which')):
         part = replace(found, pair=replace(found.pair, partial=True, scale=scale))
-        text, *_ = advice(part, partial=False)
-        assert cure in text and not list(advice(part, partial=True))
+        warning, *_ = advice(part, partial=False)
+        assert cure in str(warning) and not list(advice(part, partial=True))
 
 
 @pytest.mark.filterwarnings("ignore:.*the map is wrong as a whole:UserWarning")

@@ -11,6 +11,8 @@ from jaxsmw.cli.arguments import add_paths, add_weld, path, refuse_without, whol
 from jaxsmw.cli.console import Stopwatch, say, show
 from jaxsmw.cli.inputs import check_inputs, read_meshes
 from jaxsmw.cli.outputs import check_outputs, report_written
+from jaxsmw.errors import InputError
+from jaxsmw.wording import percentage
 
 HELP = "complete a part of a body, or a mesh with holes, by the shape model of a collection"
 
@@ -74,7 +76,11 @@ def run(options: argparse.Namespace) -> None:
         write_mesh(options.sample, make_mesh(vertices, mean.faces, name="sample"))
         report_written(options.sample)
     deviation, observed = completed.standard_deviation, completed.observed
-    show(f"observed: {observed.mean():.0%} of the model's vertices, with a noise of {completed.noise:.3g}.")
+    show(f"map of the part: right with probability {percentage(completed.probability)}.")
+    show(
+        f"observed: {observed.mean():.0%} of the model's vertices, with a noise of {completed.noise:.3g} in "
+        "the unit of the part."
+    )
     if not observed.all():
         show(
             f"standard deviation of the others: mean {deviation[~observed].mean():.3g}, largest "
@@ -90,6 +96,10 @@ def _check(options: argparse.Namespace) -> None:
     check_attribute_suffix(options.output)
     if options.sample:
         check_mesh_suffix(options.sample)
+    check_inputs(options.part)
     stored = os.path.join(options.model, "modes.npz")
-    check_inputs(options.part, stored)
+    if not os.path.isfile(stored):
+        raise InputError(
+            f"{options.model}: contains no modes.npz: give the output directory of `jaxsmw collection`."
+        )
     check_outputs([options.part, stored], files=[options.output, options.sample])

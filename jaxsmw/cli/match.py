@@ -269,8 +269,7 @@ def _write_overlap(file: str, correspondence: Correspondence, stopwatch: Stopwat
     mask_x, mask_y = probabilities.masks
     share_x, share_y = correspondence.mesh_x.average(mask_x), correspondence.mesh_y.average(mask_y)
     show(
-        f"overlap:     {share_x:.0%} of the source's area and {share_y:.0%} of the target's area have a "
-        "counterpart on the other mesh"
+        f"overlap:     predicted on {share_x:.0%} of the source's area and {share_y:.0%} of the target's area"
     )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias, get_args
 from jaxsmw.choices import GeodesicMethod
 from jaxsmw.cli.arguments import path, refuse_without, whole_number
 from jaxsmw.cli.console import Stopwatch, report_progress, show
-from jaxsmw.wording import percentage
+from jaxsmw.wording import MOST_LISTED, percentage
 
 if TYPE_CHECKING:
     import numpy as np
@@ -99,25 +99,34 @@ def estimate_error(correspondence: Correspondence, stopwatch: Stopwatch) -> Floa
 
 def show_quality(correspondence: Correspondence) -> None:
     """Print one line with the quality of a match."""
-    mean = correspondence.mesh_x.average(correspondence.expected_error())
     parts = [
         f"distortion {correspondence.distortion:.3f} (1 for isometries)",
-        f"area-weighted mean expected error {1e3 * mean:.2f} x 10^-3 sqrt(area)",
+        _expected(correspondence),
         f"wrong as a whole with probability {percentage(correspondence.wrong_probability())}",
     ]
     if correspondence.left_out:
         parts.append(f"{correspondence.left_out:.1%} of the source has no counterpart (small components)")
     show(f"quality:     {', '.join(parts)}")
-    for number, other in enumerate(correspondence.alternatives, 1):
+    others = correspondence.alternatives
+    for number, other in enumerate(others[:MOST_LISTED], 1):
         name = "other maps:" if number == 1 else ""
         show(
             f"{name:12} {number}. {other.difference}, right with probability {percentage(other.probability)}"
         )
-    if correspondence.alternatives:
-        show(
-            f"{'':12} none of these maps is right with probability "
-            f"{percentage(correspondence.none_probability())}"
-        )
+    if others:
+        more = f"{len(others) - MOST_LISTED} more; " if len(others) > MOST_LISTED else ""
+        none = percentage(correspondence.none_probability())
+        show(f"{'':12} {more}all maps are wrong with probability {none}")
+
+
+def _expected(correspondence: Correspondence) -> str:
+    """Return the mean expected error as text. Of partial shapes, it is that of the predicted overlap."""
+    errors, weights = correspondence.expected_error(), correspondence.mesh_x.vertex_areas
+    where = ""
+    if correspondence.pair.partial:
+        weights, where = weights * correspondence.overlap()[0], " in the predicted overlap"
+    mean = errors @ weights / (weights.sum() or 1.0)
+    return f"area-weighted mean expected error{where} {1e3 * mean:.2f} x 10^-3 sqrt(area)"
 
 
 def show_match(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from jaxsmw.choices import DEFAULT_PRESET
 from jaxsmw.collection.conditioning import Family, Posterior
 from jaxsmw.collection.shape_models import ShapeModel, modes_of
-from jaxsmw.errors import InputError
+from jaxsmw.errors import InputError, WrongMapWarning
 from jaxsmw.geometry.alignment import rigid_fit
 from jaxsmw.geometry.eigenbasis import eigenpairs
 from jaxsmw.geometry.mesh import Mesh, MeshLike, as_mesh, make_mesh
@@ -21,6 +22,7 @@ from jaxsmw.geometry.surface_distance import nearest_facing_points, nearest_surf
 from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.matching.match import match
 from jaxsmw.matching.stages import Preset, PresetName
+from jaxsmw.wording import percentage
 
 # The number of smooth functions for what the modes leave out, at most a tenth of the vertices. (Entry R52)
 _FUNCTIONS = 40
@@ -30,6 +32,8 @@ _ROUNDS = 3
 _FEWEST_SHAPES = 3
 # The fewest observed vertices that determine the position of a part.
 _FEWEST_OBSERVED = 10
+# A closed part without a counterpart for this share of the model's area has a lid.
+_LID = 0.02
 # A point lies on an edge if one barycentric weight is smaller.
 _ON_EDGE = 1e-9
 
@@ -45,6 +49,7 @@ class Completion:
     - `posterior`: the `Posterior` of the vertices, in the same coordinates and unit.
     - `observed`: a mask (n,), True for the vertices of the model that the part shows.
     - `noise`: the standard deviation of the noise of each observed coordinate, in the unit of the part.
+    - `probability`: the probability, from 0 to 1, that the map of the part to the model is right as a whole.
     - `calibration`: the factor of all standard deviations. With this factor, the radii hold 90 % of the
       hidden vertices of shapes of the collection, each completed by a model of the other shapes.
     """
@@ -53,6 +58,7 @@ class Completion:
     posterior: Posterior
     observed: Bool[np.ndarray, " n"]
     noise: float
+    probability: float
     calibration: float
 
     def __repr__(self) -> str:
@@ -81,6 +87,9 @@ def complete_mesh(
     search for the nearest points on the part. The position of the part is uncertain as well, and its
     uncertainty is part of the posterior.
 
+    The function issues a `WrongMapWarning` if the map of the part is probably wrong as a whole, and a
+    `UserWarning` if the part is a closed surface although the body goes on.
+
     No parameter is chosen by hand: the variances, the noise and the calibration are estimated by leaving out
     one shape of the collection at a time.
 
@@ -103,9 +112,21 @@ def complete_mesh(
     mean = make_mesh(model.mean, faces, name="mean shape")
     whole = _check_model(model)
     scaled = model.alignment.scaled
-    correspondence = match(
-        part, mean, preset=preset, partial=True, mirror="no", scale="unknown" if scaled else 1.0
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", WrongMapWarning)  # its advice is for two meshes
+        correspondence = match(
+            part, mean, preset=preset, partial=True, mirror="no", scale="unknown" if scaled else 1.0
+        )
+    if correspondence.suspicious:
+        unit = "the hand" if scaled else "the unit of length and the hand"
+        warnings.warn(
+            WrongMapWarning(
+                f"{part.name}: the map to the mean shape is wrong as a whole with a probability of "
+                f"{percentage(correspondence.wrong_probability())}: give a part with {unit} of the model, or "
+                "a larger part."
+            ),
+            stacklevel=2,
+        )
     registered = correspondence.registered_mesh()
     points = registered.points_of_target
     _, counterparts = correspondence.overlap()
@@ -114,6 +135,13 @@ def complete_mesh(
         raise InputError(
             f"{part.name}: shows {count} vertices of the model: give a larger part, in the unit of length of "
             "the model, whose surface ends where the body is missing."
+        )
+    hidden = float(mean.average(~observed))
+    if hidden > _LID and not len(part.boundary_edges):
+        warnings.warn(
+            f"{part.name}: is a closed surface, but {hidden:.0%} of the model has no counterpart on it: if a "
+            "lid closes the surface where the body is missing, remove the lid, which is taken for the body.",
+            stacklevel=2,
         )
     number = min(_FUNCTIONS, len(mean.referenced_indices) // 10)
     functions = eigenpairs(mean, max(number, 1))[1]
@@ -139,6 +167,7 @@ def complete_mesh(
         Posterior(vertices, factors, calibration * posterior.residual / size),
         observed,
         noise / size,
+        correspondence.probability,
         calibration,
     )
 

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from jaxsmw.errors import WrongMapWarning
 from jaxsmw.geometry.scale import relative_boundary
 from jaxsmw.geometry.scans import SMALL_CLOSED
 from jaxsmw.matching.correspondence import Correspondence
-from jaxsmw.wording import percentage
+from jaxsmw.wording import MOST_LISTED, percentage
 
 
-def advice(correspondence: Correspondence, *, partial: bool) -> Iterator[str]:
+def advice(correspondence: Correspondence, *, partial: bool) -> Iterator[UserWarning]:
     """Yield the warnings: a part was recognised, the map is probably wrong, or components were left out.
 
     `partial` tells whether the shapes were called partial.
     """
     if correspondence.pair.partial and not partial:
-        yield _recognition(correspondence)
+        yield UserWarning(_recognition(correspondence))
     if correspondence.suspicious:
-        yield _suspicion(correspondence)
+        yield WrongMapWarning(_suspicion(correspondence))
     if correspondence.left_out > SMALL_CLOSED:
-        yield _omission(correspondence)
+        yield UserWarning(_omission(correspondence))
 
 
 def verdict(correspondence: Correspondence) -> str:
@@ -40,8 +41,8 @@ def _recognition(correspondence: Correspondence) -> str:
         unit = f" (lengths on the source are multiplied by {pair.scale:.3g})"
         cure = ' and scale="unknown"'
     return (
-        f"{part} looks like a part of {whole}: they were matched with partial=True{unit}. If this is right, "
-        f"match them again with partial=True{cure}, which often gives a better map."
+        f"{part} looks like a part of {whole}, and was matched as such{unit}. If this is right, set "
+        f"partial=True{cure}, which often gives a better map."
     )
 
 
@@ -59,11 +60,9 @@ def _suspicion(correspondence: Correspondence) -> str:
     pair, others = correspondence.pair, correspondence.alternatives
     text = f"{pair.name}: {verdict(correspondence)}"
     if others:
-        listed = "; ".join(f"{other.difference} ({percentage(other.probability)})" for other in others)
-        none = percentage(correspondence.none_probability())
-        text += (
-            f" Other maps could be right (see Correspondence.alternatives): {listed}; none of them ({none})."
-        )
+        listed = [f"{other.difference} ({percentage(other.probability)})" for other in others[:MOST_LISTED]]
+        more = [f"and {len(others) - MOST_LISTED} more"] if len(others) > MOST_LISTED else []
+        text += f" Other maps could be right (see Correspondence.alternatives): {'; '.join(listed + more)}."
     cures = ["give a few landmarks as the initial map with init=landmarks"]
     if correspondence.origin == "landmarks":
         cures = ["give more landmarks with init=landmarks"]

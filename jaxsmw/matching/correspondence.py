@@ -413,9 +413,14 @@ class Correspondence:
         **Raises:** `InputError` if the reverse map does not fit the meshes.
         """
         if reverse_map is None:
-            reverse = self.reverse_map()
-        else:
-            reverse = check_pointwise_map(reverse_map, self.mesh_y, self.mesh_x, "reverse map")
+            return self._overlap
+        return self._overlap_with(check_pointwise_map(reverse_map, self.mesh_y, self.mesh_x, "reverse map"))
+
+    @functools.cached_property
+    def _overlap(self) -> Overlap:
+        return self._overlap_with(self.reverse_map())
+
+    def _overlap_with(self, reverse: Int64[np.ndarray, " n"]) -> Overlap:
         predicted = Overlap(
             overlap_probability(self.pair, self.pointwise_map, reverse),
             overlap_probability(self.pair.reversed(), reverse, self.pointwise_map),

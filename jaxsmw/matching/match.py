@@ -66,9 +66,9 @@ def match(
     If the preset has a search, each mesh is first cut where its surface is fused with itself, for example a
     hand with a hip; see `jaxsmw.geometry.cut_shortcuts`. The result refers to the given meshes.
 
-    The function issues a `UserWarning` if the map is probably wrong as a whole, if one mesh was recognised as
-    a part of the other, or if a mesh is too coarse for the descriptors of the preset. It also issues one if
-    small components without a counterpart have more than 5 % of X's area.
+    The function issues a `WrongMapWarning` if the map is probably wrong as a whole. It issues a `UserWarning`
+    if one mesh was recognised as a part of the other, if a mesh is too coarse for the descriptors of the
+    preset, or if small components without a counterpart have more than 5 % of X's area.
 
     **Arguments:**
 
@@ -150,9 +150,10 @@ def match(
         )
     else:
         parts = as_mesh(mesh_x, "source mesh"), as_mesh(mesh_y, "target mesh")
-        whole, *scales = scales_to_template(*parts, template, scale)
-        pairs = [_pair(part, whole, True, unit) for part, unit in zip(parts, scales, strict=True)]
         seconds: dict[str, float] = {}
+        with timed("scale of the template", seconds):
+            whole, *scales = scales_to_template(*parts, template, scale)
+        pairs = [_pair(part, whole, True, unit) for part, unit in zip(parts, scales, strict=True)]
         with timed("source to template", seconds):
             x_to_template = matched(pairs[0], init=init, history=False)
         with timed("target to template", seconds):
@@ -168,8 +169,8 @@ def match(
                 backend=backend,
             )
         correspondence = replace(correspondence, seconds=seconds)
-    for text in advice(correspondence, partial=partial or template is not None):
-        warnings.warn(text, stacklevel=2)
+    for warning in advice(correspondence, partial=partial or template is not None):
+        warnings.warn(warning, stacklevel=2)
     return correspondence
 
 

@@ -223,8 +223,9 @@ def _check_target(path: FilePath, target: Path) -> None:
         raise InputError(f"{path}: cannot be written because it names a directory: add the name of a file.")
     if not target.parent.is_dir():
         raise InputError(
-            f"{path}: cannot be written because {target.parent} is not a directory: "
-            "create the directory first, or choose another directory."
+            f"{path}: cannot be written because {target.parent} "
+            f"{'is not a directory' if target.parent.exists() else 'does not exist'}: create the directory "
+            "first, or choose another directory."
         )
     try:
         status = os.stat(target)

@@ -54,11 +54,7 @@ def difference(best: Judged, other: Judged) -> str:
     if first.prepared.mirrored != second.prepared.mirrored:
         return "mirrored"
     if first.prepared.pair.partial != second.prepared.pair.partial:
-        return (
-            "one mesh is a part of the other"
-            if second.prepared.pair.partial
-            else "both meshes are full shapes"
-        )
+        return "matched as a part and a whole" if second.prepared.pair.partial else "matched as full shapes"
     matches = best.matches, other.matches
     areas, (placed, elsewhere) = first.x.areas, (first.y.positions[chosen] for chosen in matches)
     turn = rigid_fit(placed, elsewhere, areas)
