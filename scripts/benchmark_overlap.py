@@ -45,16 +45,16 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, help="largest number of pairs (default: all pairs)")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    pairs = itertools.islice(_pairs(options.data), options.pairs)
+    pairs = itertools.islice(pairs_of_cuts(options.data, *_SHARES), options.pairs)
     file = options.output / "overlap.csv"
-    journal = measure_pairs(file, pairs, lambda pair: pair.names, _PartialPair.measure)
+    journal = measure_pairs(file, pairs, lambda pair: pair.names, PairOfCuts.measure)
     for name in ("error", "iou", "iou_of_all", "seconds"):
         values = np.array([float(row[name]) for row in journal.rows])
         print(f"{name}: {mean_interval(values, seed=0)}, median {np.median(values):.3f}")
     print(f"{len(journal.rows)} pairs\n{made_with()}", flush=True)
 
 
-class _Part:
+class Cut:
     """A cut of a full shape, with the true point of each vertex on the full shape."""
 
     def __init__(self, file: Path, full: Mesh) -> None:
@@ -65,7 +65,7 @@ class _Part:
         self.positions[truth.source_vertices] = truth.targets.positions(full)
         self.on_full = make_mesh(self.positions, self.mesh.faces, name=file.stem)
 
-    def inside(self, other: _Part, unit: float) -> tuple[SurfacePoints, Bool[np.ndarray, " m"]]:
+    def inside(self, other: Cut, unit: float) -> tuple[SurfacePoints, Bool[np.ndarray, " m"]]:
         """Return the true points on another cut, and a mask of the vertices in the overlap."""
         points, distances = nearest_surface_points(self.positions, other.on_full)
         return points, (distances < _NEAR * unit) & self.mesh.referenced_vertices
@@ -75,10 +75,10 @@ class _Part:
         return float(self.mesh.average(mask))
 
 
-class _PartialPair:
+class PairOfCuts:
     """Two cuts of one full shape, and their overlap."""
 
-    def __init__(self, source: _Part, target: _Part, unit: float) -> None:
+    def __init__(self, source: Cut, target: Cut, unit: float) -> None:
         self.source, self.target, self.unit = source, target, unit
         self.names = source.name, target.name
         self.points, self.inside = source.inside(target, unit)
@@ -111,18 +111,18 @@ def _iou(
     return float(areas[predicted & true].sum() / areas[predicted | true].sum())
 
 
-def _pairs(directory: Path) -> Iterator[_PartialPair]:
-    """Yield all ordered pairs of cuts of one full shape with the required overlap."""
+def pairs_of_cuts(directory: Path, least: float = 0.0, most: float = 1.0) -> Iterator[PairOfCuts]:
+    """Yield all ordered pairs of cuts of one body whose smaller share of the overlap is within limits."""
     files = sorted((directory / "cuts").glob("cuts_*_shape_*.off"))
     bodies = sorted({re.sub(r"cuts_(.*)_shape_\d+", r"\1", file.stem) for file in files})
     if not bodies:
         raise InputError(f"{directory}: contains no cuts/cuts_NAME_shape_N.off: give SHREC'16 partial.")
     for body in bodies:
         full = read_mesh(directory / "null" / f"{body}.off")
-        parts = [_Part(file, full) for file in files if file.stem.startswith(f"cuts_{body}_shape_")]
+        parts = [Cut(file, full) for file in files if file.stem.startswith(f"cuts_{body}_shape_")]
         for source, target in itertools.permutations(parts, 2):
-            pair = _PartialPair(source, target, float(np.sqrt(full.area)))
-            if _SHARES[0] <= min(pair.shares) <= _SHARES[1]:
+            pair = PairOfCuts(source, target, float(np.sqrt(full.area)))
+            if least <= min(pair.shares) <= most:
                 yield pair
 
 

@@ -121,7 +121,7 @@ def tables(results: Sequence[Judged]) -> str:
     rows[0] += ["mean error x10^-3", "CPU seconds"]
     for row in rows[1:]:
         own = [result for result in results if row[0] in (result.kind, "all")]
-        error = 1e3 * np.mean([result.error for result in own])
+        error = 1e3 * np.mean([result.error for result in own if np.isfinite(result.error)])
         row += [f"{error:.1f}", f"{np.median([result.seconds for result in own]):.1f}"]
     groups = markdown(reliability_table(results))
     parts = "# Search", markdown(rows), "Reliability of the probabilities:", groups, made_with()

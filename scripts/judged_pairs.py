@@ -2,7 +2,8 @@
 
 The pairs come from data sets (`docs/datasets.md`) and from made shapes: people, animals, an ape and people,
 bodies with topological noise, teeth of both sides, jaws, halves of a brain, parts called partial and parts
-called full, a mask and a head, creatures, and bumpy bodies with their mirror images.
+called full, a mask and a head, creatures, bumpy bodies with their mirror images, and two parts of one body,
+some of which share nothing.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from benchmark_overlap import pairs_of_cuts
 from common import common_landmarks, scan_files, side_of
 from jaxtyping import Int, Int64
 from scipy.spatial import KDTree
@@ -36,6 +38,9 @@ POINTS = 1000
 # The ends of the groups of maps by probability.
 GROUPS = (0, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1)
 
+TWO_PARTS = "two parts"
+"""The kind of two parts of one body, which have weights of their own."""
+
 
 class KnownPair(NamedTuple):
     """Two meshes, whether they are called partial, and vertices of X with their true matches."""
@@ -55,6 +60,8 @@ class KnownPair(NamedTuple):
 
     def errors(self, pointwise_map: Int[np.ndarray, " m"]) -> tuple[float, float]:
         """Return the mean error of a map, and its share of gross errors."""
+        if not len(self.vertices):
+            return np.inf, 1.0  # two parts that share nothing have no right map
         truth = GroundTruth(self.vertices, self.truth)
         points = min(POINTS, len(self.vertices))
         found = geodesic_error(self.y, pointwise_map, truth, number_of_samples=points)
@@ -91,6 +98,7 @@ def known_pairs(data: Path, number: int, seed: int) -> Iterator[KnownPair]:
         of_masks(data),
         of_creatures(number, seed),
         of_bumpy_bodies(number, seed),
+        of_two_parts(data, number, seed),
     )
 
 
@@ -194,6 +202,17 @@ def of_bumpy_bodies(number: int, seed: int) -> Iterator[KnownPair]:
             ),
         )
         yield KnownPair("bumpy bodies", *meshes, False, np.arange(len(order)), order)
+
+
+def of_two_parts(data: Path, number: int, seed: int) -> Iterator[KnownPair]:
+    """Draw pairs of cuts of one body, which are called partial, with the truth where they overlap."""
+    folder = data / "shrec16_partial"
+    pairs = list(pairs_of_cuts(folder)) if folder.is_dir() else []
+    for drawn in np.random.default_rng(seed).permutation(len(pairs))[:number]:
+        pair = pairs[drawn]
+        shared = np.flatnonzero(pair.inside)
+        matches = pair.points.nearest_corners(pair.target.mesh)[shared]
+        yield KnownPair(TWO_PARTS, pair.source.mesh, pair.target.mesh, True, shared, matches)
 
 
 class Judged(NamedTuple):

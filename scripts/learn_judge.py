@@ -1,6 +1,6 @@
 """Fits the judge of the search: how evidence without ground truth becomes the probability of a right map.
 
-    python scripts/learn_judge.py DATA_DIRECTORY [--pairs N] [--seed SEED] [--maps FILE.json]
+    python scripts/learn_judge.py DATA_DIRECTORY [--pairs N] [--seed SEED] [--kind KIND] [--maps FILE.json]
         [--output FILE.md]
 
 `DATA_DIRECTORY` contains the data sets of `docs/datasets.md`. The script draws N pairs of each kind of
@@ -9,8 +9,9 @@
 The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence`, and the script
 maximises their likelihood. Each pair with right and wrong maps counts once more, with a small weight, as if
 no right map had been found. The script prints the weights of all kinds together. For the tables of results,
-the maps of each kind are judged by the weights of all other kinds. With `--maps`, the features of the
-maps are kept in a file, and a later run with the same options continues there.
+the maps of each kind are judged by the weights of all other kinds. Two parts of one body have weights of
+their own, and each body is a kind. `--kind "two parts"` draws only such pairs. With `--maps`, the features of
+the maps are kept in a file, and a later run with the same options continues there.
 """
 
 from __future__ import annotations
@@ -18,13 +19,23 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from common import make_parser, write_text
 from jaxtyping import Bool, Float
-from judged_pairs import Judged, KnownPair, count_table, is_right, known_pairs, prepared, reliability_table
+from judged_pairs import (
+    TWO_PARTS,
+    Judged,
+    KnownPair,
+    count_table,
+    is_right,
+    known_pairs,
+    prepared,
+    reliability_table,
+)
 from scipy.optimize import minimize
 
 from jaxsmw.benchmark.tables import markdown
@@ -67,9 +78,12 @@ def judged_pair(known: KnownPair) -> JudgedPair:
         assert preset.search is not None
         preset = replace(preset, search=replace(preset.search, certain=1.0))
         maps = search(shapes, start, preset, mirror="auto")
+    kind = known.kind
+    if kind == TWO_PARTS:
+        kind += f" ({Path(known.x.name).stem.split('_')[1]})"
     maps = [one for one in maps if np.isfinite(one.log_odds)]
     errors = [known.errors(one.pointwise_map) for one in maps]
-    return JudgedPair(known.kind, np.array([one.evidence.features for one in maps]), np.array(errors))
+    return JudgedPair(kind, np.array([one.evidence.features for one in maps]), np.array(errors))
 
 
 def shares_of(pair: JudgedPair, weights: Float[np.ndarray, " f"]) -> Float[np.ndarray, " c"]:
@@ -115,6 +129,7 @@ def tables(pairs: Sequence[JudgedPair]) -> Iterator[str]:
 
 def main() -> None:
     parser = make_parser(__doc__, data="DATA_DIRECTORY", pairs=8, seed=True)
+    parser.add_argument("--kind", help="draw only pairs of this kind")
     parser.add_argument("--maps", metavar="FILE.json", type=Path, help="file in which the features are kept")
     parser.add_argument("--output", metavar="FILE.md", type=Path, help="also write the tables to this file")
     options = parser.parse_args()
@@ -122,7 +137,8 @@ def main() -> None:
     stored: list[dict[str, Any]] = []
     if options.maps and options.maps.exists():
         stored = json.loads(options.maps.read_text("utf-8"))
-    for position, known in enumerate(known_pairs(data, number, seed)):
+    drawn = (pair for pair in known_pairs(data, number, seed) if options.kind in (None, pair.kind))
+    for position, known in enumerate(drawn):
         if position < len(stored):
             continue
         pair = judged_pair(known)
@@ -131,7 +147,8 @@ def main() -> None:
         if options.maps:
             write_text(options.maps, json.dumps(stored))
     pairs = [JudgedPair(row["kind"], np.array(row["features"]), np.array(row["errors"])) for row in stored]
-    page = "\n\n".join((*tables(pairs), made_with() + "\n"))
+    groups = [[pair for pair in pairs if pair.kind.startswith(TWO_PARTS) == two] for two in (False, True)]
+    page = "\n\n".join((*chain.from_iterable(map(tables, filter(None, groups))), made_with() + "\n"))
     print(page)
     if options.output:
         write_text(options.output, page)

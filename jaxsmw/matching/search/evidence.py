@@ -12,9 +12,12 @@ from jaxsmw.geometry.alignment import patch_motions
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import Reading
 
-# The weights of `Evidence.features` in the log-odds, from a regression (scripts/learn_judge.py, entry R49 of
-# docs/research_log.md).
+# The weights of `Evidence.features` in the log-odds, and those for two parts of a body, from regressions
+# (scripts/learn_judge.py, entry R49 of docs/research_log.md).
 _WEIGHTS = (-6.6, -2.5, -3.5, -1.7, 1.0, 2.0)
+_WEIGHTS_OF_TWO_PARTS = (-9.5, -2.9, -3.5, 0.0, 1.9, 2.0)
+# Two parts of a body have at least this share of their area in common if they can be matched.
+_COMMON = 0.25
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
@@ -37,7 +40,8 @@ class Evidence(NamedTuple):
     nearest. The deformation and the change of orientations are means over the map and its reverse map. If one
     shape is a part of the other, the reverse map is not defined everywhere. The deformation is then that of
     the map, on the samples of the part, or on the samples of X to which the reverse map takes the part. The
-    change of orientations is that of the map from the part.
+    change of orientations is that of the map from the part. If both shapes are parts of a body, no region of
+    which is known to have a counterpart, the deformation is that of the least deformed quarter of the area.
 
     **Attributes:**
 
@@ -51,6 +55,7 @@ class Evidence(NamedTuple):
       reading. It is 0 for all maps if both hands are compared.
     - `in_place`: whether matches are hardly farther away than the nearest samples, in the given positions,
       because the meshes were aligned.
+    - `two_parts`: whether both shapes are parts of a body.
     """
 
     deformation: float
@@ -58,6 +63,7 @@ class Evidence(NamedTuple):
     orientation_change: float
     agreement: float
     in_place: bool
+    two_parts: bool = False
 
     @classmethod
     def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
@@ -69,7 +75,7 @@ class Evidence(NamedTuple):
             areas_x = np.bincount(reverse, weights=y.areas, minlength=len(x.areas)).astype(float)
         elif pair.partial:
             lacking = 1 - pair.areas[0] / pair.areas[1]
-        deformed = [areas_x @ deformation(x, y, matches)]
+        deformed = [_mean(deformation(x, y, matches), areas_x, _COMMON if reading.two_parts else 1.0)]
         ways = [(x, y, matches), (y, x, reverse)]
         if pair.partial:
             ways = [ways[pair.source_is_whole]]
@@ -82,20 +88,22 @@ class Evidence(NamedTuple):
             orientation_change=float(np.mean([orientation_change(*way) for way in ways])),
             agreement=reading.agreement(matches),
             in_place=not reading.prepared.mirrored and bool(areas_x @ reading.excess(matches) < _NEAR),
+            two_parts=reading.two_parts,
         )
 
     @property
     def features(self) -> Float[np.ndarray, " f"]:
         """What the log-odds depend on linearly, with 1 for the intercept first."""
         deformation = np.log(self.deformation + _LEAST_DEFORMATION)
-        orientation_change = np.log(self.orientation_change + _LEAST_CHANGE)
+        # Extremities of two parts can lie on cuts, so the sides that are seen from them do not count.
+        orientation_change = 0.0 if self.two_parts else np.log(self.orientation_change + _LEAST_CHANGE)
         uncovered = np.sqrt(self.uncovered)
         return np.array([1.0, deformation, uncovered, orientation_change, self.agreement, self.in_place])
 
     @property
     def log_odds(self) -> float:
         """The logarithm of the odds that the map is right, rather than none."""
-        return float(_WEIGHTS @ self.features)
+        return float((_WEIGHTS_OF_TWO_PARTS if self.two_parts else _WEIGHTS) @ self.features)
 
 
 NO_EVIDENCE = Evidence(np.inf, uncovered=1.0, orientation_change=1.0, agreement=0.0, in_place=False)
@@ -121,6 +129,13 @@ def probability(log_odds: float) -> float:
     The log-odds of the best map of a pair say how probable it is that one of its maps is right.
     """
     return float(1 / (1 + np.exp(-log_odds)))
+
+
+def _mean(values: Float[np.ndarray, " s"], areas: Float[np.ndarray, " s"], share: float) -> float:
+    """Return the mean of the smallest values on a share of the area."""
+    order = np.argsort(values)
+    until = np.minimum(np.cumsum(areas[order]), share)
+    return float(np.diff(until, prepend=0.0) @ values[order] / share)
 
 
 def deformation(source: Proxy, target: Proxy, matches: SampleMap) -> Float[np.ndarray, " s"]:

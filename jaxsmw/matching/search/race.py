@@ -37,9 +37,11 @@ _REGISTERED = 10
 _MENDED, _ROUNDS = 4, 2
 # Two maps are different if they differ on at least this share of the area.
 DIFFERENT_AREA = 0.02
-# Faults on less than the first share or more than the second share of the area are not mended. From the third
-# share of reversed area on, a map is tried for the other hand.
-_SMALL, _LARGE, _MOSTLY = 0.002, 0.5, 0.4
+SMALL_FAULT = 0.002
+"""Faults on a smaller share of the area are not mended."""
+# Faults on more than the first share of the area are not mended either. A map that reverses more than the second
+# share of the area is tried for the other hand.
+_LARGE, _MOSTLY = 0.5, 0.4
 # The evidence of opposite hands for two shapes that are nearly their own mirror images.
 SAME_HAND = -2.5
 
@@ -153,7 +155,7 @@ def _moves(candidate: Candidate, readings: Sequence[Reading]) -> Iterator[_Task]
     everywhere = reading.extended(matches)
     reversed_ = orientation_reversal(pair, everywhere, spectrum)
     for fault in (reversed_, discontinuous_parts(pair, everywhere)):
-        if _SMALL < pair.mesh_x.average(fault) < _LARGE:
+        if SMALL_FAULT < pair.mesh_x.average(fault) < _LARGE:
             yield _Task(reading, matches, fault[reading.x.samples.vertices])
     if pair.mesh_x.average(reversed_) <= _MOSTLY:
         return

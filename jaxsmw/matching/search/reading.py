@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.alignment import symmetries
 from jaxsmw.geometry.mesh import extend_to_unreferenced
+from jaxsmw.geometry.scale import relative_boundary
 from jaxsmw.matching.descriptors import PrincipalAxes
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
@@ -34,12 +35,14 @@ class Reading:
     - `prepared`: the `PreparedPair`. Its attributes `mirrored` and `pair.partial` tell how the pair is read.
     - `x`, `y`: the proxies of X (s samples) and of Y (t samples), in `Pair.units_of_length`.
     - `first`: the first map of the reading, from SHOT, on the samples (s,). None if there is no such map.
+    - `contained`: whether one shape is read as a part of the other, although both were called full.
     """
 
     prepared: PreparedPair
     x: Proxy
     y: Proxy
     first: SampleMap | None = None
+    contained: bool = False
 
     @classmethod
     def of(cls, prepared: PreparedPair) -> Reading:
@@ -56,7 +59,7 @@ class Reading:
 
     def mirror(self) -> Reading:
         """Return the reading in which X has the other hand. It has no first map."""
-        return Reading(self.prepared.mirror(), self.x.mirror(), self.y)
+        return Reading(self.prepared.mirror(), self.x.mirror(), self.y, contained=self.contained)
 
     def with_first(self, pointwise_map: Int64[np.ndarray, " m"]) -> Reading:
         """Return the reading whose first map is a map X -> Y (m,)."""
@@ -84,6 +87,12 @@ class Reading:
         except InputError:  # the samples are too sparse for SHOT
             return False
         return not any(symmetries(side.positions, side.normals, mirrored=True) for side in (self.x, self.y))
+
+    @cached_property
+    def two_parts(self) -> bool:
+        """Whether both shapes are parts of a body, so that any region may lack a counterpart."""
+        open_meshes = all(map(relative_boundary, self.prepared.given.meshes))
+        return self.prepared.pair.partial and not self.contained and open_meshes
 
     def described(self, preset: Preset) -> Reading:
         """Return the reading whose prepared pair has the descriptors that a preset uses."""

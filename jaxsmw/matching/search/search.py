@@ -17,13 +17,13 @@ from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.scale import relative_boundary
 from jaxsmw.matching.executor import run
-from jaxsmw.matching.judge import area_shape_difference, distortion
+from jaxsmw.matching.judge import area_shape_difference, discontinuous_parts, distortion
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probability, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
-from jaxsmw.matching.search.race import Candidate, Kind, different, race
+from jaxsmw.matching.search.race import SMALL_FAULT, Candidate, Kind, different, race
 from jaxsmw.matching.search.reading import Reading
 from jaxsmw.matching.settings import SearchSettings
 from jaxsmw.matching.spectral_pair import SpectralPair
@@ -181,12 +181,15 @@ def _ends_the_search(first: Judged, settings: SearchSettings) -> bool:
     """Return whether the first map needs no comparison with other maps.
 
     The probability alone does not suffice, because a map that exchanges two limbs of an animal can be as good
-    on most patches as a right map of other animals. Such a map is not nearly isometric.
+    on most patches as a right map of other animals. Such a map is not nearly isometric, or it tears the limbs
+    off.
     """
     if not _certain([first], settings):
         return False
-    prepared = first.reading.prepared
-    return distortion(prepared.pair, first.pointwise_map, prepared.x.spectrum) <= settings.certain_distortion
+    prepared, matches = first.reading.prepared, first.pointwise_map
+    torn_off = prepared.pair.mesh_x.average(discontinuous_parts(prepared.pair, matches))
+    distorted = distortion(prepared.pair, matches, prepared.x.spectrum) > settings.certain_distortion
+    return bool(torn_off <= SMALL_FAULT and not distorted)
 
 
 def _certain(judged: Sequence[Judged], settings: SearchSettings) -> bool:
@@ -246,7 +249,7 @@ def _as_parts(reading: Reading) -> Iterator[Reading]:
                 part = Pair.make(*pair.meshes, partial=True, scale=scale)
             if all(abs(np.log(part.scale / other)) > _SAME_SCALE for other in known):
                 known.append(part.scale)
-                yield Reading.of(prepared.as_part(part))
+                yield replace(Reading.of(prepared.as_part(part)), contained=True)
         except InputError:  # no scale can be estimated, or the closed mesh is the smaller one
             continue
 
