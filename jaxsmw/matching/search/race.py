@@ -39,8 +39,8 @@ _MENDED, _ROUNDS = 4, 2
 DIFFERENT_AREA = 0.02
 SMALL_FAULT = 0.002
 """Faults on a smaller share of the area are not mended."""
-# Faults on more than the first share of the area are not mended either. A map that reverses more than the second
-# share of the area is tried for the other hand.
+# Faults on more than the first share of the area are not mended either. A map that reverses more than the
+# second share of the area is tried for the other hand.
 _LARGE, _MOSTLY = 0.5, 0.4
 # The evidence of opposite hands for two shapes that are nearly their own mirror images.
 SAME_HAND = -2.5
