@@ -65,9 +65,12 @@ class JudgedPair(NamedTuple):
         return np.array([is_right(*errors) for errors in self.errors], bool)
 
     def without_right(self) -> JudgedPair | None:
-        """Return the pair as if no right map had been found, or None if it has no right map or no other."""
+        """Return the pair as if no right map had been found, or None if it has no right map or no other.
+
+        Two parts do not count again, because many of them share nothing, and have no right map.
+        """
         wrong = ~self.right
-        if wrong.all() or not wrong.any():
+        if wrong.all() or not wrong.any() or self.kind.startswith(TWO_PARTS):
             return None
         return self._replace(features=self.features[wrong], errors=self.errors[wrong])
 

@@ -10,14 +10,12 @@ from jaxtyping import Float
 
 from jaxsmw.geometry.alignment import patch_motions
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
-from jaxsmw.matching.search.reading import Reading
+from jaxsmw.matching.search.reading import COMMON, Reading
 
 # The weights of `Evidence.features` in the log-odds, and those for two parts of a body, from regressions
 # (scripts/learn_judge.py, entry R49 of docs/research_log.md).
 _WEIGHTS = (-6.6, -2.5, -3.5, -1.7, 1.0, 2.0)
-_WEIGHTS_OF_TWO_PARTS = (-9.5, -2.9, -3.5, 0.0, 1.9, 2.0)
-# Two parts of a body have at least this share of their area in common if they can be matched.
-_COMMON = 0.25
+_WEIGHTS_OF_TWO_PARTS = (-9.4, -1.8, -1.0, 0.0, 4.7, 1.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
@@ -75,7 +73,7 @@ class Evidence(NamedTuple):
             areas_x = np.bincount(reverse, weights=y.areas, minlength=len(x.areas)).astype(float)
         elif pair.partial:
             lacking = 1 - pair.areas[0] / pair.areas[1]
-        deformed = [_mean(deformation(x, y, matches), areas_x, _COMMON if reading.two_parts else 1.0)]
+        deformed = [_mean(deformation(x, y, matches), areas_x, COMMON if reading.two_parts else 1.0)]
         ways = [(x, y, matches), (y, x, reverse)]
         if pair.partial:
             ways = [ways[pair.source_is_whole]]

@@ -21,7 +21,7 @@ from jaxsmw.matching.outcome import Start
 from jaxsmw.matching.search.evidence import Evidence
 from jaxsmw.matching.search.hypotheses import HYPOTHESES, Hypothesis
 from jaxsmw.matching.search.proxies import SampleMap
-from jaxsmw.matching.search.reading import NUMBER_OF_DESCRIPTORS, Reading
+from jaxsmw.matching.search.reading import COMMON, NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
 
 # The stages by which all maps are refined, and those by which the given number of the best maps is refined
@@ -60,8 +60,12 @@ class Candidate:
         return self.evidence.log_odds
 
     def is_twin(self, other: Candidate) -> bool:
-        """Return whether the map differs from another one on less than 2 % of the area."""
-        return self.reading.difference(self.matches, other.matches) < DIFFERENT_AREA
+        """Return whether two maps differ on less than 2 % of the area, or on less than 25 % for two parts.
+
+        Points without a counterpart have any match.
+        """
+        least = COMMON if self.reading.two_parts else DIFFERENT_AREA
+        return self.reading.difference(self.matches, other.matches) < least
 
 
 Kind = TypeVar("Kind", bound=Candidate)

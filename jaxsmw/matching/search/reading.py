@@ -25,6 +25,9 @@ from jaxsmw.runtime.threads import side_by_side
 # their principal components.
 _RADII, NUMBER_OF_DESCRIPTORS = (1, 2, 4), 30
 
+COMMON = 0.25
+"""The share of the area that two parts of a body have in common at least, if they can be matched."""
+
 
 @dataclass(frozen=True, eq=False)
 class Reading:
