@@ -13,7 +13,7 @@ from .core.results import RESULTS
 from .core.solutions.closed_form import Filtering, LeastSquares
 from .core.spectrum import Spectrum
 from .creature import creature_pair
-from .errors import InputError, WrongMapWarning
+from .errors import InputError
 from .evaluation.ground_truth import read_ground_truth
 from .evaluation.metrics import geodesic_error
 from .geometry.eigenbasis import compute_spectrum
@@ -53,7 +53,6 @@ __all__ = [
     "Spectrum",
     "Stage",
     "WaveletPreservation",
-    "WrongMapWarning",
     "banks",
     "benchmark",
     "collection",

@@ -180,6 +180,17 @@ def _notes(correspondence: Correspondence) -> list[str]:
     notes = []
     if correspondence.suspicious:
         notes.append(f"Be careful: {verdict(correspondence)}")
+    if correspondence.shared is not None:
+        notes.append("Both shapes were matched to a full shape, the template, and through it to each other.")
+    if correspondence.pair.partial:
+        shares = [
+            f"{mesh.average(mask):.0%}"
+            for mesh, mask in zip(correspondence.pair.meshes, correspondence.overlap(), strict=True)
+        ]
+        notes.append(
+            f"The overlap, which has a counterpart on the other shape, is predicted on {shares[0]} of the "
+            f"source's area and on {shares[1]} of the target's area. The rest is grey."
+        )
     if correspondence.mirrored:
         notes.append(
             "The source was matched as its mirror image, so colours that run from left to right on the "
