@@ -23,6 +23,7 @@ from jaxsmw.matching.preparation import PreparedPair, prepare
 from jaxsmw.matching.search.alternatives import Alternative
 from jaxsmw.matching.search.fitting import fitted_scale
 from jaxsmw.matching.search.proxies import Proxy
+from jaxsmw.matching.search.reading import COMMON, DIFFERENT
 from jaxsmw.matching.shape import PreparedShape
 from jaxsmw.matching.stages import Preset, Stage
 
@@ -92,7 +93,7 @@ def join(
     - `laplacian`, `eigensolver`, `backend`: see `jaxsmw.match`.
 
     **Returns:** The `Correspondence` from X to Y. Its probability is that of both maps to the template being
-    right.
+    right, or of alternatives that lead to the same map.
 
     **Raises:** `ArithmeticError` if the refinement fails numerically.
     """
@@ -114,13 +115,14 @@ def join(
     stage = prepared.usable(Preset((stage,))).stages[0]
     nearest = extend_to_unreferenced(prepared.pair.mesh_y, np.arange(len(pair.mesh_y.vertices)))
     outcome = run([stage], prepared.spectra, Start(nearest[initial_map]))
+    best, *others = _alternatives(x_to_template, y_to_template, initial_map, shared)
     joined = Correspondence.of(
         prepared,
         Start(initial_map, origin="template"),
         preset,
         outcome,
-        x_to_template.probability * y_to_template.probability,
-        _alternatives(x_to_template, y_to_template),
+        best.probability,
+        tuple(others),
     )
     return replace(joined, shared=shared)
 
@@ -188,8 +190,16 @@ def _kept(mesh: Mesh, mask: Bool[np.ndarray, " n"]) -> Mesh:
     return mesh.without_faces(~mask[mesh.faces].any(axis=1))
 
 
-def _alternatives(x_to_template: Correspondence, y_to_template: Correspondence) -> tuple[Alternative, ...]:
-    """Return the maps that result if one of the maps to the template is replaced by an alternative."""
+def _alternatives(
+    x_to_template: Correspondence,
+    y_to_template: Correspondence,
+    joined: Int64[np.ndarray, " m"],
+    shared: Overlap,
+) -> list[Alternative]:
+    """Return the joined map, and the maps that result if an alternative replaces a map to the template.
+
+    A map that agrees with a more probable one, at points of X in the overlap, adds its probability to it.
+    """
     template, map_x, map_y = x_to_template.mesh_y, x_to_template.pointwise_map, y_to_template.pointwise_map
     replaced = [
         ("source", other, y_to_template.probability, (other.pointwise_map, map_y))
@@ -199,7 +209,7 @@ def _alternatives(x_to_template: Correspondence, y_to_template: Correspondence) 
         ("target", other, x_to_template.probability, (map_x, other.pointwise_map))
         for other in y_to_template.alternatives
     ]
-    found = [
+    others = [
         Alternative(
             _composed(template, *maps),
             other.probability * probability,
@@ -208,4 +218,19 @@ def _alternatives(x_to_template: Correspondence, y_to_template: Correspondence) 
         for name, other, probability, maps in replaced
         if other.probability * probability >= _LEAST_PROBABILITY
     ]
-    return tuple(sorted(found, key=lambda other: -other.probability))
+    areas = x_to_template.mesh_x.vertex_areas * shared.masks[0]
+    positions = y_to_template.mesh_x.vertices * y_to_template.pair.scale / template.area**0.5
+
+    def agree(one: Alternative, other: Alternative) -> bool:
+        apart = np.linalg.norm(positions[one.pointwise_map] - positions[other.pointwise_map], axis=1)
+        return bool(areas @ (apart >= DIFFERENT) <= COMMON * areas.sum())
+
+    found: list[Alternative] = []
+    first = Alternative(joined, x_to_template.probability * y_to_template.probability, "")
+    for one in (first, *sorted(others, key=lambda other: -other.probability)):
+        twin = next((number for number, known in enumerate(found) if agree(known, one)), None)
+        if twin is None:
+            found.append(one)
+        else:
+            found[twin] = found[twin]._replace(probability=found[twin].probability + one.probability)
+    return found

@@ -61,6 +61,8 @@ REPORT_FILES = (
 )
 """The files that `write_report` may write."""
 
+# The largest number of other maps on a page.
+_MOST_SHOWN = 10
 _QUALITY_CAPTION = (
     "The share of matches whose geodesic error is at most a threshold. Higher curves are better."
 )
@@ -212,7 +214,7 @@ def _shown_maps(correspondence: Correspondence, errors: Mapping[str, GeodesicErr
         f"other {number}: {other.difference} (probability {percentage(other.probability)})": _shown_map(
             other.pointwise_map, _encoded(other.pointwise_map, *spectra, convention), None, convention
         )
-        for number, other in enumerate(correspondence.alternatives, 1)
+        for number, other in enumerate(correspondence.alternatives[:_MOST_SHOWN], 1)
     }
     return {
         "refined": replace(refined, errors={**refined.errors, **expected}),

@@ -25,6 +25,8 @@ from jaxsmw.runtime.threads import side_by_side
 # their principal components.
 _RADII, NUMBER_OF_DESCRIPTORS = (1, 2, 4), 30
 
+DIFFERENT = 0.2
+"""Two maps differ at a point if its two matches are so far apart, in units of the square root of the area."""
 COMMON = 0.25
 """The share of the area that two parts of a body have in common at least, if they can be matched."""
 
@@ -136,7 +138,7 @@ class Reading:
 
     def difference(self, first: SampleMap, second: SampleMap) -> float:
         """Return the share of X's area, from 0 to 1, on which two maps of samples differ."""
-        return float(self.x.areas @ (self.y.distances[first, second] > _DIFFERENT))
+        return float(self.x.areas @ (self.y.distances[first, second] > DIFFERENT))
 
     def agreement(self, matches: SampleMap) -> float:
         """Return the share of X's area, from 0 to 1, on which a map of samples agrees with the first map.
@@ -162,6 +164,3 @@ class Reading:
 
 # The radii of SHOT, in units of 0.06, and the least mean asymmetry of asymmetric shapes. (Entry R23)
 _ASYMMETRY_RADII, _ASYMMETRIC = (3, 6), 0.61
-# Two maps differ at a sample if its two matches are at least so far apart along the surface, in units of the
-# square root of the area.
-_DIFFERENT = 0.2
