@@ -14,10 +14,13 @@ from jaxsmw.matching.search.reading import COMMON, Reading
 
 # The weights of `Evidence.features` in the log-odds, and those for two parts of a body, from regressions
 # (scripts/learn_judge.py, entry R49 of docs/research_log.md).
-_WEIGHTS = (-6.6, -2.5, -3.5, -1.7, 1.0, 2.0)
+_WEIGHTS = (-7.6, -2.5, -3.5, -1.7, 2.0, 2.0)
 _WEIGHTS_OF_TWO_PARTS = (-9.4, -1.8, -1.0, 0.0, 4.7, 1.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
+# A larger agreement counts no more. Right maps of different animals agree with the first map on half
+# of the area, and maps that take a head to a tail on a quarter. (Entry R49)
+_AGREEING = 0.4
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
 # samples have as much.
 _LEAST_DEFORMATION, _LEAST_CHANGE = 0.01, 0.05
@@ -50,7 +53,7 @@ class Evidence(NamedTuple):
     - `orientation_change`: how often the map exchanges the sides of the body, such as belly and back, from 0
       to 1; see `orientation_change`.
     - `agreement`: the share of X's area, from 0 to 1, on which the map agrees with the first map of its
-      reading. It is 0 for all maps if both hands are compared.
+      reading. It is 0.2 for all maps if both hands are compared.
     - `in_place`: whether matches are hardly farther away than the nearest samples, in the given positions,
       because the meshes were aligned.
     - `two_parts`: whether both shapes are parts of a body.
@@ -96,7 +99,8 @@ class Evidence(NamedTuple):
         # Extremities of two parts can lie on cuts, so the sides that are seen from them do not count.
         orientation_change = 0.0 if self.two_parts else np.log(self.orientation_change + _LEAST_CHANGE)
         uncovered = np.sqrt(self.uncovered)
-        return np.array([1.0, deformation, uncovered, orientation_change, self.agreement, self.in_place])
+        agreement = self.agreement if self.two_parts else min(self.agreement / _AGREEING, 1.0)
+        return np.array([1.0, deformation, uncovered, orientation_change, agreement, self.in_place])
 
     @property
     def log_odds(self) -> float:

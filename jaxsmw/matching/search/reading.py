@@ -143,9 +143,9 @@ class Reading:
     def agreement(self, matches: SampleMap) -> float:
         """Return the share of X's area, from 0 to 1, on which a map of samples agrees with the first map.
 
-        Without a first map, the share is 0.
+        Without a first map, the share is 0.2, which is between the shares of right and of wrong maps.
         """
-        return 0.0 if self.first is None else 1 - self.difference(self.first, matches)
+        return _UNKNOWN_AGREEMENT if self.first is None else 1 - self.difference(self.first, matches)
 
     @cached_property
     def nearest(self) -> SampleMap:
@@ -162,5 +162,6 @@ class Reading:
         return matched - nearest
 
 
+_UNKNOWN_AGREEMENT = 0.2
 # The radii of SHOT, in units of 0.06, and the least mean asymmetry of asymmetric shapes. (Entry R23)
 _ASYMMETRY_RADII, _ASYMMETRIC = (3, 6), 0.61
