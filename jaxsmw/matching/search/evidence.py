@@ -15,7 +15,7 @@ from jaxsmw.matching.search.reading import COMMON, Reading
 # The weights of `Evidence.features` in the log-odds, and those for two parts of a body, from regressions
 # (scripts/learn_judge.py, entry R49 of docs/research_log.md).
 _WEIGHTS = (-7.6, -2.5, -3.5, -1.7, 2.0, 2.0)
-_WEIGHTS_OF_TWO_PARTS = (-9.4, -1.8, -1.0, 0.0, 4.7, 1.0)
+_WEIGHTS_OF_TWO_PARTS = (-10.3, -2.1, -3.0, 0.0, 4.8, 2.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # A larger agreement counts no more. Right maps of different animals agree with the first map on half
