@@ -7,7 +7,7 @@ import learn_judge
 import numpy as np
 import pytest
 from benchmark_search import draw, tables
-from judged_pairs import Judged, KnownPair, of_bumpy_bodies, of_creatures
+from judged_pairs import Judged, KnownPair, of_bumpy_bodies, of_creatures, of_two_parts
 from learn_judge import JudgedPair
 from report_helpers import cells
 
@@ -57,6 +57,17 @@ def test_errors_of_a_known_pair():
     assert known.errors(true) == (0, 0)
     turned = known.errors(np.roll(true, 300))
     assert turned[0] > 0.1 and turned[1] > 0.1
+    assert known._replace(vertices=rows[:0]).errors(true) == (np.inf, 1.0)  # two parts that share nothing
+
+
+@pytest.mark.sampled
+def test_two_parts_of_one_body_have_the_truth_of_their_overlap(shared):
+    """Both cuts are taken to their full shape."""
+    pairs = list(of_two_parts(shared / "data", 6, 0))
+    assert len(pairs) == 6 and all(pair.partial for pair in pairs)
+    assert any(len(pair.vertices) for pair in pairs)
+    for pair in pairs:
+        assert len(pair.truth) == len(pair.vertices) <= len(pair.x.vertices)
 
 
 def test_an_interrupted_measurement_continues(monkeypatch, tmp_path, capsys):

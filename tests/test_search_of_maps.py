@@ -197,6 +197,44 @@ def test_a_map_to_a_part_is_measured_where_the_part_lies(pair):
     assert evidence.deformation < 0.3 * deformation(reading.x, reading.y, collapsed).mean()
 
 
+def test_two_parts_are_judged_where_they_fit_best(pair):
+    """The whole surface may lack a counterpart, apart from a quarter of the area."""
+    mesh, _, _ = pair
+    along = mesh.vertices[:, 2]
+    parts = [
+        mesh.without_faces(~kept[mesh.faces].all(axis=1))
+        for kept in (along < np.quantile(along, 0.75), along > np.quantile(along, 0.3))
+    ]
+    reading = read(*parts, partial=True)
+    distances, matches = KDTree(reading.y.positions).query(reading.x.positions)
+    collapsed = np.where(distances < 0.05, matches, matches[distances < 0.05][0])
+    evidence = Evidence.of(reading, collapsed)
+    of_patches = deformation(reading.x, reading.y, collapsed)
+    order = np.argsort(of_patches)
+    least = order[np.cumsum(reading.x.areas[order]) < 0.25]
+    assert evidence.two_parts and evidence.deformation < 0.3 * of_patches.mean()
+    assert evidence.deformation == pytest.approx(of_patches[least].mean(), abs=2e-3)
+    assert evidence.uncovered > 0.1
+    other = evidence._replace(orientation_change=1.0, uncovered=0.0)
+    assert other.log_odds == evidence.log_odds < evidence._replace(agreement=0.5).log_odds
+    # Maps that differ only where a part lacks a counterpart are the same map.
+    elsewhere = np.where(distances < 0.05, matches, matches[distances < 0.05][-1])
+    one, other = (Candidate(reading, found, evidence) for found in (collapsed, elsewhere))
+    assert 0.02 < reading.difference(collapsed, elsewhere) < 0.5
+    assert one.is_twin(other) == (reading.difference(collapsed, elsewhere) < 0.25)
+    contained = replace(reading, contained=True)
+    assert not Evidence.of(contained, collapsed).two_parts
+    assert not replace(one, reading=contained).is_twin(other)
+
+
+def test_more_than_a_small_agreement_counts_no_more(pair):
+    reading = read(*pair[:2])
+    evidence = Evidence.of(reading, reading.reduced(pair[2]))
+    assert evidence.agreement == 0.2  # there is no first map
+    odds = [evidence._replace(agreement=share).log_odds for share in (0.0, 0.2, 0.4, 0.9)]
+    assert odds[0] < odds[1] == evidence.log_odds < odds[2] == odds[3]
+
+
 def test_a_map_to_a_part_of_the_target_leaves_the_rest_uncovered(pair):
     mesh, _, _ = pair
     reading = read(mesh, mesh)
@@ -364,6 +402,15 @@ def test_a_certain_map_ends_the_search(pair, monkeypatch):
         preset = replace(SEARCH, search=replace(SEARCH.search, certain=certain, certain_distortion=most))
         (found,) = search(prepared, Start(start), preset, outcome=Outcome(start))
         assert len(raced) == races and found.outcome.successful
+    # A map that tears a limb off does not end the search, even if it is certain.
+    raced.clear()
+    torn = truth.copy()
+    limb = mesh_x.vertices[:, 1] < np.quantile(mesh_x.vertices[:, 1], 0.02)
+    torn[limb] = truth[mesh_x.vertices[:, 1].argmax()]
+    lenient = replace(SEARCH, search=replace(SEARCH.search, certain=1e-6, certain_distortion=99.0))
+    search(prepared, Start(torn), lenient, outcome=Outcome(torn))
+    assert raced
+    raced.clear()
     (found,) = search(prepared, Start(wrong), replace(SEARCH, search=None))
     assert found.log_odds < 0 and not raced and found.outcome.successful
 

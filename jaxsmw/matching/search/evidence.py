@@ -15,7 +15,7 @@ from jaxsmw.matching.search.reading import COMMON, Reading
 # The weights of `Evidence.features` in the log-odds, and those for two parts of a body, from regressions
 # (scripts/learn_judge.py, entry R49 of docs/research_log.md).
 _WEIGHTS = (-7.6, -2.5, -3.5, -1.7, 2.0, 2.0)
-_WEIGHTS_OF_TWO_PARTS = (-10.3, -2.1, -3.0, 0.0, 4.8, 2.0)
+_WEIGHTS_OF_TWO_PARTS = (-10.3, -2.1, 0.0, 0.0, 4.8, 2.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
 # A larger agreement counts no more. Right maps of different animals agree with the first map on half
@@ -96,10 +96,11 @@ class Evidence(NamedTuple):
     def features(self) -> Float[np.ndarray, " f"]:
         """What the log-odds depend on linearly, with 1 for the intercept first."""
         deformation = np.log(self.deformation + _LEAST_DEFORMATION)
-        # Extremities of two parts can lie on cuts, so the sides that are seen from them do not count.
-        orientation_change = 0.0 if self.two_parts else np.log(self.orientation_change + _LEAST_CHANGE)
-        uncovered = np.sqrt(self.uncovered)
-        agreement = self.agreement if self.two_parts else min(self.agreement / _AGREEING, 1.0)
+        orientation_change = np.log(self.orientation_change + _LEAST_CHANGE)
+        uncovered, agreement = np.sqrt(self.uncovered), min(self.agreement / _AGREEING, 1.0)
+        if self.two_parts:
+            # Any region can lack a counterpart, and extremities can lie on cuts. Right maps agree widely.
+            orientation_change, uncovered, agreement = 0.0, 0.0, self.agreement
         return np.array([1.0, deformation, uncovered, orientation_change, agreement, self.in_place])
 
     @property
