@@ -174,7 +174,9 @@ def with_lid(part: Mesh) -> Mesh:
     return make_mesh(np.vstack([part.vertices, middle]), np.vstack([part.faces, lid]), name="part with lid")
 
 
-@pytest.mark.filterwarnings("ignore:.*the mesh is coarse there", "ignore:.*the map to the mean shape")
+@pytest.mark.filterwarnings(
+    "ignore:.*(the mesh is coarse there|the map to the mean shape|is a closed surface)"
+)
 def test_a_lid_and_a_wrong_map_are_reported():
     model, mean, truth = family_of_creatures()
     whole = make_mesh(truth, mean.faces)
