@@ -7,11 +7,12 @@
 `scripts/judged_pairs.py`. `search` always runs all hypotheses, and returns maps that differ from each other.
 
 The probabilities of the maps of a pair are those of `jaxsmw.matching.search.evidence`, and the script
-maximises their likelihood. Each pair with right and wrong maps counts once more, with a small weight, as if
-no right map had been found. The script prints the weights of all kinds together. For the tables of results,
-the maps of each kind are judged by the weights of all other kinds. Two parts of one body have weights of
-their own, and each body is a kind. `--kind "two parts"` draws only such pairs. With `--maps`, the features of
-the maps are kept in a file, and a later run with the same options continues there.
+maximises their likelihood. Except for two parts of one body, each pair with right and wrong maps counts once
+more, with a small weight, as if no right map had been found. The script prints the weights of all kinds
+together. For the tables of results, the maps of each kind are judged by the weights of all other kinds. Two
+parts of one body have weights of their own, and each body is a kind. `--kind "two parts"` draws only such
+pairs. With `--maps`, the features of the maps are kept in a file, and a later run with the same options
+continues there.
 """
 
 from __future__ import annotations

@@ -124,6 +124,18 @@ def test_a_vase_with_ribs_has_one_symmetry_fewer_than_ribs(folds):
     assert symmetries(*surface, mirrored=True)
 
 
+def test_the_boundary_of_a_symmetric_sheet_fits_as_well():
+    """All points of flat sheets lie in one plane, and so do their moved points."""
+    square = np.stack(np.meshgrid(np.arange(40), np.arange(40)), axis=-1).reshape(-1, 2) / 40
+    square += np.random.default_rng(0).uniform(-0.01, 0.01, square.shape)
+    corner = square[(square < 0.5).any(axis=1)]
+    for sheet, turns, reflections in ((square, 3, 4), (corner, 0, 1)):
+        surface = np.column_stack([sheet, np.zeros(len(sheet))]), np.tile([0, 0, 1.0], (len(sheet), 1))
+        assert len(symmetries(*surface)) == turns
+        assert len(symmetries(*surface, mirrored=True)) == reflections
+    assert symmetries(surface[0][:10], surface[1][:10]) == []
+
+
 def test_a_lump_has_no_symmetry():
     surface = LUMP.vertices / LUMP.area**0.5, LUMP.vertex_normals
     assert not symmetries(*surface) and not symmetries(*surface, mirrored=True)

@@ -611,7 +611,7 @@ def test_the_quality_of_the_map_is_printed(run, pair, tmp_path, monkeypatch):
         )
         assert next(lines) == "other maps:  1. mirrored, right with probability 20 %"
         assert next(lines) == "             2. mirrored, right with probability below 1 %"
-        assert next(lines) == "             all maps are wrong with probability 5 %"
+        assert next(lines) == "             no map is right with probability 5 %"
 
 
 @pytest.mark.parametrize("name", ["map.txt", "map", "a.b.npy"])

@@ -114,9 +114,9 @@ def show_quality(correspondence: Correspondence) -> None:
             f"{name:12} {number}. {other.difference}, right with probability {percentage(other.probability)}"
         )
     if others:
-        more = f"{len(others) - MOST_LISTED} more; " if len(others) > MOST_LISTED else ""
-        none = percentage(correspondence.none_probability())
-        show(f"{'':12} {more}all maps are wrong with probability {none}")
+        if len(others) > MOST_LISTED:
+            show(f"{'':12} and {len(others) - MOST_LISTED} more")
+        show(f"{'':12} no map is right with probability {percentage(correspondence.none_probability())}")
 
 
 def _expected(correspondence: Correspondence) -> str:
@@ -125,7 +125,9 @@ def _expected(correspondence: Correspondence) -> str:
     where = ""
     if correspondence.pair.partial:
         weights, where = weights * correspondence.overlap()[0], " in the predicted overlap"
-    mean = errors @ weights / (weights.sum() or 1.0)
+    if not weights.sum():
+        return "no predicted overlap"
+    mean = errors @ weights / weights.sum()
     return f"area-weighted mean expected error{where} {1e3 * mean:.2f} x 10^-3 sqrt(area)"
 
 

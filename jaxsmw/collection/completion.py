@@ -32,7 +32,7 @@ _ROUNDS = 3
 _FEWEST_SHAPES = 3
 # The fewest observed vertices that determine the position of a part.
 _FEWEST_OBSERVED = 10
-# A closed part without a counterpart for this share of the model's area has a lid.
+# A closed part probably has a lid if this share of the model's area has no counterpart on it.
 _LID = 0.02
 # A point lies on an edge if one barycentric weight is smaller.
 _ON_EDGE = 1e-9
@@ -139,8 +139,8 @@ def complete_mesh(
     hidden = float(mean.average(~observed))
     if hidden > _LID and not len(part.boundary_edges):
         warnings.warn(
-            f"{part.name}: is a closed surface, but {hidden:.0%} of the model has no counterpart on it: if a "
-            "lid closes the surface where the body is missing, remove the lid, which is taken for the body.",
+            f"{part.name}: is a closed surface, but {hidden:.0%} of the model has no counterpart on it: if "
+            "the body continues beyond a lid, remove the lid, whose points are taken for points of the body.",
             stacklevel=2,
         )
     number = min(_FUNCTIONS, len(mean.referenced_indices) // 10)

@@ -30,6 +30,8 @@ _INTERCHANGEABLE = 0.85
 # nearest samples is smaller, in units of length. That of people in nearly the same pose as their turned
 # image is at least 0.01.
 _ONTO_ITSELF = 0.005
+# Fewer points do not show a symmetry. This share of the points must be near the surface.
+_FEWEST, _NEARLY_ALL = 30, 0.98
 # The distance of the points on normals from the surface, in units of length.
 _THICKNESS = 0.1
 # The weight of unit normals beside positions in oriented points, in units of length.
@@ -141,15 +143,18 @@ def symmetries(
 
     If `mirrored` is True, they bring the mirror image, whose points are `-points`, onto the surface instead.
 
-    The axis of a half turn is a principal axis of the surface. The axis of any other turn is one as well,
-    along which the variance differs from the two other ones, unless all three are equal. The iterations of
-    `align_rigidly` therefore run from few rotations. A surface of revolution gets turns by multiples of 30°.
+    The iterations of `align_rigidly` run from a few rotations. The axis of a half turn is a principal axis.
+    The axis of any other turn is the principal axis whose variance differs from the two others. If all three
+    are equal, the axes of a cube and of an icosahedron are tried. A surface of revolution gets turns by
+    multiples of 30°, and half turns. A symmetry by less than about 30° can be missed.
 
     **Arguments:**
 
     - `points`: points (p, 3), evenly spread over the surface, in units in which its area is about 1.
     - `normals`: the unit normals of the surface at the points (p, 3).
     """
+    if len(points) < _FEWEST:
+        return []
     variances, axes = np.linalg.eigh(np.cov(points.T))
     smaller, larger = variances[:2] >= _INTERCHANGEABLE * variances[1:]
     if smaller and larger:
@@ -164,11 +169,35 @@ def symmetries(
     offsets = (_to_tangent_planes(moving, points, normals, tree, motion)[2] for motion in motions)
     distances = np.array([np.sqrt(np.mean(offset**2)) for offset in offsets])
     closest = [motions[number] for number in np.argsort(distances)[: np.sum(distances < _ONTO_ITSELF)]]
+    sides = -normals if mirrored else normals
+    closest = [motion for motion in closest if _covers(moving, sides, points, normals, tree, motion)]
     least = _DIFFERENT**2 * variances.sum()
     if mirrored:
         return different_alignments(closest, moving, least, len(motions))
     identity = Alignment(np.eye(3), np.zeros(3))
     return different_alignments([identity, *closest], moving, least, len(motions))[1:]
+
+
+def _covers(
+    x: Float64[np.ndarray, "p 3"],
+    normals_x: Float64[np.ndarray, "p 3"],
+    y: Float64[np.ndarray, "p 3"],
+    normals_y: Float64[np.ndarray, "p 3"],
+    tree: KDTree,
+    motion: Alignment,
+) -> bool:
+    """Return whether the moved points x cover the surface of y, with normals to the same side.
+
+    Nearly all points then have a neighbour on the other surface that is hardly farther away than a sample is
+    from the next one. The boundary of an open surface must fit too, which distances to planes do not show.
+    """
+    spacing = tree.query(y, 2)[0][:, 1].mean()
+    moved = motion.apply(x)
+    distances, nearest = tree.query(moved)
+    back = KDTree(moved).query(y)[0]
+    farthest = max(np.quantile(distances, _NEARLY_ALL), np.quantile(back, _NEARLY_ALL))
+    same_side = (motion.turn(normals_x) * normals_y[nearest]).sum(axis=1).mean() > 0.5
+    return bool(same_side and farthest < 2 * spacing)
 
 
 def _between_axes(

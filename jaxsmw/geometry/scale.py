@@ -110,9 +110,18 @@ class _Samples(NamedTuple):
     descriptors: Float[np.ndarray, "s d"]
 
 
+# The shortest boundary of a part, divided by the square root of its area.
+_LONG_BOUNDARY = 0.4
+
+
 def relative_boundary(mesh: Mesh) -> float:
     """Return the length of the boundary, divided by the square root of the area; 0 for a closed surface."""
     return float(mesh.lengths(mesh.boundary_edges).sum() / mesh.area**0.5)
+
+
+def may_be_part(mesh: Mesh) -> bool:
+    """Return whether the boundary of a mesh is so long that the mesh may be a part of a body."""
+    return relative_boundary(mesh) >= _LONG_BOUNDARY
 
 
 def _sample(mesh: Mesh, share: float) -> _Samples:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from jaxsmw.errors import WrongMapWarning
-from jaxsmw.geometry.scale import relative_boundary
+from jaxsmw.geometry.scale import may_be_part
 from jaxsmw.geometry.scans import SMALL_CLOSED
 from jaxsmw.matching.correspondence import Correspondence
 from jaxsmw.wording import MOST_LISTED, percentage
@@ -41,7 +41,7 @@ def _recognition(correspondence: Correspondence) -> str:
         unit = f" (lengths on the source are multiplied by {pair.scale:.3g})"
         cure = ' and scale="unknown"'
     return (
-        f"{part} looks like a part of {whole}, and was matched as such{unit}. If this is right, set "
+        f"{part} looks like a part of {whole}, and was matched as such{unit}. If it is a part, set "
         f"partial=True{cure}, which often gives a better map."
     )
 
@@ -70,7 +70,7 @@ def _suspicion(correspondence: Correspondence) -> str:
         cures.insert(0, 'use preset="accurate", which searches for the right map')
     if pair.partial and pair.scale == 1:
         cures.append('estimate the scale with scale="unknown" if the units of length differ')
-    if pair.partial and correspondence.shared is None and all(map(relative_boundary, pair.meshes)):
+    if pair.partial and correspondence.shared is None and all(map(may_be_part, pair.meshes)):
         cures.append(
             "match both meshes through a full shape of this kind with template=mesh, or with "
             'template="mammal" for four-legged animals, if both are parts'

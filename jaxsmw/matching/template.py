@@ -198,7 +198,7 @@ def _alternatives(
 ) -> list[Alternative]:
     """Return the joined map, and the maps that result if an alternative replaces a map to the template.
 
-    A map that agrees with a more probable one, at points of X in the overlap, adds its probability to it.
+    A map that agrees with a more probable one in the overlap adds its probability to that one.
     """
     template, map_x, map_y = x_to_template.mesh_y, x_to_template.pointwise_map, y_to_template.pointwise_map
     replaced = [
@@ -223,7 +223,7 @@ def _alternatives(
 
     def agree(one: Alternative, other: Alternative) -> bool:
         apart = np.linalg.norm(positions[one.pointwise_map] - positions[other.pointwise_map], axis=1)
-        return bool(areas @ (apart >= DIFFERENT) <= COMMON * areas.sum())
+        return bool(areas @ (apart >= DIFFERENT) < COMMON * areas.sum())
 
     found: list[Alternative] = []
     first = Alternative(joined, x_to_template.probability * y_to_template.probability, "")

@@ -12,8 +12,8 @@ from jaxsmw.geometry.alignment import patch_motions
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
 from jaxsmw.matching.search.reading import COMMON, Reading
 
-# The weights of `Evidence.features` in the log-odds, and those for two parts of a body, from regressions
-# (scripts/learn_judge.py, entry R49 of docs/research_log.md).
+# The weights of `Evidence.features` in the log-odds, and those for two parts of a body. They follow
+# regressions (scripts/learn_judge.py), with the changes that entry R49 of docs/research_log.md explains.
 _WEIGHTS = (-7.6, -2.5, -3.5, -1.7, 2.0, 2.0)
 _WEIGHTS_OF_TWO_PARTS = (-10.3, -2.1, 0.0, 0.0, 4.8, 2.0)
 # How much differences of log-odds count between maps of the same pair.

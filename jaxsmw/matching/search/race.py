@@ -62,7 +62,7 @@ class Candidate:
     def is_twin(self, other: Candidate) -> bool:
         """Return whether two maps differ on less than 2 % of the area, or on less than 25 % for two parts.
 
-        Points without a counterpart have any match.
+        The matches of points without a counterpart are arbitrary.
         """
         least = COMMON if self.reading.two_parts else DIFFERENT_AREA
         return self.reading.difference(self.matches, other.matches) < least

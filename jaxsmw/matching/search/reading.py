@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.alignment import symmetries
 from jaxsmw.geometry.mesh import extend_to_unreferenced
-from jaxsmw.geometry.scale import relative_boundary
+from jaxsmw.geometry.scale import may_be_part
 from jaxsmw.matching.descriptors import PrincipalAxes
 from jaxsmw.matching.preparation import PreparedPair
 from jaxsmw.matching.search.proxies import Proxy, SampleMap
@@ -91,13 +91,15 @@ class Reading:
                 return False
         except InputError:  # the samples are too sparse for SHOT
             return False
-        return not any(symmetries(side.positions, side.normals, mirrored=True) for side in (self.x, self.y))
+        # The limits of a symmetry hold for surfaces of area 1.
+        both = ((side.positions * side.unit / side.mesh.area**0.5, side.normals) for side in (self.x, self.y))
+        return not any(symmetries(*side, mirrored=True) for side in both)
 
     @cached_property
     def two_parts(self) -> bool:
         """Whether both shapes are parts of a body, so that any region may lack a counterpart."""
-        open_meshes = all(map(relative_boundary, self.prepared.given.meshes))
-        return self.prepared.pair.partial and not self.contained and open_meshes
+        parts = all(map(may_be_part, self.prepared.given.meshes))
+        return self.prepared.pair.partial and not self.contained and parts
 
     def described(self, preset: Preset) -> Reading:
         """Return the reading whose prepared pair has the descriptors that a preset uses."""
@@ -137,15 +139,22 @@ class Reading:
         return extend_to_unreferenced(self.prepared.pair.mesh_x, everywhere)
 
     def difference(self, first: SampleMap, second: SampleMap) -> float:
-        """Return the share of X's area, from 0 to 1, on which two maps of samples differ."""
-        return float(self.x.areas @ (self.y.distances[first, second] > DIFFERENT))
+        """Return the share of X's area, from 0 to 1, on which two maps of samples differ.
+
+        If Y is a small part of X, its points are near each other in the unit of X, so its own size counts.
+        """
+        least = DIFFERENT * min(1.0, self.y.mesh.area**0.5 / self.y.unit)
+        return float(self.x.areas @ (self.y.distances[first, second] > least))
 
     def agreement(self, matches: SampleMap) -> float:
         """Return the share of X's area, from 0 to 1, on which a map of samples agrees with the first map.
 
-        Without a first map, the share is 0.2, which is between the shares of right and of wrong maps.
+        Without a first map, the share is 0.2, or 0.65 for two parts. This is between the shares of right and
+        of wrong maps.
         """
-        return _UNKNOWN_AGREEMENT if self.first is None else 1 - self.difference(self.first, matches)
+        if self.first is None:
+            return _UNKNOWN_AGREEMENT[self.two_parts]
+        return 1 - self.difference(self.first, matches)
 
     @cached_property
     def nearest(self) -> SampleMap:
@@ -162,6 +171,6 @@ class Reading:
         return matched - nearest
 
 
-_UNKNOWN_AGREEMENT = 0.2
+_UNKNOWN_AGREEMENT = 0.2, 0.65
 # The radii of SHOT, in units of 0.06, and the least mean asymmetry of asymmetric shapes. (Entry R23)
 _ASYMMETRY_RADII, _ASYMMETRIC = (3, 6), 0.61

@@ -15,7 +15,7 @@ from jaxsmw.choices import DEFAULT_INITIAL_MAP, Mirror
 from jaxsmw.core.arrays import namespace
 from jaxsmw.core.spectrum import Spectrum
 from jaxsmw.errors import InputError
-from jaxsmw.geometry.scale import relative_boundary
+from jaxsmw.geometry.scale import may_be_part, relative_boundary
 from jaxsmw.matching.executor import run
 from jaxsmw.matching.judge import area_shape_difference, discontinuous_parts, distortion
 from jaxsmw.matching.outcome import Outcome, Start
@@ -32,9 +32,9 @@ from jaxsmw.matching.starts import make_start
 
 logger = logging.getLogger("jaxsmw")
 
-# One mesh can be a part of the other if its boundary is so long, relative to the square root of its area, and
-# longer than that of the other by this factor.
-_LONG, _LONGER = 0.4, 1.5
+# One mesh can be a part of the other if its boundary is longer than that of the other by this factor, both
+# relative to the square root of the area.
+_LONGER = 1.5
 # The largest number of races. The maps of the first race, refined at all vertices, are mended by the second.
 _ROUNDS = 2
 
@@ -66,11 +66,13 @@ class Judged(Candidate):
         return self.outcome.pointwise_map
 
     def with_turns(self) -> list[Judged]:
-        """Return this map, and this map with each turn of a symmetric shape, which share its probability.
+        """Return this map, and this map with each turn of a symmetric shape. They divide its probability.
 
         The turns are those of Y or, if Y is a part of X, those of X. The maps have the same evidence, except
         that not all maps of aligned meshes are in place.
         """
+        if not self.outcome.successful:
+            return [self]
         reading, matches = self.reading, self.pointwise_map
         if reading.prepared.pair.source_is_whole:
             maps = [matches[turn] for turn in reading.x.turns]
@@ -115,7 +117,7 @@ def search(
         reading = replace(reading, first=None)
     first = Judged.of(reading, outcome)
     if settings is None:
-        return distinct(_turned([first], hypotheses))
+        return _results([first], start, preset)
     judged = [first]
     certain = settings.certain == 0 or (_ends_the_search(first, settings) and not both_hands)
     readings = readings_of(reading, both_hands=both_hands) if hypotheses and not certain else [reading]
@@ -147,12 +149,23 @@ def search(
     parts = np.sqrt(before * _shares_of(judged))
     parts /= parts.sum() or 1.0
     judged = [replace(one, share=float(part)) for one, part in zip(judged, parts, strict=True)]
-    return distinct(_turned(judged, hypotheses))
+    return _results(judged, start, preset)
 
 
-def _turned(judged: Sequence[Judged], hypotheses: bool) -> list[Judged]:
-    """Return maps with their turns. A start that the user gave tells one turn from the others."""
-    return [turn for one in judged for turn in one.with_turns()] if hypotheses else list(judged)
+def _results(judged: Sequence[Judged], start: Start, preset: Preset) -> list[Judged]:
+    """Return different maps and their turns, the most probable first. A best turn passes the last stage.
+
+    A start that the user gave tells one turn of a symmetric shape from the others.
+    """
+    turned = list(judged)
+    if start.origin not in ("map", "landmarks", "positions"):
+        turned = [turn for one in judged for turn in one.with_turns()]
+    best, *others = distinct(turned)
+    if all(best.outcome is not one.outcome for one in judged):
+        prepared = best.reading.prepared
+        outcome = run(preset.before_final[-1:], prepared.spectra, Start(best.pointwise_map))
+        best = replace(Judged.of(best.reading, outcome), share=best.share)
+    return [best, *others]
 
 
 def distinct(judged: Iterable[Judged]) -> list[Judged]:
@@ -168,8 +181,8 @@ def distinct(judged: Iterable[Judged]) -> list[Judged]:
             found[twin] = replace(found[twin], share=found[twin].share + one.share)
         elif not found or one.outcome.successful:
             found.append(one)
-    best, *others = found  # its turns are as probable, up to rounding
-    return [best, *sorted(others, key=lambda one: -one.share)]
+    # The turns of a map have the same probability, up to rounding.
+    return sorted(found, key=lambda one: -round(one.share, 6))
 
 
 def _shares_of(maps: Sequence[Candidate]) -> Float[np.ndarray, " c"]:
@@ -239,7 +252,7 @@ def _as_parts(reading: Reading) -> Iterator[Reading]:
     prepared, pair = reading.prepared, reading.prepared.pair
     # The boundaries of cuts through fused surfaces do not count.
     shorter, longer = sorted(map(relative_boundary, prepared.given.meshes))
-    if pair.partial or longer < max(_LONG, _LONGER * shorter):
+    if pair.partial or longer < _LONGER * shorter or not any(map(may_be_part, prepared.given.meshes)):
         return
     known: list[float] = []
     for scale in (1.0, "unknown"):
