@@ -249,7 +249,7 @@ def test_figures_are_saved_reproducibly_or_not_at_all(tmp_path: Path) -> None:
     before = sorted(tmp_path.iterdir())
     with pytest.raises(InputError, match=r"\.png, \.pdf or \.svg"):
         save_figure(tmp_path / "c.jpg", figure)
-    with pytest.raises(InputError, match="not a directory"):
+    with pytest.raises(InputError, match="nowhere does not exist: create the directory"):
         save_figure(tmp_path / "nowhere" / "c.png", figure)
     assert sorted(tmp_path.iterdir()) == before
 
