@@ -18,8 +18,8 @@ _WEIGHTS = (-7.6, -2.5, -3.5, -1.7, 2.0, 2.0)
 _WEIGHTS_OF_TWO_PARTS = (-10.3, -2.1, 0.0, 0.0, 4.8, 2.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
-# Between full shapes, a larger agreement counts no more. Right maps of animals agree with the first map on half
-# of the area, and maps that take a head to a tail on a quarter. (Entry R49)
+# Between full shapes, a larger agreement counts no more. Right maps of different animals agree with the first
+# map on half of the area, and maps that take a head to a tail on a quarter. (Entry R49)
 _AGREEING = 0.4
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
 # samples have as much.
