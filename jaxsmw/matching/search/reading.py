@@ -139,12 +139,8 @@ class Reading:
         return extend_to_unreferenced(self.prepared.pair.mesh_x, everywhere)
 
     def difference(self, first: SampleMap, second: SampleMap) -> float:
-        """Return the share of X's area, from 0 to 1, on which two maps of samples differ.
-
-        If Y is a small part of X, its points are near each other in the unit of X, so its own size counts.
-        """
-        least = DIFFERENT * min(1.0, self.y.mesh.area**0.5 / self.y.unit)
-        return float(self.x.areas @ (self.y.distances[first, second] > least))
+        """Return the share of X's area, from 0 to 1, on which two maps of samples differ."""
+        return float(self.x.areas @ (self.y.distances[first, second] > DIFFERENT))
 
     def agreement(self, matches: SampleMap) -> float:
         """Return the share of X's area, from 0 to 1, on which a map of samples agrees with the first map.
