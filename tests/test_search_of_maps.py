@@ -203,7 +203,7 @@ def test_two_parts_are_judged_where_they_fit_best(pair):
     along = mesh.vertices[:, 2]
     parts = [
         mesh.without_faces(~kept[mesh.faces].all(axis=1))
-        for kept in (along < np.quantile(along, 0.75), along > np.quantile(along, 0.3))
+        for kept in (along > np.quantile(along, 0.3), along < np.quantile(along, 0.75))
     ]
     reading = read(*parts, partial=True)
     distances, matches = KDTree(reading.y.positions).query(reading.x.positions)
@@ -222,7 +222,7 @@ def test_two_parts_are_judged_where_they_fit_best(pair):
     one, other = (Candidate(reading, found, evidence) for found in (collapsed, elsewhere))
     assert 0.02 < reading.difference(collapsed, elsewhere) < 0.5
     assert one.is_twin(other) == (reading.difference(collapsed, elsewhere) < 0.25)
-    contained = replace(reading, contained=True)
+    contained = replace(reading, two_parts=False)
     assert not Evidence.of(contained, collapsed).two_parts
     assert not replace(one, reading=contained).is_twin(other)
 

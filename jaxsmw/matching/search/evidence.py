@@ -18,8 +18,8 @@ _WEIGHTS = (-7.6, -2.5, -3.5, -1.7, 2.0, 2.0)
 _WEIGHTS_OF_TWO_PARTS = (-10.3, -2.1, 0.0, 0.0, 4.8, 2.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
-# Between full shapes, a larger agreement counts no more. Right maps of different animals agree with the first
-# map on half of the area, and maps that take a head to a tail on a quarter. (Entry R49)
+# A larger agreement counts no more. Right maps of different animals agree with the first map on half of the
+# area, and maps that take a head to a tail on a quarter. (Entry R49)
 _AGREEING = 0.4
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
 # samples have as much.
@@ -56,7 +56,7 @@ class Evidence(NamedTuple):
       reading. It is 0.2 for all maps if both hands are compared.
     - `in_place`: whether matches are hardly farther away than the nearest samples, in the given positions,
       because the meshes were aligned.
-    - `partial`, `two_parts`: whether one shape is read as a part, and whether both are parts of a body.
+    - `two_parts`: whether both shapes are read as parts of a body.
     """
 
     deformation: float
@@ -64,33 +64,28 @@ class Evidence(NamedTuple):
     orientation_change: float
     agreement: float
     in_place: bool
-    partial: bool = False
     two_parts: bool = False
 
     @classmethod
     def of(cls, reading: Reading, matches: SampleMap) -> Evidence:
         """Measure a map of samples (s,)."""
         x, y, pair = reading.x, reading.y, reading.prepared.pair
-        to_matches = y.distances[:, matches]
-        reverse, areas_x, lacking = to_matches.argmin(axis=1), x.areas, 0.0
-        if pair.source_is_whole:
-            areas_x = np.bincount(reverse, weights=y.areas, minlength=len(x.areas)).astype(float)
-        elif pair.partial:
-            lacking = 1 - pair.areas[0] / pair.areas[1]
+        reverse, areas_x = reading.reverse(matches), reading.shared_areas(matches)
         deformed = [_mean(deformation(x, y, matches), areas_x, COMMON if reading.two_parts else 1.0)]
         ways = [(x, y, matches), (y, x, reverse)]
         if pair.partial:
             ways = [ways[pair.source_is_whole]]
         else:
             deformed.append(y.areas @ deformation(y, x, reverse))
-        uncovered = float(y.areas @ (to_matches.min(axis=1) > _COVERED))
+        to_matches = y.distances[np.arange(len(reverse)), matches[reverse]]
+        uncovered = float(y.areas @ (to_matches > _COVERED))
+        lacking = max(0.0, 1 - pair.areas[0] / pair.areas[1])
         return cls(
             deformation=float(np.mean(deformed)),
             uncovered=max(0.0, uncovered - lacking),
             orientation_change=float(np.mean([orientation_change(*way) for way in ways])),
             agreement=reading.agreement(matches),
             in_place=not reading.prepared.mirrored and bool(areas_x @ reading.excess(matches) < _NEAR),
-            partial=pair.partial,
             two_parts=reading.two_parts,
         )
 
@@ -100,8 +95,6 @@ class Evidence(NamedTuple):
         deformation = np.log(self.deformation + _LEAST_DEFORMATION)
         orientation_change = np.log(self.orientation_change + _LEAST_CHANGE)
         uncovered, agreement = np.sqrt(self.uncovered), min(self.agreement / _AGREEING, 1.0)
-        if self.partial:
-            agreement = (1 + self.agreement) / 2  # the log-odds depend on the whole agreement, with weight 1
         if self.two_parts:
             # Any region can lack a counterpart, and extremities can lie on cuts. Right maps agree widely.
             orientation_change, uncovered, agreement = 0.0, 0.0, self.agreement

@@ -26,7 +26,8 @@ from jaxsmw.runtime.threads import side_by_side
 _RADII, NUMBER_OF_DESCRIPTORS = (1, 2, 4), 30
 
 DIFFERENT = 0.2
-"""Two maps differ at a point if its two matches are so far apart, in units of the square root of the area."""
+"""Two maps differ at a point if its two matches are so far apart, in units of the square root of the area.
+If one shape is a part of the other, this is the area of the part."""
 COMMON = 0.25
 """The share of the area that two parts of a body have in common at least, if they can be matched."""
 
@@ -40,18 +41,21 @@ class Reading:
     - `prepared`: the `PreparedPair`. Its attributes `mirrored` and `pair.partial` tell how the pair is read.
     - `x`, `y`: the proxies of X (s samples) and of Y (t samples), in `Pair.units_of_length`.
     - `first`: the first map of the reading, from SHOT, on the samples (s,). None if there is no such map.
-    - `contained`: whether one shape is read as a part of the other, although both were called full.
+    - `two_parts`: whether both shapes are read as parts of a body, so that any region may lack a counterpart.
     """
 
     prepared: PreparedPair
     x: Proxy
     y: Proxy
     first: SampleMap | None = None
-    contained: bool = False
+    two_parts: bool = False
 
     @classmethod
     def of(cls, prepared: PreparedPair) -> Reading:
-        """Return the reading of a prepared pair."""
+        """Return the reading of a prepared pair.
+
+        If the pair was called partial, and each mesh may be a part of a body, both shapes are read as parts.
+        """
 
         def proxy(side: tuple[int, float]) -> Proxy:
             number, unit = side
@@ -60,11 +64,12 @@ class Reading:
             return made
 
         x, y = side_by_side(proxy, *enumerate(prepared.pair.units_of_length))
-        return cls(prepared, x, y)
+        two_parts = prepared.pair.partial and all(map(may_be_part, prepared.given.meshes))
+        return cls(prepared, x, y, two_parts=two_parts)
 
     def mirror(self) -> Reading:
         """Return the reading in which X has the other hand. It has no first map."""
-        return Reading(self.prepared.mirror(), self.x.mirror(), self.y, contained=self.contained)
+        return replace(self, prepared=self.prepared.mirror(), x=self.x.mirror(), first=None)
 
     def with_first(self, pointwise_map: Int64[np.ndarray, " m"]) -> Reading:
         """Return the reading whose first map is a map X -> Y (m,)."""
@@ -94,12 +99,6 @@ class Reading:
         # The limits of a symmetry hold for surfaces of area 1.
         both = ((side.positions * side.unit / side.mesh.area**0.5, side.normals) for side in (self.x, self.y))
         return not any(symmetries(*side, mirrored=True) for side in both)
-
-    @cached_property
-    def two_parts(self) -> bool:
-        """Whether both shapes are parts of a body, so that any region may lack a counterpart."""
-        parts = all(map(may_be_part, self.prepared.given.meshes))
-        return self.prepared.pair.partial and not self.contained and parts
 
     def described(self, preset: Preset) -> Reading:
         """Return the reading whose prepared pair has the descriptors that a preset uses."""
@@ -138,15 +137,34 @@ class Reading:
         everywhere = self.y.samples.vertices[matches][self.x.samples.nearest]
         return extend_to_unreferenced(self.prepared.pair.mesh_x, everywhere)
 
+    def reverse(self, matches: SampleMap) -> Int64[np.ndarray, " t"]:
+        """Return the map Y -> X (t,) in which each sample has the sample of X whose match is nearest."""
+        return self.y.distances[:, matches].argmin(axis=1)
+
+    def shared_areas(self, matches: SampleMap) -> Float[np.ndarray, " s"]:
+        """Return the area (s,) that each sample of X represents, in all 1.
+
+        If Y is a part of X, only the samples to which the reverse of a map takes Y have an area. The matches
+        of other samples are arbitrary, because these samples have no counterpart.
+        """
+        if not self.prepared.pair.source_is_whole:
+            return self.x.areas
+        return np.bincount(self.reverse(matches), self.y.areas, len(self.x.areas))
+
     def difference(self, first: SampleMap, second: SampleMap) -> float:
-        """Return the share of X's area, from 0 to 1, on which two maps of samples differ."""
-        return float(self.x.areas @ (self.y.distances[first, second] > DIFFERENT))
+        """Return the share of X's area, from 0 to 1, on which two maps of samples differ.
+
+        If Y is a part of X, the share is that of the area that either map takes to Y, see `shared_areas`.
+        """
+        areas = (self.shared_areas(first) + self.shared_areas(second)) / 2
+        limit = DIFFERENT * min(self.prepared.pair.areas) ** 0.5
+        return float(areas @ (self.y.distances[first, second] > limit))
 
     def agreement(self, matches: SampleMap) -> float:
         """Return the share of X's area, from 0 to 1, on which a map of samples agrees with the first map.
 
-        Without a first map, the share is 0.2, or 0.65 for two parts. This is between the shares of right and
-        of wrong maps.
+        Without a first map, the share is 0.2, or 0.65 for two parts. This is between the shares of
+        right and of wrong maps.
         """
         if self.first is None:
             return _UNKNOWN_AGREEMENT[self.two_parts]

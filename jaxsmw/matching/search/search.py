@@ -262,7 +262,7 @@ def _as_parts(reading: Reading) -> Iterator[Reading]:
                 part = Pair.make(*pair.meshes, partial=True, scale=scale)
             if all(abs(np.log(part.scale / other)) > _SAME_SCALE for other in known):
                 known.append(part.scale)
-                yield replace(Reading.of(prepared.as_part(part)), contained=True)
+                yield replace(Reading.of(prepared.as_part(part)), two_parts=False)
         except InputError:  # no scale can be estimated, or the closed mesh is the smaller one
             continue
 
