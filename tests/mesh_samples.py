@@ -1,9 +1,10 @@
 """Meshes with all kinds of data, for the tests of mesh files."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxsmw.geometry.mesh import make_mesh
-from jaxsmw.io.mesh_data import MeshData, Skin, Texture
+from jaxsmw.io.mesh_data import MeshData, Skeleton, Skin, Texture
 
 
 def sample(*, seam: bool = True, seed: int = 0) -> MeshData:
@@ -19,6 +20,18 @@ def sample(*, seam: bool = True, seed: int = 0) -> MeshData:
         texture = Texture(random.uniform(size=(n, 2)), faces)
     weights = random.uniform(size=(n, 6)) * (random.uniform(size=(n, 6)) > 0.3)
     weights[:, 2] += 0.1
+    matrices = np.tile(np.eye(4), (6, 1, 1))
+    matrices[:, :3, :3] = Rotation.random(6, rng=seed).as_matrix() * [
+        [[2.0]],
+        [[-1]],
+        [[1]],
+        [[1]],
+        [[1]],
+        [[1]],
+    ]
+    matrices[3, :3, :3] @= [[1, 0.5, 0], [0, 1, 0], [0, 0, 3]]  # is not a rotation with a scale
+    matrices[:, :3, 3] = random.normal(size=(6, 3))
+    skeleton = Skeleton(np.array([4, 0, -1, 4, -1, 3]), matrices)
     return MeshData(
         make_mesh(vertices, faces, name="sample"),
         faces,
@@ -38,6 +51,8 @@ def sample(*, seam: bool = True, seed: int = 0) -> MeshData:
         },
         texture=texture,
         blend_shapes={"smile": random.normal(size=(n, 3)), "blink left": random.normal(size=(n, 3))},
-        skin=Skin(tuple(f"joint {i}" for i in range(6)), weights / weights.sum(axis=1, keepdims=True)),
+        skin=Skin(
+            tuple(f"joint {i}" for i in range(6)), weights / weights.sum(axis=1, keepdims=True), skeleton
+        ),
         label_names={"group": ("head", "left arm", "rest")},
     )

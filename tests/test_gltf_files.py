@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mesh_samples import sample
 from messages import assert_names, refusal
+from scipy.spatial.transform import Rotation
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOGeometry import vtkGLTFReader
 
@@ -259,8 +260,90 @@ def test_skins_name_their_joints(tmp_path):
     file.json["skins"] = [{"joints": [3, 1, 2, 4]}]
     data = read_mesh_data(file.save(tmp_path))
     assert np.array_equal(data.mesh.vertices, SQUARE), "the joints alone move a skinned mesh"
-    assert data.skin.joints == ("hip", "node 2", "hip (2)")
-    assert np.allclose(data.skin.weights, [[0, 0, 1], [0, 1, 0], [0.2, 0.8, 0], [1, 0, 0]])
+    assert data.skin.joints == ("hip", "node 2", "hip (2)", "unused") and data.skin.skeleton is None
+    assert np.allclose(data.skin.weights, [[0, 0, 1, 0], [0, 1, 0, 0], [0.2, 0.8, 0, 0], [1, 0, 0, 0]])
+
+
+def posed(file: dict, buffer: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices that the nodes of a written file pose, by its matrices, and the stored vertices."""
+
+    def numbers(index, kind="f4"):
+        accessor = file["accessors"][index]
+        view = file["bufferViews"][accessor["bufferView"]]
+        width = {"VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor["type"]]
+        rows = np.frombuffer(buffer, np.uint8, view["byteLength"], view["byteOffset"]).reshape(
+            accessor["count"], -1
+        )
+        return rows.copy().view(kind)[:, :width]
+
+    def local(node):
+        if "matrix" in node:
+            return np.reshape(node["matrix"], (4, 4)).T
+        turn = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix() @ np.diag(
+            node.get("scale", [1] * 3)
+        )
+        return np.block([[turn, np.reshape(node.get("translation", [0] * 3), (3, 1))], [0, 0, 0, 1]])
+
+    places, pending = {}, [(number, np.eye(4)) for number in file["scenes"][0]["nodes"]]
+    for number, above in pending:
+        places[number] = above @ local(file["nodes"][number])
+        pending += [(child, places[number]) for child in file["nodes"][number].get("children", [])]
+    skin, attributes = file["skins"][0], file["meshes"][0]["primitives"][0]["attributes"]
+    inverses = numbers(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+    motions = np.stack([places[node] for node in skin["joints"]]) @ inverses
+    vertices = numbers(attributes["POSITION"]).astype(float)
+    total = np.zeros((len(vertices), 4, 4))
+    for part in range(sum(name.startswith("JOINTS") for name in attributes)):
+        joints, weights = numbers(attributes[f"JOINTS_{part}"], "u2"), numbers(attributes[f"WEIGHTS_{part}"])
+        total += np.einsum("nj,njab->nab", weights, motions[joints])
+    return np.einsum("nab,nb->na", total, np.c_[vertices, np.ones(len(vertices))])[:, :3], vertices
+
+
+def test_the_nodes_of_a_written_skeleton_pose_the_mesh(tmp_path):
+    data = sample(seam=False)
+    write_mesh_data(tmp_path / "m.gltf", data)
+    file = json.loads((tmp_path / "m.gltf").read_text())
+    buffer = base64.b64decode(file["buffers"][0]["uri"].split(",")[1])
+    bound, vertices = posed(file, buffer)
+    assert np.allclose(bound, vertices, atol=1e-5), "in the bind pose, the mesh stays as it is"
+    nodes = {node["name"]: node for node in file["nodes"]}
+    assert "matrix" in nodes["joint 3"] and "rotation" in nodes["joint 0"] and nodes["joint 0"]["scale"]
+    # A turn of joint 4 moves what hangs on it (joints 0, 1, 3 and 5) about its place.
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.2])
+    nodes["joint 4"]["rotation"] = (
+        (Rotation.from_quat(nodes["joint 4"]["rotation"]) * turn).as_quat().tolist()
+    )
+    found, _ = posed(file, buffer)
+    moved = 1 - data.skin.weights[:, [2]]
+    matrix = data.skin.skeleton.bind_matrices[4]
+    motion = matrix @ np.block([[turn.as_matrix(), np.zeros((3, 1))], [0, 0, 0, 1]]) @ np.linalg.inv(matrix)
+    turned = vertices @ motion[:3, :3].T + motion[:3, 3]
+    assert np.allclose(found, moved * turned + (1 - moved) * vertices, atol=1e-5)
+
+
+def test_joints_of_other_programs_have_parents_and_places(tmp_path):
+    """Nodes between joints count in places, and are left out. Joints of several skins are joined."""
+    file = square()
+    attributes = file.json["meshes"][0]["primitives"][0]["attributes"]
+    attributes["JOINTS_0"] = file.add(np.zeros((4, 4), "u1"))
+    attributes["WEIGHTS_0"] = file.add(np.array([[1, 0, 0, 0]] * 4, "f4"))
+    places = np.tile(np.eye(4, dtype="f4"), (2, 1, 1))
+    places[:, :3, 3] = [[1, 2, 3], [4, 5, 6]]
+    inverses = file.add(np.linalg.inv(places).swapaxes(1, 2).reshape(2, 16))
+    file.nodes(
+        {"mesh": 0, "skin": 0},
+        {"name": "hand"},
+        {"children": [1]},
+        {"name": "arm", "children": [2]},
+        roots=[0, 3],
+    )
+    file.json["skins"] = [{"joints": [3, 1], "inverseBindMatrices": inverses}]
+    skin = read_mesh_data(file.save(tmp_path)).skin
+    assert skin.joints == ("hand", "arm") and skin.skeleton.parents.tolist() == [1, -1]
+    assert np.allclose(skin.skeleton.bind_matrices, places[::-1])
+    assert np.array_equal(skin.weights, [[0, 1]] * 4)
+    file.json["accessors"][inverses]["count"] = 1
+    assert "a skin has 1 bind matrices for 2 joints" in refused_file(file.save(tmp_path))
 
 
 @pytest.mark.parametrize("seam", [False, True])

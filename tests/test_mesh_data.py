@@ -19,7 +19,16 @@ from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLPolyDataWriter
 
 from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh, make_mesh
-from jaxsmw.io import MeshData, Skin, Texture, read_mesh, read_mesh_data, write_mesh, write_mesh_data
+from jaxsmw.io import (
+    MeshData,
+    Skeleton,
+    Skin,
+    Texture,
+    read_mesh,
+    read_mesh_data,
+    write_mesh,
+    write_mesh_data,
+)
 
 SUFFIXES = [".off", ".obj", ".ply", ".stl", ".mat", ".vtk", ".vtp", ".gltf", ".glb", ".npz", ".gii", ".pial"]
 # What the formats keep of the sample: vertex data, face data, and other attributes.
@@ -86,6 +95,9 @@ def test_data_are_read_back(tmp_path, suffix, seam):
     if "skin" in others:
         assert again.skin.joints == data.skin.joints
         assert np.allclose(again.skin.weights, data.skin.weights, rtol=0, atol=limit)
+        assert np.array_equal(again.skin.skeleton.parents, data.skin.skeleton.parents)
+        matrices = (skin.skeleton.bind_matrices for skin in (again.skin, data.skin))
+        assert np.allclose(*matrices, rtol=0, atol=10 * limit)
     assert again.label_names == (data.label_names if "label_names" in others else {})
     assert_notes_name_what_is_lost(notes, data, again)
 
@@ -469,6 +481,12 @@ def test_off_normals_and_texture(tmp_path):
     assert data.texture.coordinates.tolist() == [[0, 0], [1, 0], [0, 1]]
 
 
+def skeleton(parents, matrices=None):
+    """A skin with one joint, and a skeleton with the given arrays."""
+    matrices = np.asarray([np.eye(4)] if matrices is None else matrices, float)
+    return {"skin": Skin(("a",), np.ones((3, 1)), Skeleton(parents, matrices))}
+
+
 # ------------------------------------------------------------------------------------------- checks
 
 TRIANGLE = make_mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], name="triangle")
@@ -494,6 +512,12 @@ INCONSISTENT = {
     "short skin": ({"skin": (("a",), np.zeros((2, 1)))}, "needs numbers of shape (3, 1)"),
     "equal joints": ({"skin": (("a", "a"), np.zeros((3, 2)))}, "not distinct"),
     "skin of nan": ({"skin": (("a",), np.full((3, 1), np.nan))}, "not finite"),
+    "short bind matrices": (skeleton([-1], np.zeros((2, 4, 4))), "needs numbers of shape (1, 4, 4)"),
+    "flat bind matrix": (skeleton([-1], [np.diag([1, 1, 0, 1])]), "a bind matrix has no inverse"),
+    "projective bind matrix": (skeleton([-1], [np.diag([1, 1, 1, 2])]), "a bind matrix has no inverse"),
+    "parent out of range": (skeleton([1]), "not 1 integers from -1 to 0"),
+    "parent of floats": (skeleton([0.5]), "not 1 integers from -1 to 0"),
+    "own parent": (skeleton([0]), "is its own ancestor"),
     "labels without data": ({"label_names": {"a": ("x",)}}, "the array of labels 'a'"),
     "labels out of range": ({"face_data": {"a": [1]}, "label_names": {"a": ("x",)}}, "from 0 to 0"),
     "labels of floats": ({"face_data": {"a": [0.0]}, "label_names": {"a": ("x",)}}, "must contain integers"),

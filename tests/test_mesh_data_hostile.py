@@ -196,7 +196,8 @@ HOSTILE = {
     "wide words.npz": (npz_with_header((1, 3), f"<U{2**28}"), "not a .npz file"),
     "negative rows.npz": (npz_with_header((-1, -3)), "not a .npz file"),
     "bomb.npz": (npz_with_header((10**6, 3)), "not a .npz file"),
-    "half a skin.npz": (npz(**NPZ, skin_joints=np.array(["a"])), "half of a texture or of a skin"),
+    "half a skin.npz": (npz(**NPZ, skin_joints=np.array(["a"])), "half of a texture, of a skin or of a skeleton"),
+    "half a skeleton.npz": (npz(**NPZ, skin_joints=np.array(["a"]), skin_weights=np.ones((3, 1)), skin_parents=np.array([-1])), "or of a skeleton"),
     "short data.npz": (npz(**NPZ, **{"vertex_data/a": np.ones(2)}), "'a' have 2 rows, but need 3"),
     "single number.npz": (npz(**NPZ, **{"face_data/a": np.array(1.0)}), "shape ()"),
     "short shape.npz": (npz(**NPZ, **{"blend_shapes/a": np.ones((2, 3))}), "the blend shape 'a'"),
@@ -207,6 +208,8 @@ HOSTILE = {
     "short data.mat": (mat(vertex_data={"a": np.ones((2, 1))}), "'a' have 2 rows, but need 3"),
     "words as data.mat": (mat(vertex_data={"a": "xyz"}), "the vertex data 'a'"),
     "skin without weights.mat": (mat(skin={"joints": "a"}), "the skin"),
+    "half a skeleton.mat": (mat(skin={"joints": "a", "weights": np.ones((3, 1))}, skeleton={"parents": 0.0}), "the skeleton has no arrays"),
+    "broken parents.mat": (mat(skin={"joints": "a", "weights": np.ones((3, 1))}, skeleton={"parents": 0.5, "bind_matrices": np.eye(4)}), "the parents of the joints are not"),
     "labels.mat": (mat(label_names={"a": "x"}), "the array of labels 'a'"),
 }  # fmt: skip
 

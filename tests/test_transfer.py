@@ -18,7 +18,7 @@ from jaxsmw.geometry.surface_distance import (
     nearest_points_of_triangles,
     nearest_surface_points,
 )
-from jaxsmw.io import Landmarks, MeshData, Skin, Texture, read_mesh_data, write_mesh_data
+from jaxsmw.io import Landmarks, MeshData, Skeleton, Skin, Texture, read_mesh_data, write_mesh_data
 from jaxsmw.transfer import (
     RegisteredMesh,
     register_mesh,
@@ -579,6 +579,34 @@ class TestAttributes:
         assert skin.joints == data.skin.joints
         assert skin.weights.min() == 0 and np.allclose(skin.weights.sum(axis=1), 1, atol=1e-12)
         assert (skin.weights > 0).sum(axis=1).max() == 4
+
+    @pytest.mark.parametrize("angle", [0, 40, 80])
+    def test_a_skeleton_takes_the_pose_and_the_size_of_the_target(self, angle):
+        """A forearm that is bent about the elbow, on a body that is turned and three times as large."""
+        mesh = make_mesh(sphere_mesh(4)[0] * [0.5, 0.5, 3], sphere_mesh(4)[1])
+        height = mesh.vertices[:, 2]
+        bent = 1 / (1 + np.exp(-8 * height))
+        weights = np.stack([1 - bent, bent, np.zeros_like(bent)], axis=1)
+        matrices = np.tile(np.eye(4), (3, 1, 1))
+        matrices[:, :3, :3] = Rotation.random(3, rng=1).as_matrix()
+        matrices[:, 2, 3] = [-2.5, 0, 2.8]  # shoulder, elbow, and a tip that moves no vertex
+        skeleton = Skeleton(np.array([-1, 0, 1]), matrices)
+        data = MeshData(mesh, mesh.faces, skin=Skin(("upper arm", "forearm", "tip"), weights, skeleton))
+        bend = Rotation.from_euler("x", angle, degrees=True)
+        posed = Rotation.from_rotvec(bent[:, None] * bend.as_rotvec()).apply(mesh.vertices)
+        target = make_mesh(3 * posed @ TURN.T + SHIFT, mesh.faces)
+        registered = on_same_numbering(mesh, target)
+        expected = matrices.copy()
+        expected[1:, :3] = bend.as_matrix() @ expected[1:, :3]
+        expected[:, :3] = TURN @ expected[:, :3]
+        expected[:, :3, 3] = 3 * expected[:, :3, 3] + SHIFT
+        for skin in (transfer_attributes(data, registered).skin, registered_data(data, registered).skin):
+            found = skin.skeleton
+            assert np.array_equal(found.parents, skeleton.parents)
+            assert np.abs(found.bind_matrices[:, :3, 3] - expected[:, :3, 3]).max() < 0.25  # of 18
+            rotations = found.bind_matrices[:, :3, :3] @ expected[:, :3, :3].swapaxes(1, 2)
+            assert np.degrees(Rotation.from_matrix(rotations).magnitude()).max() < 1 + 0.1 * angle
+        assert np.array_equal(found.bind_matrices[:, 3], [[0, 0, 0, 1]] * 3)
 
     def test_values_that_are_not_finite_do_not_spread(self):
         data, mesh_y = decorated(bumpy_mesh(4)), bumpy_mesh(5)

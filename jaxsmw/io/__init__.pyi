@@ -3,7 +3,7 @@ from .exchange import ImportedMap, make_functional_map, to_geomfum, to_pyfm, to_
 from .landmark_files import read_landmark_file, write_landmark_file
 from .landmarks import FrameDistances, LandmarkMatch, Landmarks, check_frame, find_frame, match_landmarks
 from .maps import read_landmarks, read_pointwise_map, write_pointwise_map
-from .mesh_data import LabelTable, MeshData, Overlay, Skin, Texture
+from .mesh_data import LabelTable, MeshData, Overlay, Skeleton, Skin, Texture
 from .meshes import read_mesh, read_mesh_data, write_mesh, write_mesh_data
 from .overlays import read_overlay, write_overlay
 from .spectra import make_spectrum, read_functional_map, read_spectrum, write_functional_map, write_spectrum
@@ -17,6 +17,7 @@ __all__ = [
     "Landmarks",
     "MeshData",
     "Overlay",
+    "Skeleton",
     "Skin",
     "Texture",
     "Volume",

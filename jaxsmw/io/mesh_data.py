@@ -34,6 +34,20 @@ class Texture(NamedTuple):
     corners: np.ndarray
 
 
+class Skeleton(NamedTuple):
+    """The joints of a skin in the bind pose: the pose in which they were bound to the mesh.
+
+    **Attributes:**
+
+    - `parents`: the number of the parent of each joint (joints,), int64; -1 for a joint without a parent.
+    - `bind_matrices`: the place of each joint (joints, 4, 4), float64. A matrix takes the coordinates of the
+      joint to those of the mesh. glTF stores the inverses.
+    """
+
+    parents: np.ndarray
+    bind_matrices: np.ndarray
+
+
 class Skin(NamedTuple):
     """The weights that bind the vertices of a mesh to the joints of a skeleton.
 
@@ -43,10 +57,12 @@ class Skin(NamedTuple):
     - `weights`: the weight of each joint at each vertex (n, joints), float64. The weights are finite numbers
       without unit, as in the file. They are usually from 0 to 1 with sum 1 at each vertex, but neither range
       nor sum is checked.
+    - `skeleton`: the `Skeleton`, or None if the file does not say where the joints are.
     """
 
     joints: tuple[str, ...]
     weights: np.ndarray
+    skeleton: Skeleton | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +99,7 @@ class MeshData:
     face_data: Mapping[str, np.ndarray] = field(default_factory=dict)
     texture: tuple[np.ndarray, np.ndarray] | None = None
     blend_shapes: Mapping[str, np.ndarray] = field(default_factory=dict)
-    skin: tuple[tuple[str, ...], np.ndarray] | None = None
+    skin: Skin | tuple[tuple[str, ...], np.ndarray] | None = None
     label_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -99,7 +115,7 @@ class MeshData:
                     for name, values in self.blend_shapes.items()
                 },
                 "texture": None if self.texture is None else checked_texture(self.texture, len(faces)),
-                "skin": None if self.skin is None else _checked_skin(*self.skin, n),
+                "skin": None if self.skin is None else _checked_skin(Skin(*self.skin), n),
                 "label_names": {name: tuple(map(str, names)) for name, names in self.label_names.items()},
             }
             for attribute, value in checked.items():
@@ -205,10 +221,33 @@ def _rows(data: Mapping[str, Any], what: str, count: int, noun: str) -> dict[str
     return checked
 
 
-def _checked_skin(joints: tuple[str, ...], weights: Any, n: int) -> Skin:
+def _checked_skin(skin: Skin, n: int) -> Skin:
+    joints = tuple(map(str, skin.joints))
     if len(set(joints)) != len(joints) or not joints:
         raise InputError("the names of the joints are not distinct: give each joint its own name.")
-    return Skin(tuple(map(str, joints)), _real(weights, "the skin", (n, len(joints))))
+    weights = _real(skin.weights, "the skin", (n, len(joints)))
+    skeleton = None if skin.skeleton is None else _checked_skeleton(Skeleton(*skin.skeleton), len(joints))
+    return Skin(joints, weights, skeleton)
+
+
+def _checked_skeleton(skeleton: Skeleton, number: int) -> Skeleton:
+    matrices = _real(skeleton.bind_matrices, "the bind matrices", (number, 4, 4))
+    if (matrices[:, 3] != [0, 0, 0, 1]).any() or (np.linalg.det(matrices[:, :3, :3]) == 0).any():
+        raise InputError(
+            "a bind matrix has no inverse, or its last row is not 0 0 0 1: export the skin again."
+        )
+    parents = np.asarray(skeleton.parents)
+    if parents.shape != (number,) or parents.dtype.kind not in "iu" or not _within(parents + 1, number + 1):
+        raise InputError(
+            f"the parents of the joints are not {number} integers from -1 to {number - 1}: give each joint "
+            "the number of its parent, or -1."
+        )
+    above = parents.astype(np.int64)
+    for _ in range(number):
+        above = np.where(above < 0, -1, parents[above])
+    if (above >= 0).any():
+        raise InputError("a joint is its own ancestor: give each joint a parent above it, or -1.")
+    return Skeleton(parents.astype(np.int64), matrices)
 
 
 def checked_texture(texture: tuple[np.ndarray, np.ndarray], f: int) -> Texture:

@@ -16,6 +16,7 @@ from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.surface_distance import nearest_surface_points
 from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, Skin, Texture
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
+from jaxsmw.transfer.skeletons import with_moved_skeleton
 from jaxsmw.transfer.textures import transfer_texture
 from jaxsmw.wording import count_of
 
@@ -62,7 +63,7 @@ def transfer_attributes(
       no texture, the face of Y has no texture either.
     - Skin weights are interpolated. Let k be the largest number of joints at a vertex of X. Each vertex of Y
       keeps only the k largest weights. The weights of a vertex sum to 1, unless all weights of the nearest
-      face are 0.
+      face are 0. The joints move to the place that they have in Y, and turn with the vertices around them.
     - Blend shapes are displacements of the vertices of X. They are first rotated and scaled in the same way
       as the neighbourhoods of the vertices (`RegisteredMesh.similarities`), and then interpolated.
     - Normals describe the shape of X, so they are not transferred.
@@ -109,7 +110,7 @@ def transfer_attributes(
         face_data=_without(whole.face_data, taken) | face_data,
         blend_shapes=_without(whole.blend_shapes, blend_shapes) | blend_shapes,
         texture=texture,
-        skin=whole.skin if data.skin is None else _mixed_skin(Skin(*data.skin), matrix),
+        skin=whole.skin if data.skin is None else _mixed_skin(Skin(*data.skin), matrix, registered),
         label_names=_without(whole.label_names, taken) | dict(data.label_names),
     )
 
@@ -119,7 +120,7 @@ def registered_data(data: MeshData, registered: RegisteredMesh) -> MeshData:
 
     All data keep their order and values, but two kinds of vectors follow the neighbourhood of their vertex
     (`RegisteredMesh.similarities`): the displacements of blend shapes are rotated and scaled, and normals are
-    rotated.
+    rotated. The joints of a skeleton move as in `transfer_attributes`.
 
     **Raises:** `InputError` if `data` does not belong to the registered mesh.
     """
@@ -135,6 +136,7 @@ def registered_data(data: MeshData, registered: RegisteredMesh) -> MeshData:
         mesh=replace(registered.mesh, notes=data.mesh.notes, dropped_faces=data.mesh.dropped_faces),
         vertex_data=vertex_data,
         blend_shapes={name: similarities.of_vectors(moves) for name, moves in data.blend_shapes.items()},
+        skin=None if data.skin is None else with_moved_skeleton(Skin(*data.skin), registered),
     )
 
 
@@ -208,7 +210,7 @@ def _interpolated(values: Shaped[np.ndarray, "n ..."], corners: _Corners) -> Flo
     return np.where(np.isfinite(heaviest), means, heaviest)
 
 
-def _mixed_skin(skin: Skin, matrix: csr_array) -> Skin:
+def _mixed_skin(skin: Skin, matrix: csr_array, registered: RegisteredMesh) -> Skin:
     """Return interpolated weights, with at most as many joints per vertex as the source has."""
     own = np.maximum(skin.weights, 0)
     most = int((own > 0).sum(axis=1).max(initial=0))
@@ -218,7 +220,7 @@ def _mixed_skin(skin: Skin, matrix: csr_array) -> Skin:
         omitted = np.argsort(-weights, axis=1, kind="stable")[:, most:]
         np.put_along_axis(weights, omitted, 0, axis=1)
     totals = weights.sum(axis=1, keepdims=True)
-    return Skin(skin.joints, ratio(weights, totals))
+    return with_moved_skeleton(skin, registered)._replace(weights=ratio(weights, totals))
 
 
 def _without(values: Mapping[str, _Value], names: Collection[str]) -> dict[str, _Value]:

@@ -12,6 +12,7 @@ from jaxsmw.errors import InputError
 from jaxsmw.geometry.mesh import Mesh
 from jaxsmw.geometry.sampling import farthest_point_samples
 from jaxsmw.geometry.surface_distance import bounding_box_diagonal, nearest_surface_points
+from jaxsmw.geometry.surface_points import SurfacePoints
 from jaxsmw.io.landmarks import Landmarks, check_frame
 from jaxsmw.transfer.registered_mesh import RegisteredMesh
 
@@ -75,10 +76,11 @@ def transfer_landmarks(
         )
     notes = () if off_surface else check_frame(landmarks, mesh_x)
     points, distances = nearest_surface_points(landmarks.positions, mesh_x)
-    images = registered.project(points).positions(mesh_y)
-    if off_surface:
+    if not off_surface:
+        images = registered.project(points).positions(mesh_y)
+    else:
         _check_near(landmarks, distances, mesh_x)
-        images = _deformed(landmarks.positions, points.positions(mesh_x), images, registered)
+        images = carried_by_space(landmarks.positions, points, registered)
     errors = None
     if expected_error is not None:
         at_corners = expected_error[mesh_x.faces[points.faces]]
@@ -98,18 +100,23 @@ def _check_near(landmarks: Landmarks, distances: Float64[np.ndarray, " l"], mesh
         )
 
 
-def _deformed(
-    positions: Float64[np.ndarray, "l 3"],
-    feet: Float64[np.ndarray, "l 3"],
-    images: Float64[np.ndarray, "l 3"],
-    registered: RegisteredMesh,
+def carried_by_space(
+    positions: Float64[np.ndarray, "l 3"], feet: SurfacePoints, registered: RegisteredMesh
 ) -> Float64[np.ndarray, "l 3"]:
-    """Move points by the thin-plate spline that takes X and the feet of the points to their images."""
-    from scipy.interpolate import RBFInterpolator  # 0.1 s, which only landmarks off the surface need
+    """Move points by the thin-plate spline that takes X, and the projections of the points, to Y.
+
+    **Arguments:**
+
+    - `positions`: points near X (l, 3).
+    - `feet`: the projections of the points onto X.
+    - `registered`: the `RegisteredMesh` of X on Y.
+    """
+    from scipy.interpolate import RBFInterpolator  # 0.1 s, which only points off the surface need
 
     mesh_x = registered.mesh_x
     chosen = farthest_point_samples(mesh_x, min(_CENTERS, len(mesh_x.referenced_indices)))
-    centers = np.concatenate([feet, mesh_x.vertices[chosen]])
+    centers = np.concatenate([feet.positions(mesh_x), mesh_x.vertices[chosen]])
+    images = registered.project(feet).positions(registered.mesh_y)
     values = np.concatenate([images, registered.vertices[chosen]])
     # Centres that nearly coincide would make the system singular.
     size = _APART * bounding_box_diagonal(mesh_x)

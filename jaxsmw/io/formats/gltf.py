@@ -25,12 +25,12 @@ from jaxsmw.io.formats.polygons import (
     unique_names,
 )
 from jaxsmw.io.formats.text import damaged, excerpt, export_again
-from jaxsmw.io.mesh_data import COLORS, Skin
+from jaxsmw.io.mesh_data import COLORS, Skeleton, Skin
 from jaxsmw.runtime.files import read_bytes
 from jaxsmw.wording import count_of
 
 TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
-COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 RECORD = "jaxsmw"
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -42,6 +42,7 @@ _NOT_DATA = re.compile(r"POSITION|NORMAL|TANGENT|TEXCOORD_0|(JOINTS|WEIGHTS)_\d+
 # The largest accepted numbers of triangle corners, displacements and weights. There is one displacement per
 # vertex and blend shape, and one weight per vertex and joint.
 _MOST_CORNERS, _MOST_DISPLACEMENTS, _MOST_WEIGHTS = 6 * 10**7, 2**24, 2**25
+_SINGULAR = 1e8  # bind matrices with a larger condition number have no inverse in float32
 
 
 def parse_gltf(data: bytes, folder: Path) -> Polygons:
@@ -80,6 +81,8 @@ class _Scene:
         self.vertices = self.corners = self.ignored = 0
         self.notes: list[str] = []
         self.record: dict[str, Any] = {}
+        self.parents: dict[int, int] = {}  # of the nodes in the scene; -1 for none
+        self.bind_matrices: dict[int, np.ndarray | None] = {}  # of nodes that are joints
         for node, matrix in self._nodes():
             if "mesh" in node:
                 self._add_mesh(node, matrix)
@@ -95,15 +98,16 @@ class _Scene:
             below = {str(child) for of_node in children for child in of_node}
             roots = [i for i in range(len(nodes)) if str(i) not in below]
         in_scene: dict[int, tuple[dict[str, Any], np.ndarray]] = {}
-        pending = [(root, np.eye(4)) for root in reversed(roots)]
+        pending = [(root, np.eye(4), -1) for root in reversed(roots)]
         while pending:
-            number, above = pending.pop()
+            number, above, parent = pending.pop()
             node = document.item("nodes", number)
             if number in in_scene:
                 raise damaged(f"node {number} has several parents")
             matrix = above @ self._matrix(node)
             in_scene[number] = node, matrix
-            pending += [(child, matrix) for child in reversed(document.list_of(node, "children"))]
+            self.parents[number] = parent
+            pending += [(child, matrix, number) for child in reversed(document.list_of(node, "children"))]
         if "nodes" not in document.json:
             return [({"mesh": i}, np.eye(4)) for i in range(len(document.list_of(document.json, "meshes")))]
         return list(in_scene.values())
@@ -139,7 +143,7 @@ class _Scene:
             self.record = record if isinstance(record, dict) else {}
         nodes_of_joints = None
         if "skin" in node:
-            nodes_of_joints = document.list_of(document.item("skins", node["skin"]), "joints")
+            nodes_of_joints = self._joints(document.item("skins", node["skin"]))
             matrix = np.eye(4)  # the node's transform does not move a skinned mesh
         parts: dict[str, _Part] = {}
         for primitive in document.list_of(mesh, "primitives"):
@@ -193,7 +197,7 @@ class _Scene:
         for name, index in attributes.items():
             if _NOT_DATA.fullmatch(name):
                 continue
-            if str(document.item("accessors", index).get("type")) not in COLUMNS:
+            if COLUMNS.get(str(document.item("accessors", index).get("type")), 16) > 4:
                 self.notes.append(f"The vertex data {name[:40]!a} were ignored, because they are matrices.")
                 continue
             columns = (3, 4) if name.startswith("COLOR_") else (1, 2, 3, 4)
@@ -203,6 +207,23 @@ class _Scene:
             own_name = COLORS if name == "COLOR_0" else name.removeprefix("_") or name
             data[unique_name(own_name, data)] = values
         return data
+
+    def _joints(self, skin: dict[str, Any]) -> list[Any]:
+        """Return the nodes that are the joints of a skin, and keep their bind matrices."""
+        document = self.document
+        nodes = document.list_of(skin, "joints")
+        inverses = np.zeros((len(nodes), 16))
+        if "inverseBindMatrices" in skin:
+            given = document.floats(skin["inverseBindMatrices"], 16)
+            if len(given) < len(nodes):
+                raise damaged(f"a skin has {len(given)} bind matrices for {len(nodes)} joints")
+            inverses = given[: len(nodes)]
+        for node, inverse in zip(nodes, inverses.reshape(-1, 4, 4).swapaxes(1, 2), strict=True):
+            document.item("nodes", node)
+            is_affine = np.isfinite(inverse).all() and np.array_equal(inverse[3], [0, 0, 0, 1])
+            is_regular = is_affine and np.linalg.cond(inverse[:3, :3]) < _SINGULAR
+            self.bind_matrices.setdefault(node, np.linalg.inv(inverse) if is_regular else None)
+        return nodes
 
     def _skin(
         self, attributes: dict[str, Any], nodes: list[Any] | None, n: int
@@ -216,8 +237,6 @@ class _Scene:
             weights = document.floats(attributes.get(f"WEIGHTS_{number}"), 4, n)
             if joints.dtype.kind != "u" or (joints[weights != 0] >= len(nodes)).any():
                 raise damaged("a vertex uses a joint that the skin does not have")
-            for node in nodes:
-                document.item("nodes", node)
             sets.append((np.array([*nodes, 0])[np.minimum(joints, len(nodes))], weights))
         joints, weights = (np.hstack(parts) for parts in zip(*sets, strict=True))
         return joints, weights
@@ -303,10 +322,9 @@ class _Scene:
         }
 
     def _joined_skin(self, n: int) -> Skin | None:
-        used = [part.joints[part.weights != 0] for part in self.parts]
-        nodes = sorted(set(np.concatenate(used).tolist()))
-        if not nodes:
+        if not any((part.weights != 0).any() for part in self.parts):
             return None
+        nodes = sorted(self.bind_matrices)  # with joints that move no vertex, but other joints
         if len(nodes) * n > _MOST_WEIGHTS:
             raise InputError("has too many joints for its vertices: export a skin with fewer joints.")
         names = [self.document.item("nodes", node).get("name") for node in nodes]
@@ -319,7 +337,21 @@ class _Scene:
             column = np.minimum(np.searchsorted(nodes, part.joints), len(nodes) - 1)
             row = np.broadcast_to(part.first + np.arange(len(part.joints))[:, None], column.shape)
             np.add.at(weights, (row, column), part.weights)  # the weights at unused joints are 0
-        return Skin(tuple(joints), weights)
+        return Skin(tuple(joints), weights, self._skeleton(nodes))
+
+    def _skeleton(self, nodes: list[int]) -> Skeleton | None:
+        """Return the skeleton of joints, or None if the file does not say where they are."""
+        matrices = [matrix for node in nodes if (matrix := self.bind_matrices[node]) is not None]
+        if len(matrices) < len(nodes) or np.array_equal(matrices, np.tile(np.eye(4), (len(nodes), 1, 1))):
+            return None
+        number_of = {node: number for number, node in enumerate(nodes)}
+        parents = []
+        for node in nodes:
+            above = self.parents.get(node, -1)
+            while above >= 0 and above not in number_of:
+                above = self.parents[above]
+            parents.append(number_of.get(above, -1))
+        return Skeleton(np.array(parents), np.stack(matrices))
 
 
 def _check_shapes(displacements: int) -> None:
@@ -355,7 +387,7 @@ def _without_copies(polygons: Polygons, record: dict[str, Any], document: _Docum
         if polygons.texture is None
         else (polygons.texture[0][first_texture], texture[polygons.corners]),
         blend_shapes={name: moves[first] for name, moves in polygons.blend_shapes.items()},
-        skin=None if skin is None else Skin(skin.joints, skin.weights[first]),
+        skin=None if skin is None else skin._replace(weights=skin.weights[first]),
     )
 
 

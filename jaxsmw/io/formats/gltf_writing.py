@@ -13,11 +13,12 @@ from jaxtyping import Int64
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.gltf import COLUMNS, RECORD, TYPES
 from jaxsmw.io.formats.polygons import Formatted, is_color, omissions, width_of
-from jaxsmw.io.mesh_data import MeshData
+from jaxsmw.io.mesh_data import MeshData, Skeleton, Skin
 
 _VERTICES, _INDICES = 34962, 34963
 _COMPONENTS = {kind: number for number, kind in TYPES.items()}
 _SHAPES = {columns: name for name, columns in COLUMNS.items()}
+_SHEAR = 1e-5  # the axes of a joint count as orthogonal if all cosines are below this number
 _LARGEST_EXACT = 2**24  # float32 represents all integers up to this number
 
 
@@ -99,7 +100,7 @@ class _Writer:
     def add_skin(self, attributes: dict[str, int]) -> None:
         """Add a skin whose joints are nodes below one root, with four joints in each pair of attributes."""
         assert self.data.skin is not None
-        names, weights = self.data.skin
+        names, weights, skeleton = Skin(*self.data.skin)
         if len(names) > 65535:
             raise InputError("has more than 65535 joints, the limit of glTF files: write a .npz file.")
         order = np.argsort(-np.abs(weights), axis=1, kind="stable")
@@ -116,15 +117,27 @@ class _Writer:
             part = slice(4 * number, 4 * number + 4)
             attributes[f"JOINTS_{number}"] = self.accessor(joints[:, part], _VERTICES)
             attributes[f"WEIGHTS_{number}"] = self.accessor(largest[:, part], _VERTICES)
-        nodes = list(range(2, 2 + len(names)))
+        if skeleton is None:
+            # Inverse bind matrices are optional in glTF, but VTK 9.7 ends the process if a file has none.
+            skeleton = Skeleton(np.full(len(names), -1), np.tile(np.eye(4), (len(names), 1, 1)))
+        parents, matrices = skeleton
+        nodes: list[dict[str, Any]] = [{"name": "joints"}, *({"name": name} for name in names)]
+        for number, (parent, matrix) in enumerate(zip(parents, matrices, strict=True)):
+            nodes[1 + number] |= _transform(
+                matrix if parent < 0 else np.linalg.inv(matrices[parent]) @ matrix
+            )
+            # The nodes of the file are the mesh and these nodes.
+            nodes[1 + parent].setdefault("children", []).append(2 + number)
+        self.json["nodes"] += nodes
         self.json["nodes"][0]["skin"] = 0
-        self.json["nodes"] += [{"name": "joints", "children": nodes}, *({"name": name} for name in names)]
         self.json["scenes"][0]["nodes"].append(1)
-        identity = np.tile(np.eye(4, dtype=np.float32).ravel(), (len(names), 1))
-        matrices = {"bufferView": self.view(identity), "componentType": _COMPONENTS["f4"]}
-        self.json["accessors"].append(matrices | {"count": len(names), "type": "MAT4"})
-        # Inverse bind matrices are optional in glTF, but VTK 9.7 ends the process if a file has none.
-        self.json["skins"] = [{"joints": nodes, "inverseBindMatrices": len(self.json["accessors"]) - 1}]
+        inverses = np.linalg.inv(matrices).swapaxes(1, 2).reshape(-1, 16)
+        self.json["skins"] = [
+            {
+                "joints": list(range(2, 2 + len(names))),
+                "inverseBindMatrices": self.accessor(_single(inverses)),
+            }
+        ]
 
     def view(self, values: np.ndarray, target: int | None = None) -> int:
         """Add a buffer view. In views of vertex data, each row begins at a multiple of four bytes."""
@@ -143,7 +156,12 @@ class _Writer:
         return len(self.json["bufferViews"]) - 1
 
     def accessor(
-        self, values: np.ndarray, target: int, *, limits: bool = False, is_fraction: bool = False
+        self,
+        values: np.ndarray,
+        target: int | None = None,
+        *,
+        limits: bool = False,
+        is_fraction: bool = False,
     ) -> int:
         """Add an accessor and its buffer view."""
         accessor: dict[str, Any] = {
@@ -168,6 +186,21 @@ class _Writer:
             skin=True,
             texture=True,
         )
+
+
+def _transform(matrix: np.ndarray) -> dict[str, list[float]]:
+    """Return the transform of a node, if possible by parts, because animations do not change matrices."""
+    from scipy.spatial.transform import Rotation  # 0.1 s, which only skins need
+
+    if np.array_equal(matrix, np.eye(4)):
+        return {}
+    scale = np.linalg.norm(matrix[:3, :3], axis=0)
+    scale[0] *= np.sign(np.linalg.det(matrix[:3, :3]))
+    axes = matrix[:3, :3] / scale
+    if np.abs(axes.T @ axes - np.eye(3)).max() > _SHEAR:
+        return {"matrix": matrix.T.ravel().tolist()}
+    parts = {"translation": matrix[:3, 3], "rotation": Rotation.from_matrix(axes).as_quat(), "scale": scale}
+    return {name: values.tolist() for name, values in parts.items()}
 
 
 def _single(values: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ from scipy.io.matlab import MatWriteError, matfile_version
 
 from jaxsmw.errors import InputError, naming
 from jaxsmw.io.formats.polygons import Formatted, Polygons, omissions, texture_or_note
-from jaxsmw.io.mesh_data import MeshData, Skin
+from jaxsmw.io.mesh_data import MeshData, Skeleton, Skin
 from jaxsmw.runtime.files import atomic_write, largest_contents, read_bytes
 
 POINTWISE_MAP, FUNCTIONAL_MAP = "T12", "C21"
@@ -310,7 +310,7 @@ def parse_mat(data: bytes) -> Polygons:
     def arrays(field: str, rows: int) -> dict[str, np.ndarray]:
         return {key: _rows(values, rows) for key, values in _struct(surface, field).items()}
 
-    texture, skin = _struct(surface, "texture"), _struct(surface, "skin")
+    texture, skin, skeleton = (_struct(surface, name) for name in ("texture", "skin", "skeleton"))
     corners, notes = texture_or_note(lambda: _texture(texture, f) if texture else None)
     return Polygons(
         vertices,
@@ -321,9 +321,28 @@ def parse_mat(data: bytes) -> Polygons:
         blend_shapes=arrays("blend_shapes", n),
         notes=notes,
         texture=corners,
-        skin=Skin(tuple(_words(skin.get("joints", []))), _rows(skin.get("weights", []), n)) if skin else None,
+        skin=Skin(
+            tuple(_words(skin.get("joints", []))), _rows(skin.get("weights", []), n), _skeleton(skeleton)
+        )
+        if skin
+        else None,
         label_names={key: tuple(_words(names)) for key, names in _struct(surface, "label_names").items()},
     )
+
+
+def _skeleton(skeleton: Mapping[str, Any]) -> Skeleton | None:
+    """Return the skeleton of a struct: parents (0 for none), and bind matrices below each other."""
+    if not skeleton:
+        return None
+    parents, matrices = (np.atleast_1d(skeleton.get(name, [])) for name in ("parents", "bind_matrices"))
+    if not _is_real(parents) or not _is_real(matrices) or matrices.shape != (4 * parents.size, 4):
+        raise InputError(
+            "the skeleton has no arrays of real numbers called parents (joints, 1) and bind_matrices (4 "
+            "joints, 4): save both arrays."
+        )
+    parents = parents.ravel()
+    is_whole = np.array_equal(parents, np.floor(parents)) and (np.abs(parents) < 2**31).all()
+    return Skeleton(parents.astype(np.int64) - 1 if is_whole else parents, matrices.reshape(-1, 4, 4))
 
 
 def _struct(struct: Mapping[str, Any], field: str) -> Mapping[str, Any]:
@@ -373,7 +392,11 @@ def format_mat(data: MeshData) -> Formatted:
     if data.texture is not None:
         surface["texture"] = {"coordinates": data.texture[0], "corners": data.texture[1] + 1.0}
     if data.skin is not None:
-        surface["skin"] = {"joints": _cells(data.skin[0]), "weights": data.skin[1]}
+        joints, weights, skeleton = Skin(*data.skin)
+        surface["skin"] = {"joints": _cells(joints), "weights": weights}
+        if skeleton is not None:
+            matrices = skeleton.bind_matrices.reshape(-1, 4)
+            surface["skeleton"] = {"parents": skeleton.parents + 1.0, "bind_matrices": matrices}
     notes = omissions(
         data,
         "MATLAB",

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.polygons import Formatted, Polygons, texture_or_note
-from jaxsmw.io.mesh_data import MeshData, Skin
+from jaxsmw.io.mesh_data import MeshData, Skeleton, Skin
 from jaxsmw.runtime.files import largest_contents
 
 _FOLDERS = "vertex_data", "face_data", "blend_shapes", "label_names"
@@ -37,9 +37,12 @@ def parse_npz(data: bytes) -> Polygons:
         if folder in folders and rest:
             folders[folder][rest] = array
     texture = [arrays[name] for name in ("texture_coordinates", "texture_corners") if name in arrays]
-    skin = [arrays[name] for name in ("skin_joints", "skin_weights") if name in arrays]
-    if len(skin) == 1:
-        raise InputError("contains only half of a texture or of a skin: save both arrays.")
+    skin, skeleton = (
+        [arrays[name] for name in names if name in arrays]
+        for names in (("skin_joints", "skin_weights"), ("skin_parents", "skin_bind_matrices"))
+    )
+    if len(skin) == 1 or len(skeleton) == 1:
+        raise InputError("contains only half of a texture, of a skin or of a skeleton: save both arrays.")
     corners, notes = texture_or_note(lambda: _texture(texture, faces.shape))
     return Polygons(
         vertices.astype(np.float64),
@@ -50,7 +53,9 @@ def parse_npz(data: bytes) -> Polygons:
         notes=notes,
         texture=corners,
         blend_shapes=folders["blend_shapes"],
-        skin=Skin(tuple(map(str, skin[0].ravel())), skin[1]) if skin else None,
+        skin=Skin(tuple(map(str, skin[0].ravel())), skin[1], Skeleton(*skeleton) if skeleton else None)
+        if skin
+        else None,
         label_names={name: tuple(map(str, names.ravel())) for name, names in folders["label_names"].items()},
     )
 
@@ -123,7 +128,10 @@ def format_npz(data: MeshData) -> Formatted:
     if data.texture is not None:
         arrays |= {"texture_coordinates": data.texture[0], "texture_corners": data.texture[1]}
     if data.skin is not None:
-        arrays |= {"skin_joints": np.array(data.skin[0]), "skin_weights": data.skin[1]}
+        joints, weights, skeleton = Skin(*data.skin)
+        arrays |= {"skin_joints": np.array(joints), "skin_weights": weights}
+        if skeleton is not None:
+            arrays |= {"skin_parents": skeleton.parents, "skin_bind_matrices": skeleton.bind_matrices}
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
