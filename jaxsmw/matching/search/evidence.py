@@ -85,7 +85,7 @@ class Evidence(NamedTuple):
             uncovered=max(0.0, uncovered - lacking),
             orientation_change=float(np.mean([orientation_change(*way) for way in ways])),
             agreement=reading.agreement(matches),
-            in_place=not reading.prepared.mirrored and bool(areas_x @ reading.excess(matches) < _NEAR),
+            in_place=is_in_place(reading, matches),
             two_parts=reading.two_parts,
         )
 
@@ -129,6 +129,12 @@ def probability(log_odds: float) -> float:
     The log-odds of the best map of a pair say how probable it is that one of its maps is right.
     """
     return float(1 / (1 + np.exp(-log_odds)))
+
+
+def is_in_place(reading: Reading, matches: SampleMap) -> bool:
+    """Return whether matches are hardly farther away than the nearest samples, in the given positions."""
+    excess = reading.shared_areas(matches) @ reading.excess(matches)
+    return not reading.prepared.mirrored and bool(excess < _NEAR)
 
 
 def _mean(values: Float[np.ndarray, " s"], areas: Float[np.ndarray, " s"], share: float) -> float:

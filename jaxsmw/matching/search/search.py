@@ -21,7 +21,7 @@ from jaxsmw.matching.judge import area_shape_difference, discontinuous_parts, di
 from jaxsmw.matching.outcome import Outcome, Start
 from jaxsmw.matching.pair import Pair
 from jaxsmw.matching.preparation import PreparedPair
-from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, probability, shares
+from jaxsmw.matching.search.evidence import NO_EVIDENCE, Evidence, is_in_place, probability, shares
 from jaxsmw.matching.search.hypotheses import HYPOTHESES
 from jaxsmw.matching.search.race import SMALL_FAULT, Candidate, Kind, different, race
 from jaxsmw.matching.search.reading import Reading
@@ -78,10 +78,12 @@ class Judged(Candidate):
             maps = [matches[turn] for turn in reading.x.turns]
         else:
             maps = [turn[matches] for turn in reading.y.turns]
-        turned = [Judged.of(reading, Outcome(one)) for one in maps]
-        evidence = [self.evidence._replace(in_place=one.evidence.in_place) for one in turned]
-        parts = self.share * shares([one.log_odds for one in (self.evidence, *evidence)])
-        judged = [self, *(replace(one, evidence=known) for one, known in zip(turned, evidence, strict=True))]
+        judged = [self]
+        for one in maps:
+            turned = reading.reduced(one)
+            evidence = self.evidence._replace(in_place=is_in_place(reading, turned))
+            judged.append(Judged(reading, turned, evidence, Outcome(one)))
+        parts = self.share * _shares_of(judged)
         return [replace(one, share=float(part)) for one, part in zip(judged, parts, strict=True)]
 
 
