@@ -586,12 +586,17 @@ class TestAttributes:
         mesh = make_mesh(sphere_mesh(4)[0] * [0.5, 0.5, 3], sphere_mesh(4)[1])
         height = mesh.vertices[:, 2]
         bent = 1 / (1 + np.exp(-8 * height))
-        weights = np.stack([1 - bent, bent, np.zeros_like(bent)], axis=1)
-        matrices = np.tile(np.eye(4), (3, 1, 1))
-        matrices[:, :3, :3] = Rotation.random(3, rng=1).as_matrix()
-        matrices[:, 2, 3] = [-2.5, 0, 2.8]  # shoulder, elbow, and a tip that moves no vertex
-        skeleton = Skeleton(np.array([-1, 0, 1]), matrices)
-        data = MeshData(mesh, mesh.faces, skin=Skin(("upper arm", "forearm", "tip"), weights, skeleton))
+        weights = np.stack(
+            [1 - bent, bent, np.zeros_like(bent), np.arange(len(bent)) == height.argmax()], axis=1
+        )
+        matrices = np.tile(np.eye(4), (4, 1, 1))
+        matrices[:, :3, :3] = Rotation.random(4, rng=1).as_matrix()
+        # Shoulder, elbow, a joint that moves no vertex, and one that moves a single vertex.
+        matrices[:, 2, 3] = [-2.5, 0, 2.5, 2.8]
+        skeleton = Skeleton(np.array([-1, 0, 1, 2]), matrices)
+        data = MeshData(
+            mesh, mesh.faces, skin=Skin(("upper arm", "forearm", "hand", "tip"), weights, skeleton)
+        )
         bend = Rotation.from_euler("x", angle, degrees=True)
         posed = Rotation.from_rotvec(bent[:, None] * bend.as_rotvec()).apply(mesh.vertices)
         target = make_mesh(3 * posed @ TURN.T + SHIFT, mesh.faces)
@@ -606,7 +611,7 @@ class TestAttributes:
             assert np.abs(found.bind_matrices[:, :3, 3] - expected[:, :3, 3]).max() < 0.25  # of 18
             rotations = found.bind_matrices[:, :3, :3] @ expected[:, :3, :3].swapaxes(1, 2)
             assert np.degrees(Rotation.from_matrix(rotations).magnitude()).max() < 1 + 0.1 * angle
-        assert np.array_equal(found.bind_matrices[:, 3], [[0, 0, 0, 1]] * 3)
+        assert np.array_equal(found.bind_matrices[:, 3], [[0, 0, 0, 1]] * 4)
 
     def test_values_that_are_not_finite_do_not_spread(self):
         data, mesh_y = decorated(bumpy_mesh(4)), bumpy_mesh(5)
