@@ -42,7 +42,9 @@ _NOT_DATA = re.compile(r"POSITION|NORMAL|TANGENT|TEXCOORD_0|(JOINTS|WEIGHTS)_\d+
 # The largest accepted numbers of triangle corners, displacements and weights. There is one displacement per
 # vertex and blend shape, and one weight per vertex and joint.
 _MOST_CORNERS, _MOST_DISPLACEMENTS, _MOST_WEIGHTS = 6 * 10**7, 2**24, 2**25
-_SINGULAR = 1e8  # bind matrices with a larger condition number have no inverse in float32
+# Bind matrices with a larger condition number have no inverse in float32. Exporters round their last rows.
+_SINGULAR, _ROUNDING = 1e8, 1e-4
+_NO_SKELETON = "The places of the joints were ignored, because a bind matrix has no inverse."
 
 
 def parse_gltf(data: bytes, folder: Path) -> Polygons:
@@ -212,7 +214,7 @@ class _Scene:
         """Return the nodes that are the joints of a skin, and keep their bind matrices."""
         document = self.document
         nodes = document.list_of(skin, "joints")
-        inverses = np.zeros((len(nodes), 16))
+        inverses = np.tile(np.eye(4).ravel(), (len(nodes), 1))
         if "inverseBindMatrices" in skin:
             given = document.floats(skin["inverseBindMatrices"], 16)
             if len(given) < len(nodes):
@@ -220,9 +222,14 @@ class _Scene:
             inverses = given[: len(nodes)]
         for node, inverse in zip(nodes, inverses.reshape(-1, 4, 4).swapaxes(1, 2), strict=True):
             document.item("nodes", node)
-            is_affine = np.isfinite(inverse).all() and np.array_equal(inverse[3], [0, 0, 0, 1])
-            is_regular = is_affine and np.linalg.cond(inverse[:3, :3]) < _SINGULAR
-            self.bind_matrices.setdefault(node, np.linalg.inv(inverse) if is_regular else None)
+            is_affine = np.isfinite(inverse).all() and np.abs(inverse[3] - [0, 0, 0, 1]).max() < _ROUNDING
+            matrix = None
+            if is_affine and np.linalg.cond(inverse[:3, :3]) < _SINGULAR:
+                matrix = np.eye(4)
+                matrix[:3] = np.linalg.inv(inverse)[:3]
+            else:
+                self.notes.append(_NO_SKELETON)
+            self.bind_matrices.setdefault(node, matrix)
         return nodes
 
     def _skin(
