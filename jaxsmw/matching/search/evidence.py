@@ -18,8 +18,8 @@ _WEIGHTS = (-7.6, -2.5, -3.5, -1.7, 2.0, 2.0)
 _WEIGHTS_OF_TWO_PARTS = (-10.3, -2.1, 0.0, 0.0, 4.8, 2.0)
 # How much differences of log-odds count between maps of the same pair.
 _CONTRAST = 5.0
-# A larger agreement counts no more. Right maps of different animals agree with the first map on half of the
-# area, and maps that take a head to a tail on a quarter. (Entry R49)
+# Between full shapes, a larger agreement counts no more. Right maps of different animals agree with the first
+# map on half of the area, and maps that take a head to a tail on a quarter. (Entry R49)
 _AGREEING = 0.4
 # These numbers are added to the deformation and to the change of orientations, because even right maps of
 # samples have as much.
@@ -56,7 +56,7 @@ class Evidence(NamedTuple):
       reading. It is 0.2 for all maps if both hands are compared.
     - `in_place`: whether matches are hardly farther away than the nearest samples, in the given positions,
       because the meshes were aligned.
-    - `two_parts`: whether both shapes are read as parts of a body.
+    - `partial`, `two_parts`: whether one shape is read as a part, and whether both are parts of a body.
     """
 
     deformation: float
@@ -64,6 +64,7 @@ class Evidence(NamedTuple):
     orientation_change: float
     agreement: float
     in_place: bool
+    partial: bool = False
     two_parts: bool = False
 
     @classmethod
@@ -86,6 +87,7 @@ class Evidence(NamedTuple):
             orientation_change=float(np.mean([orientation_change(*way) for way in ways])),
             agreement=reading.agreement(matches),
             in_place=is_in_place(reading, matches),
+            partial=pair.partial,
             two_parts=reading.two_parts,
         )
 
@@ -95,6 +97,8 @@ class Evidence(NamedTuple):
         deformation = np.log(self.deformation + _LEAST_DEFORMATION)
         orientation_change = np.log(self.orientation_change + _LEAST_CHANGE)
         uncovered, agreement = np.sqrt(self.uncovered), min(self.agreement / _AGREEING, 1.0)
+        if self.partial:
+            agreement = (1 + self.agreement) / 2  # the first maps of parts are wrong more often (entry R49)
         if self.two_parts:
             # Any region can lack a counterpart, and extremities can lie on cuts. Right maps agree widely.
             orientation_change, uncovered, agreement = 0.0, 0.0, self.agreement

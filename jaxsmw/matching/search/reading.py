@@ -26,8 +26,7 @@ from jaxsmw.runtime.threads import side_by_side
 _RADII, NUMBER_OF_DESCRIPTORS = (1, 2, 4), 30
 
 DIFFERENT = 0.2
-"""Two maps differ at a point if its two matches are so far apart, in units of the square root of the area.
-If one shape is a part of the other, this is the area of the part."""
+"""Two maps differ at a point if its two matches are so far apart, in units of the square root of the area."""
 COMMON = 0.25
 """The share of the area that two parts of a body have in common at least, if they can be matched."""
 
@@ -157,8 +156,7 @@ class Reading:
         If Y is a part of X, the share is that of the area that either map takes to Y, see `shared_areas`.
         """
         areas = (self.shared_areas(first) + self.shared_areas(second)) / 2
-        limit = DIFFERENT * min(self.prepared.pair.areas) ** 0.5
-        return float(areas @ (self.y.distances[first, second] > limit))
+        return float(areas @ (self.y.distances[first, second] > DIFFERENT))
 
     def agreement(self, matches: SampleMap) -> float:
         """Return the share of X's area, from 0 to 1, on which a map of samples agrees with the first map.
