@@ -349,6 +349,12 @@ def test_joints_of_other_programs_have_parents_and_places(tmp_path):
     file.json["skins"] = [{"joints": [3, 1], "inverseBindMatrices": broken}]
     data = read_mesh_data(file.save(tmp_path))
     assert data.skin.skeleton is None and "places of the joints were ignored" in " ".join(data.mesh.notes)
+    # Another skin of the same joints has the right matrices.
+    file.json["nodes"].append({"mesh": 0, "skin": 1})
+    file.json["scenes"][0]["nodes"].append(4)
+    file.json["skins"].append({"joints": [3, 1], "inverseBindMatrices": inverses})
+    skin = read_mesh_data(file.save(tmp_path)).skin
+    assert np.allclose(skin.skeleton.bind_matrices, places[::-1], atol=1e-5)
     file.json["accessors"][broken]["count"] = 1
     assert "a skin has 1 bind matrices for 2 joints" in refused_file(file.save(tmp_path))
 
@@ -678,3 +684,27 @@ def test_damaged_files_are_read_or_refused(tmp_path_factory, sound, data):
         assert np.isfinite(mesh.vertices).all() and mesh.faces.max() < len(mesh.vertices)
     else:
         assert message.startswith(f"{path}: ") and "\n" not in message
+
+
+def test_long_chains_and_many_uses_of_a_skin_are_read_quickly(tmp_path):
+    """In an earlier version, 30 000 joints below 30 000 other nodes took longer than this test may."""
+    file = square()
+    attributes = file.json["meshes"][0]["primitives"][0]["attributes"]
+    attributes["JOINTS_0"] = file.add(np.zeros((4, 4), "u1"))
+    attributes["WEIGHTS_0"] = file.add(np.array([[1, 0, 0, 0]] * 4, "f4"))
+    chain = [{"children": [number + 2]} for number in range(9999)]
+    chain.append({"children": list(range(10001, 20001))})
+    file.nodes(
+        {"mesh": 0, "skin": 0},
+        *chain,
+        *[{}] * 10000,
+        *[{"mesh": 0, "skin": 0}] * 50,
+        roots=[0, 1, *range(20001, 20051)],
+    )
+    inverses = np.tile(np.eye(4, dtype="f4"), (10000, 1, 1))
+    inverses[:, 3, 0] = 1e-9
+    inverses[:, 0, 3] = 1
+    matrices = file.add(inverses.swapaxes(1, 2).reshape(-1, 16))
+    file.json["skins"] = [{"joints": list(range(10001, 20001)), "inverseBindMatrices": matrices}]
+    skeleton = read_mesh_data(file.save(tmp_path)).skin.skeleton
+    assert (skeleton.parents == -1).all() and np.allclose(skeleton.bind_matrices[:, 0, 3], -1)

@@ -613,6 +613,18 @@ class TestAttributes:
             assert np.degrees(Rotation.from_matrix(rotations).magnitude()).max() < 1 + 0.1 * angle
         assert np.array_equal(found.bind_matrices[:, 3], [[0, 0, 0, 1]] * 4)
 
+    def test_a_skeleton_of_a_flat_mesh_is_moved(self):
+        flat, faces = grid_mesh(8, 8)
+        mesh = make_mesh(np.c_[flat[:, :2], np.zeros(len(flat))], faces)
+        target = moved(mesh, 2 * TURN)
+        matrices = np.tile(np.eye(4), (2, 1, 1))
+        matrices[1, :2, 3] = [0.5, 0.6]
+        weights = np.stack([1 - flat[:, 0], flat[:, 0]], axis=1)
+        skin = Skin(("a", "b"), weights, Skeleton(np.array([-1, 0]), matrices))
+        data = MeshData(mesh, mesh.faces, skin=skin)
+        found = registered_data(data, on_same_numbering(mesh, target)).skin.skeleton.bind_matrices
+        assert np.abs(found[:, :3, 3] - (2 * matrices[:, :3, 3] @ TURN.T + SHIFT)).max() < 0.05
+
     def test_values_that_are_not_finite_do_not_spread(self):
         data, mesh_y = decorated(bumpy_mesh(4)), bumpy_mesh(5)
         height = np.where(data.mesh.vertices[:, 2] > 0.5, np.nan, 1.0)

@@ -243,8 +243,8 @@ def _checked_skeleton(skeleton: Skeleton, number: int) -> Skeleton:
             "the number of its parent, or -1."
         )
     above = parents.astype(np.int64)
-    for _ in range(number):
-        above = np.where(above < 0, -1, parents[above])
+    for _ in range(number.bit_length()):  # each round doubles the number of generations
+        above = np.where(above < 0, -1, above[above])
     if (above >= 0).any():
         raise InputError("a joint is its own ancestor: give each joint a parent above it, or -1.")
     return Skeleton(parents.astype(np.int64), matrices)

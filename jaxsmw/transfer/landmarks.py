@@ -121,8 +121,11 @@ def carried_by_space(
     # Centres that nearly coincide would make the system singular.
     size = _APART * bounding_box_diagonal(mesh_x)
     _, kept = np.unique(np.rint(centers / size), axis=0, return_index=True)
-    # In three dimensions, the kernel of the thin-plate spline is the distance.
-    return RBFInterpolator(centers[kept], values[kept], kernel="linear", degree=1)(positions)
+    # In three dimensions, the kernel of the thin-plate spline is the distance. Points of a flat mesh do not
+    # determine an affine map of space.
+    offsets = centers[kept] - centers[kept].mean(axis=0)
+    degree = int(np.linalg.matrix_rank(offsets, tol=size * len(kept) ** 0.5) == 3)
+    return RBFInterpolator(centers[kept], values[kept], kernel="linear", degree=degree)(positions)
 
 
 def landmark_vertices(

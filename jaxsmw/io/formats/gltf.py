@@ -85,6 +85,7 @@ class _Scene:
         self.record: dict[str, Any] = {}
         self.parents: dict[int, int] = {}  # of the nodes in the scene; -1 for none
         self.bind_matrices: dict[int, np.ndarray | None] = {}  # of nodes that are joints
+        self.skins: dict[int, list[Any]] = {}  # the joints of each skin
         for node, matrix in self._nodes():
             if "mesh" in node:
                 self._add_mesh(node, matrix)
@@ -145,7 +146,10 @@ class _Scene:
             self.record = record if isinstance(record, dict) else {}
         nodes_of_joints = None
         if "skin" in node:
-            nodes_of_joints = self._joints(document.item("skins", node["skin"]))
+            skin, number = document.item("skins", node["skin"]), node["skin"]
+            if number not in self.skins:  # many nodes can have the same skin
+                self.skins[number] = self._joints(skin)
+            nodes_of_joints = self.skins[number]
             matrix = np.eye(4)  # the node's transform does not move a skinned mesh
         parts: dict[str, _Part] = {}
         for primitive in document.list_of(mesh, "primitives"):
@@ -229,7 +233,8 @@ class _Scene:
                 matrix[:3] = np.linalg.inv(inverse)[:3]
             else:
                 self.notes.append(_NO_SKELETON)
-            self.bind_matrices.setdefault(node, matrix)
+            if self.bind_matrices.get(node) is None:
+                self.bind_matrices[node] = matrix
         return nodes
 
     def _skin(
@@ -244,7 +249,7 @@ class _Scene:
             weights = document.floats(attributes.get(f"WEIGHTS_{number}"), 4, n)
             if joints.dtype.kind != "u" or (joints[weights != 0] >= len(nodes)).any():
                 raise damaged("a vertex uses a joint that the skin does not have")
-            sets.append((np.array([*nodes, 0])[np.minimum(joints, len(nodes))], weights))
+            sets.append((np.array([*nodes, 0])[np.minimum(joints.astype(np.int64), len(nodes))], weights))
         joints, weights = (np.hstack(parts) for parts in zip(*sets, strict=True))
         return joints, weights
 
@@ -351,13 +356,15 @@ class _Scene:
         matrices = [matrix for node in nodes if (matrix := self.bind_matrices[node]) is not None]
         if len(matrices) < len(nodes) or np.array_equal(matrices, np.tile(np.eye(4), (len(nodes), 1, 1))):
             return None
-        number_of = {node: number for number, node in enumerate(nodes)}
+        nearest = {node: number for number, node in enumerate(nodes)}  # the nearest joint at or above a node
         parents = []
         for node in nodes:
-            above = self.parents.get(node, -1)
-            while above >= 0 and above not in number_of:
-                above = self.parents[above]
-            parents.append(number_of.get(above, -1))
+            passed, above = [], self.parents.get(node, -1)
+            while above >= 0 and above not in nearest:
+                passed.append(above)
+                above = self.parents.get(above, -1)
+            parents.append(nearest.get(above, -1))
+            nearest |= dict.fromkeys(passed, parents[-1])
         return Skeleton(np.array(parents), np.stack(matrices))
 
 
