@@ -94,7 +94,7 @@ class SearchSettings:
     - `pass_tolerance`: a number of at least 0. If all passes together lower the log-odds that the map is
       right by more than this value, the map before the passes is kept.
     - `without_creases_from` (entry R47): a number of at least 0. From this area-based shape difference on,
-      the passes use no crease eigenvectors.
+      maps of the race and further passes are refined without crease eigenvectors.
     - `coarse_from` (Table R32): a number of at least 0. From this area-based shape difference on, coarse
       passes and a single usual pass run instead. A value below `non_isometric` has the same effect as
       `non_isometric`.

@@ -24,14 +24,16 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import COMMON, NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
 
-# The stages by which all maps are refined, and those by which the given number of the best maps is refined
-# once more. Coarse levels of registration move limbs that finer levels leave in place. (Entry R49 of
-# docs/research_log.md)
-_STAGES = (
-    Stage(WaveletPreservation(), number_of_eigenvectors=50),
-    Stage(FeatureRegression((20, 20, 26, 35)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),
+# The routes by which each map is refined, and those by which the given number of the best
+# maps is refined once more. Between animals that differ much in form, functional maps of wavelets move
+# the right map away from its place, and the regression alone does not. Coarse levels of registration move limbs
+# that finer levels leave in place, but they also move the right maps of short limbs. (Entry R49 of docs/research_log.md)
+_REGRESSION = Stage(FeatureRegression((20, 20, 26, 35)), number_of_descriptors=NUMBER_OF_DESCRIPTORS)
+_ROUTES = ((Stage(WaveletPreservation(), number_of_eigenvectors=50), _REGRESSION), (_REGRESSION,))
+_LAST_ROUTES = tuple(
+    (Stage(Registration(levels), number_of_descriptors=NUMBER_OF_DESCRIPTORS),)
+    for levels in ((8, 12, 20, 35, 60), (20, 35, 60))
 )
-_LAST_STAGES = (Stage(Registration((8, 12, 20, 35, 60)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),)
 _REGISTERED = 10
 # The number of the best maps that are mended in each round, and the number of rounds.
 _MENDED, _ROUNDS = 4, 2
@@ -93,7 +95,7 @@ def race(
         return list(different(found))  # registration moves a part away from its place on a different body
     best = list(islice(different(found), _REGISTERED))
     # Registration improves most maps. It makes a limb of others collapse, so they stay as they were as well.
-    return list(different([*best, *_refined([_Task.of(one) for one in best], _LAST_STAGES)]))
+    return list(different([*best, *_refined([_Task.of(one) for one in best], _LAST_ROUTES)]))
 
 
 def hand_evidence(reading: Reading) -> float:
@@ -138,16 +140,18 @@ def _hypotheses(reading: Reading, hypotheses: Sequence[Hypothesis] = HYPOTHESES)
                 yield _Task(reading, matches)
 
 
-def _refined(tasks: Sequence[_Task], by: Sequence[Stage] = _STAGES) -> list[Candidate]:
-    """Refine maps of samples, and judge those whose refinement succeeds."""
+def _refined(tasks: Sequence[_Task], routes: Sequence[Sequence[Stage]] = _ROUTES) -> list[Candidate]:
+    """Refine maps of samples by each route, and judge those whose refinement succeeds."""
     if not tasks:
         return []
     fewest = min(len(side.areas) for task in tasks for side in (task.reading.x, task.reading.y))
-    stages = [stage.fitted(fewest) for stage in by]
     starts = [(task.reading.spectra, Start(task.matches, excluded=task.excluded)) for task in tasks]
     return [
         Candidate(task.reading, outcome.pointwise_map, Evidence.of(task.reading, outcome.pointwise_map))
-        for task, outcome in zip(tasks, run_all(stages, starts), strict=True)
+        for route in routes
+        for task, outcome in zip(
+            tasks, run_all([stage.fitted(fewest) for stage in route], starts), strict=True
+        )
         if outcome.successful
     ]
 

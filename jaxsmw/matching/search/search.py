@@ -139,9 +139,9 @@ def search(
         if not likely:
             break
         if number == 0:  # The rivals have passed the race as well.
-            again = [_refined(one, preset) for one in judged]
+            again = [_refined(one, preset, settings) for one in judged]
             judged = [one for one in again if one.outcome.successful] or judged
-        refined = [_refined(one, preset) for one in likely]
+        refined = [_refined(one, preset, settings) for one in likely]
         judged = list(different([*judged, *refined]))
         certain = _certain(judged, settings)
     # Further passes make some wrong maps nearly as good as the right one, so the evidence before them counts.
@@ -283,11 +283,12 @@ def _first(reading: Reading, preset: Preset) -> Judged:
     return Judged.of(reading.with_first(outcome.pointwise_map) if outcome.successful else reading, outcome)
 
 
-def _refined(candidate: Candidate, preset: Preset) -> Judged:
+def _refined(candidate: Candidate, preset: Preset, settings: SearchSettings) -> Judged:
     """Run the repeated stages of a preset from a map of samples."""
     reading = candidate.reading.described(preset)
     start = Start(reading.extended(candidate.matches))
-    return Judged.of(reading, run(preset.repeated, reading.prepared.spectra, start))
+    spectra, _ = _spectra(reading, start.pointwise_map, settings)
+    return Judged.of(reading, run(preset.repeated, spectra, start))
 
 
 def _finished(judged: Judged, preset: Preset) -> Judged:
@@ -296,15 +297,12 @@ def _finished(judged: Judged, preset: Preset) -> Judged:
     **Returns:** The map after the last pass, or the given map if no pass runs, if a pass fails, or if the
     passes make the map less probable.
     """
-    settings, prepared = preset.search, judged.reading.prepared
-    if settings is None or not judged.outcome.successful or prepared.pair.partial:
+    settings = preset.search
+    if settings is None or not judged.outcome.successful or judged.reading.prepared.pair.partial:
         return judged
-    spectra = prepared.spectra
-    change = area_shape_difference(prepared.pair, judged.pointwise_map, *spectra.both)
+    spectra, change = _spectra(judged.reading, judged.pointwise_map, settings)
     if change < settings.non_isometric:
         return judged
-    if change >= settings.without_creases_from:
-        spectra = _without_creases(spectra)
     passes = [preset.repeated] * settings.passes
     if change >= settings.coarse_from:
         *before, last = preset.repeated
@@ -322,8 +320,14 @@ def _finished(judged: Judged, preset: Preset) -> Judged:
     return after if after.log_odds >= judged.log_odds - settings.pass_tolerance else judged
 
 
-def _without_creases(spectra: SpectralPair) -> SpectralPair:
-    """Return the spectra with crease eigenvectors of zero, which need no further program."""
+def _spectra(
+    reading: Reading, pointwise_map: Int64[np.ndarray, " m"], settings: SearchSettings
+) -> tuple[SpectralPair, float]:
+    """Return the spectra by which a map (m,) is refined, and its area-based shape difference.
+
+    Creases of shapes that differ much in form are not alike, so the crease eigenvectors of full shapes are
+    then zero. They need no further program.
+    """
 
     def zeroed(spectrum: Spectrum) -> Spectrum:
         creases = spectrum.crease_eigenvectors
@@ -331,4 +335,8 @@ def _without_creases(spectra: SpectralPair) -> SpectralPair:
             None if creases is None else namespace(creases).zeros_like(creases)
         )
 
-    return replace(spectra, x=zeroed(spectra.x), y=zeroed(spectra.y))
+    prepared, spectra = reading.prepared, reading.prepared.spectra
+    change = area_shape_difference(prepared.pair, pointwise_map, *spectra.both)
+    if prepared.pair.partial or change < settings.without_creases_from:
+        return spectra, change
+    return replace(spectra, x=zeroed(spectra.x), y=zeroed(spectra.y)), change
