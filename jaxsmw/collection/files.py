@@ -80,7 +80,7 @@ def _write_meshes(meshes: Iterable[tuple[Path, MeshData]]) -> list[Path]:
 
 def _turned(data: MeshData) -> MeshData:
     """Reverse the faces, so that the normals of a mirror image point outward."""
-    texture = None if data.texture is None else (data.texture[0], data.texture[1][:, ::-1])
+    texture = None if data.texture is None else data.texture._replace(corners=data.texture.corners[:, ::-1])
     mesh = replace(data.mesh, faces=np.ascontiguousarray(data.mesh.faces[:, ::-1]))
     return replace(data, mesh=mesh, faces=data.faces[:, ::-1], texture=texture)
 

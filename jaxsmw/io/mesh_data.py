@@ -97,9 +97,9 @@ class MeshData:
     faces: np.ndarray
     vertex_data: Mapping[str, np.ndarray] = field(default_factory=dict)
     face_data: Mapping[str, np.ndarray] = field(default_factory=dict)
-    texture: tuple[np.ndarray, np.ndarray] | None = None
+    texture: Texture | None = None
     blend_shapes: Mapping[str, np.ndarray] = field(default_factory=dict)
-    skin: Skin | tuple[tuple[str, ...], np.ndarray] | None = None
+    skin: Skin | None = None
     label_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -250,10 +250,11 @@ def _checked_skeleton(skeleton: Skeleton, number: int) -> Skeleton:
     return Skeleton(parents.astype(np.int64), matrices)
 
 
-def checked_texture(texture: tuple[np.ndarray, np.ndarray], f: int) -> Texture:
+def checked_texture(texture: Texture, f: int) -> Texture:
     """Check the texture of f triangles."""
-    coordinates = _real(texture[0], "the texture", (*np.shape(texture[0])[:1], 2))
-    corners = _indices(texture[1], len(coordinates), "the texture's corners", "texture vertices", -1)
+    coordinates, corners = texture
+    coordinates = _real(coordinates, "the texture", (*np.shape(coordinates)[:1], 2))
+    corners = _indices(corners, len(coordinates), "the texture's corners", "texture vertices", -1)
     if len(corners) != f:
         raise InputError(
             f"the texture has {count_of(len(corners), 'row')} of corners, but the mesh has "
@@ -298,7 +299,7 @@ def _indices(values: Any, count: int, what: str, whole: str, first: int = 0) -> 
     return array.astype(np.int64)
 
 
-def texture_at_corners(texture: tuple[np.ndarray, np.ndarray]) -> Float64[np.ndarray, "f 6"]:
+def texture_at_corners(texture: Texture) -> Float64[np.ndarray, "f 6"]:
     """Return the texture coordinates (u0, v0, u1, v1, u2, v2) of each triangle. Missing ones are NaN."""
     coordinates, corners = texture
     return np.vstack([coordinates, [[np.nan, np.nan]]])[corners].reshape(-1, 6)

@@ -33,7 +33,7 @@ from jaxsmw.errors import InputError, naming
 from jaxsmw.geometry.mesh import Mesh, make_mesh
 from jaxsmw.geometry.point_cloud import triangulate_points
 from jaxsmw.io.formats.polygons import Polygons, texture_or_note, triangles_of
-from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, checked_texture
+from jaxsmw.io.mesh_data import COLORS, NORMALS, MeshData, Texture, checked_texture
 from jaxsmw.runtime.files import atomic_write, read_bytes
 from jaxsmw.wording import count_of
 
@@ -198,7 +198,11 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool | float = False) 
         notes = [*polygons.notes, *_notes(polygons.sizes[~is_strip], polygons.lines, len(faces))]
         of_corners = polygons.texture
         texture, lost = texture_or_note(
-            lambda: of_corners and checked_texture((of_corners[0], of_corners[1][at]), len(at))
+            lambda: (
+                None
+                if of_corners is None
+                else checked_texture(Texture(of_corners[0], of_corners[1][at]), len(at))
+            )
         )
     # `MeshData` refuses arrays that are too short.
     face_data = {

@@ -110,7 +110,7 @@ def transfer_attributes(
         face_data=_without(whole.face_data, taken) | face_data,
         blend_shapes=_without(whole.blend_shapes, blend_shapes) | blend_shapes,
         texture=texture,
-        skin=whole.skin if data.skin is None else _mixed_skin(Skin(*data.skin), matrix, registered),
+        skin=whole.skin if data.skin is None else _mixed_skin(data.skin, matrix, registered),
         label_names=_without(whole.label_names, taken) | dict(data.label_names),
     )
 
@@ -136,7 +136,7 @@ def registered_data(data: MeshData, registered: RegisteredMesh) -> MeshData:
         mesh=replace(registered.mesh, notes=data.mesh.notes, dropped_faces=data.mesh.dropped_faces),
         vertex_data=vertex_data,
         blend_shapes={name: similarities.of_vectors(moves) for name, moves in data.blend_shapes.items()},
-        skin=None if data.skin is None else with_moved_skeleton(Skin(*data.skin), registered),
+        skin=None if data.skin is None else with_moved_skeleton(data.skin, registered),
     )
 
 

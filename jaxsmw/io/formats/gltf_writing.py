@@ -13,7 +13,7 @@ from jaxtyping import Int64
 from jaxsmw.errors import InputError
 from jaxsmw.io.formats.gltf import COLUMNS, RECORD, TYPES
 from jaxsmw.io.formats.polygons import Formatted, is_color, omissions, width_of
-from jaxsmw.io.mesh_data import MeshData, Skeleton, Skin
+from jaxsmw.io.mesh_data import MeshData, Skeleton
 
 _VERTICES, _INDICES = 34962, 34963
 _COMPONENTS = {kind: number for number, kind in TYPES.items()}
@@ -82,7 +82,7 @@ class _Writer:
         positions = _single(data.mesh.vertices)[self.original]
         attributes = {"POSITION": self.accessor(positions, _VERTICES, limits=True)}
         if data.texture is not None:
-            coordinates = np.vstack([data.texture[0], [[0, 1]]])[texture]
+            coordinates = np.vstack([data.texture.coordinates, [[0, 1]]])[texture]
             coordinates[:, 1] = 1 - coordinates[:, 1]  # in glTF, v = 0 at the top of the picture
             attributes["TEXCOORD_0"] = self.accessor(_single(coordinates), _VERTICES)
         for name, values in data.vertex_data.items():
@@ -100,7 +100,7 @@ class _Writer:
     def add_skin(self, attributes: dict[str, int]) -> None:
         """Add a skin whose joints are nodes below one root, with four joints in each pair of attributes."""
         assert self.data.skin is not None
-        names, weights, skeleton = Skin(*self.data.skin)
+        names, weights, skeleton = self.data.skin
         if len(names) > 65535:
             raise InputError("has more than 65535 joints, the limit of glTF files: write a .npz file.")
         order = np.argsort(-np.abs(weights), axis=1, kind="stable")
@@ -223,8 +223,8 @@ def _split(
     n = len(data.mesh.vertices)
     if data.texture is None:
         return np.arange(n), np.arange(n), data.faces
-    t = len(data.texture[0])
-    pairs = np.column_stack([data.faces.ravel(), data.texture[1].ravel()])
+    t = len(data.texture.coordinates)
+    pairs = np.column_stack([data.faces.ravel(), data.texture.corners.ravel()])
     alone = np.setdiff1d(np.arange(n), data.faces)
     # Without seams, texture vertex i belongs to vertex i.
     pairs = np.vstack([pairs, np.column_stack([alone, alone if t == n else np.full(len(alone), -1)])])

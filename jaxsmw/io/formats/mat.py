@@ -390,9 +390,9 @@ def format_mat(data: MeshData) -> Formatted:
         if fields := {name: value for name, value in values.items() if _is_field(name)}:
             surface[part] = fields
     if data.texture is not None:
-        surface["texture"] = {"coordinates": data.texture[0], "corners": data.texture[1] + 1.0}
+        surface["texture"] = {"coordinates": data.texture.coordinates, "corners": data.texture.corners + 1.0}
     if data.skin is not None:
-        joints, weights, skeleton = Skin(*data.skin)
+        joints, weights, skeleton = data.skin
         surface["skin"] = {"joints": _cells(joints), "weights": weights}
         if skeleton is not None:
             matrices = skeleton.bind_matrices.reshape(-1, 4)

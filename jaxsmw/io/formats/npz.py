@@ -126,9 +126,9 @@ def format_npz(data: MeshData) -> Formatted:
         for name, values in getattr(data, folder).items():
             arrays[f"{folder}/{name}"] = np.asarray(values)
     if data.texture is not None:
-        arrays |= {"texture_coordinates": data.texture[0], "texture_corners": data.texture[1]}
+        arrays |= {"texture_coordinates": data.texture.coordinates, "texture_corners": data.texture.corners}
     if data.skin is not None:
-        joints, weights, skeleton = Skin(*data.skin)
+        joints, weights, skeleton = data.skin
         arrays |= {"skin_joints": np.array(joints), "skin_weights": weights}
         if skeleton is not None:
             arrays |= {"skin_parents": skeleton.parents, "skin_bind_matrices": skeleton.bind_matrices}

@@ -300,7 +300,7 @@ def format_ply(data: MeshData) -> Formatted:
     columns = dict(zip("xyz", data.mesh.vertices.T, strict=True))
     lists: dict[str, np.ndarray] = {"vertex_indices": data.faces.astype("<i4")}
     if data.texture is not None and is_texture_of_vertices(data):
-        columns |= dict(zip(("s", "t"), data.texture[0].T, strict=True))
+        columns |= dict(zip(("s", "t"), data.texture.coordinates.T, strict=True))
     elif data.texture is not None:
         lists[TEXTURE_OF_CORNERS] = texture_at_corners(data.texture)
     reserved = {*"xyz", *(name for pair in _TEXTURES for name in pair)}

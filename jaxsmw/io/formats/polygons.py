@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -18,6 +18,8 @@ TEXTURE_OF_CORNERS = "texcoord"
 
 TextureOfCorners: TypeAlias = tuple[np.ndarray, np.ndarray]
 """Texture coordinates (t, 2), and the texture vertex of each corner in a list of corners, or -1."""
+Parsed = TypeVar("Parsed")
+"""What a parser returns."""
 Formatted: TypeAlias = tuple[bytes, tuple[str, ...]]
 """The bytes of a file, and sentences about the data that it does not contain."""
 
@@ -134,9 +136,7 @@ def are_vertices(corners: np.ndarray, n: int) -> bool:
     return bool(((corners >= 0) & (corners < n) & (corners == np.floor(corners))).all())
 
 
-def texture_or_note(
-    parse: Callable[[], TextureOfCorners | None],
-) -> tuple[TextureOfCorners | None, tuple[str, ...]]:
+def texture_or_note(parse: Callable[[], Parsed | None]) -> tuple[Parsed | None, tuple[str, ...]]:
     """Parse a texture. Matching does not need a texture, so a note replaces a texture that cannot be read."""
     try:
         return parse(), ()
@@ -154,7 +154,7 @@ def omissions(data: MeshData, form: str, **holds: bool | Callable[[str, Any], bo
         "vertex_data": ("the vertex data", data.vertex_data),
         "face_data": ("the face data", data.face_data),
         "blend_shapes": ("the blend shapes", data.blend_shapes),
-        "skin": ("the joints", {} if data.skin is None else dict.fromkeys(data.skin[0])),
+        "skin": ("the joints", {} if data.skin is None else dict.fromkeys(data.skin.joints)),
         "label_names": ("the names of the labels", data.label_names),
         "texture": ("texture", {} if data.texture is None else {"coordinates": data.texture}),
     }
@@ -186,8 +186,8 @@ def is_texture_of_vertices(data: MeshData) -> bool:
     """Return whether texture vertex i belongs to vertex i for all i, so that there is no seam."""
     return (
         data.texture is not None
-        and len(data.texture[0]) == len(data.mesh.vertices)
-        and np.array_equal(data.texture[1], data.faces)
+        and len(data.texture.coordinates) == len(data.mesh.vertices)
+        and np.array_equal(data.texture.corners, data.faces)
     )
 
 

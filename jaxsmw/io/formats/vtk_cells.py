@@ -126,7 +126,7 @@ def arrays_of(data: MeshData) -> tuple[dict[str, np.ndarray], dict[str, np.ndarr
     """
     cell_data, coordinates = dict(data.face_data), None
     if data.texture is not None and is_texture_of_vertices(data):
-        coordinates = data.texture[0]
+        coordinates = data.texture.coordinates
     elif data.texture is not None:
         cell_data[TEXTURE_OF_CORNERS] = texture_at_corners(data.texture)
     return dict(data.vertex_data), cell_data, coordinates

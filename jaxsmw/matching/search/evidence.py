@@ -26,7 +26,7 @@ _AGREEING = 0.4
 _LEAST_DEFORMATION, _LEAST_CHANGE = 0.01, 0.05
 # A map is in place if the mean distance between the given positions of samples and of their matches exceeds
 # that of the nearest samples by less than this number of units of Y.
-_NEAR = 0.03
+_NEAR = 0.023
 # A sample of Y is uncovered if no match is nearer, in units of the square root of the area.
 _COVERED = 0.1
 # The least number of extremities from which sides are seen. With fewer of them, all maps have this change of

@@ -24,16 +24,14 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import COMMON, NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
 
-# The routes by which each map is refined, and those by which the given number of the best
-# maps is refined once more. Between animals that differ much in form, functional maps of wavelets move
-# the right map away from its place, and the regression alone does not. Coarse levels of registration move limbs
-# that finer levels leave in place, but they also move the right maps of short limbs. (Entry R49 of docs/research_log.md)
+# The routes by which each map is refined, and those by which the given number of the best maps is refined
+# once more. Between animals that differ much in form, functional maps of wavelets move the right map away
+# from its place, and the regression alone does not. Coarse levels of registration move limbs that finer
+# levels leave in place. (Entry R49 of docs/research_log.md)
 _REGRESSION = Stage(FeatureRegression((20, 20, 26, 35)), number_of_descriptors=NUMBER_OF_DESCRIPTORS)
+_REGISTRATION = Stage(Registration((8, 12, 20, 35, 60)), number_of_descriptors=NUMBER_OF_DESCRIPTORS)
 _ROUTES = ((Stage(WaveletPreservation(), number_of_eigenvectors=50), _REGRESSION), (_REGRESSION,))
-_LAST_ROUTES = tuple(
-    (Stage(Registration(levels), number_of_descriptors=NUMBER_OF_DESCRIPTORS),)
-    for levels in ((8, 12, 20, 35, 60), (20, 35, 60))
-)
+_LAST_ROUTES = ((_REGISTRATION,),)
 _REGISTERED = 10
 # The number of the best maps that are mended in each round, and the number of rounds.
 _MENDED, _ROUNDS = 4, 2
