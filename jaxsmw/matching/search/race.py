@@ -24,14 +24,13 @@ from jaxsmw.matching.search.proxies import SampleMap
 from jaxsmw.matching.search.reading import COMMON, NUMBER_OF_DESCRIPTORS, Reading
 from jaxsmw.matching.stages import Stage
 
-# The routes by which each map is refined, and those by which the given number of the best maps is refined
-# once more. Between animals that differ much in form, functional maps of wavelets move the right map away
-# from its place, and the regression alone does not. Coarse levels of registration move limbs that finer
-# levels leave in place. (Entry R49 of docs/research_log.md)
+# The routes by which each map is refined, and the stages by which the given number of the best maps of full
+# shapes is refined once more. Between animals that differ much in form, functional maps of wavelets move the
+# right map away from its place, and the regression alone does not. Coarse levels of registration move limbs
+# that finer levels leave in place. (Entry R49 of docs/research_log.md)
 _REGRESSION = Stage(FeatureRegression((20, 20, 26, 35)), number_of_descriptors=NUMBER_OF_DESCRIPTORS)
-_REGISTRATION = Stage(Registration((8, 12, 20, 35, 60)), number_of_descriptors=NUMBER_OF_DESCRIPTORS)
 _ROUTES = ((Stage(WaveletPreservation(), number_of_eigenvectors=50), _REGRESSION), (_REGRESSION,))
-_LAST_ROUTES = ((_REGISTRATION,),)
+_LAST_STAGES = (Stage(Registration((8, 12, 20, 35, 60)), number_of_descriptors=NUMBER_OF_DESCRIPTORS),)
 _REGISTERED = 10
 # The number of the best maps that are mended in each round, and the number of rounds.
 _MENDED, _ROUNDS = 4, 2
@@ -89,11 +88,11 @@ def race(
         new = [best for best in islice(different(found), _MENDED) if best not in moved]
         found += _refined([move for best in new for move in _moves(best, readings)])
         moved += new
-    if all(reading.prepared.pair.partial for reading in readings):
-        return list(different(found))  # registration moves a part away from its place on a different body
     best = list(islice(different(found), _REGISTERED))
     # Registration improves most maps. It makes a limb of others collapse, so they stay as they were as well.
-    return list(different([*best, *_refined([_Task.of(one) for one in best], _LAST_ROUTES)]))
+    # Registration also moves parts away from their place on different bodies.
+    full = [_Task.of(one) for one in best if not one.reading.prepared.pair.partial]
+    return list(different([*best, *_refined(full, (_LAST_STAGES,))]))
 
 
 def hand_evidence(reading: Reading) -> float:
