@@ -18,7 +18,7 @@ from jaxsmw.io import (
     write_mesh,
     write_mesh_data,
 )
-from jaxsmw.io.mesh_data import MeshData
+from jaxsmw.io.mesh_data import MeshData, Texture
 
 pytestmark = pytest.mark.usefixtures("small_pictures")
 
@@ -69,7 +69,7 @@ def test_all_files_are_written(run, pair, tmp_path):
 
 def test_missing_pictures_and_coordinate_systems_are_noted(run, pair, tmp_path):
     mesh = jaxsmw.read_mesh(pair / "x.off")
-    texture = mesh.vertices[:, :2], mesh.faces
+    texture = Texture(mesh.vertices[:, :2], mesh.faces)
     write_mesh_data(tmp_path / "x.obj", MeshData(mesh, mesh.faces, texture=texture))
     outcome = run(
         "transfer", tmp_path / "x.obj", pair / "y.ply", "--map", pair / "truth.txt",
