@@ -198,11 +198,7 @@ def read_mesh_data(path: str | os.PathLike[str], *, weld: bool | float = False) 
         notes = [*polygons.notes, *_notes(polygons.sizes[~is_strip], polygons.lines, len(faces))]
         of_corners = polygons.texture
         texture, lost = texture_or_note(
-            lambda: (
-                None
-                if of_corners is None
-                else checked_texture(Texture(of_corners[0], of_corners[1][at]), len(at))
-            )
+            lambda: of_corners and checked_texture(Texture(of_corners[0], of_corners[1][at]), len(at))
         )
     # `MeshData` refuses arrays that are too short.
     face_data = {

@@ -147,7 +147,10 @@ def search(
     # Further passes make some wrong maps nearly as good as the right one, so the evidence before them counts.
     before = _shares_of(judged)
     probable = _probable(before, settings)
-    judged = [_finished(one, preset) if again else one for one, again in zip(judged, probable, strict=True)]
+    judged = [
+        _finished(one, preset, settings) if again else one
+        for one, again in zip(judged, probable, strict=True)
+    ]
     parts = np.sqrt(before * _shares_of(judged))
     parts /= parts.sum() or 1.0
     judged = [replace(one, share=float(part)) for one, part in zip(judged, parts, strict=True)]
@@ -291,14 +294,13 @@ def _refined(candidate: Candidate, preset: Preset, settings: SearchSettings) -> 
     return Judged.of(reading, run(preset.repeated, spectra, start))
 
 
-def _finished(judged: Judged, preset: Preset) -> Judged:
+def _finished(judged: Judged, preset: Preset, settings: SearchSettings) -> Judged:
     """Run further passes for shapes that differ in form, because their maps converge slowly.
 
     **Returns:** The map after the last pass, or the given map if no pass runs, if a pass fails, or if the
     passes make the map less probable.
     """
-    settings = preset.search
-    if settings is None or not judged.outcome.successful or judged.reading.prepared.pair.partial:
+    if not judged.outcome.successful or judged.reading.prepared.pair.partial:
         return judged
     spectra, change = _spectra(judged.reading, judged.pointwise_map, settings)
     if change < settings.non_isometric:
